@@ -8,11 +8,12 @@ import pytest
 import ep2sindy as ep
 from benchmarks.many_states import lorenz_96
 from ep2sindy.estimation import working_set
+from ep2sindy.estimation.explanation import explain
 from ep2sindy.estimation.likelihood import Gram, gram
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import WEIGHED_AT, Solution, at_level, from_smooth
 from ep2sindy.estimation.supports import inverse_of, term_prices
-from ep2sindy.estimation.working_set import first_set, search_within
+from ep2sindy.estimation.working_set import first_set
 from ep2sindy.regression import searches
 from ep2sindy.regression.exchanges import exchanged_supports
 from ep2sindy.systems.systems import System
@@ -169,8 +170,8 @@ def test_a_true_term_outside_the_set_enters(monkeypatch: pytest.MonkeyPatch) -> 
     kept = first_set(problem, 7)
     kept[np.flatnonzero(true)[[1, 6]]] = False
     monkeypatch.setattr(working_set, "first_set", lambda problem, max_terms: kept)
-    part, found = search_within(problem, max_terms=7)
-    assert chosen(problem, part, found) == true.tolist()
+    found = explain(problem, max_terms=7, align=False)
+    assert chosen(problem, found.problem, found.solution) == true.tolist()
 
 
 def chosen(problem: EstimationProblem, part: EstimationProblem, found: Solution) -> list[bool]:

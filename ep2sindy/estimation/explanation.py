@@ -22,6 +22,7 @@ from ep2sindy.estimation.lateness import (
     move_channels,
     suspect_delays,
 )
+from ep2sindy.estimation.likelihood import STEERED
 from ep2sindy.estimation.missing_state import ROADS, missing_state
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import EstimationProblem
@@ -40,7 +41,7 @@ from ep2sindy.estimation.solver import (
     settle,
 )
 from ep2sindy.estimation.supports import term_prices
-from ep2sindy.estimation.working_set import search_within
+from ep2sindy.estimation.working_set import search_within, with_entrances
 from ep2sindy.runtime.progress import SILENT
 from ep2sindy.trust.interruption import is_interruption
 
@@ -152,14 +153,21 @@ def _explain(problem: EstimationProblem, max_terms: int | None, align: bool) -> 
         return Explanation(
             late.problem, late.solution, few_terms, misfit, late.delays, none, (said,)
         )
+    part, by_pushes = problem, pushed is not None and pushed.explains
+    tested = best is first if best.fits else by_pushes  # terms outside the set were, or need not be
+    if not tested:
+        near = best if best.fits else first
+        wider, found = with_entrances(problem, near, max_terms=few_terms)
+        if found.fits:
+            part, best = wider, found
     if best.fits:
-        limit = _at_limit(problem, best, max_terms)
-        return Explanation(problem, best, few_terms, limit, none, none)
+        limit = _at_limit(part, best, max_terms)
+        return Explanation(part, best, few_terms, limit, none, none)
     # A hidden state that is pushed explains whatever there is.
     if pushed is not None and pushed.explained.any() and problem.measured.all():
         return _under_pushes(problem, pushed, max_terms)
-    words = _misfit(problem, best) + _roads(problem)
-    return Explanation(problem, best, few_terms, words, none, none)
+    words = _misfit(part, best) + _roads(problem)
+    return Explanation(part, best, few_terms, words, none, none)
 
 
 def _under_pushes(problem: EstimationProblem, pushed: PushedFit, max_terms: int) -> Explanation:
@@ -279,6 +287,12 @@ def _misfit(problem: EstimationProblem, found: Solution) -> str:
         signs.append("whatever was tried runs away between two samples")
     if found.flow_error:
         signs.append(f"the states leave the model by {found.flow_error:g} of the noise per sample")
+    if not found.parting < STEERED:
+        factor = np.exp(min(found.parting, 100.0) / 2.0)
+        signs.append(
+            f"paths beside the fit part by a factor of {factor:.2g} per sample, so it could follow "
+            "any samples"
+        )
     for state, memory in zip(problem.states, found.noise.unexplained, strict=True):
         if memory:
             signs.append(f"what is left of {state} lasts ({memory:.2f} from sample to sample)")

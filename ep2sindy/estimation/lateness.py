@@ -13,8 +13,9 @@ from math import log
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.estimation.flow import Flow
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, hessian
-from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
+from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 from ep2sindy.estimation.supports import PenalisedFit, best_support, inverse_of, penalise
 
 PAYS = 1.0  # least fall of squares plus prices, beyond the delays' own price
@@ -142,8 +143,9 @@ def _those_that_show(
     while late.any():
         delays[:] = 0.0
         delays[late], errors = around.of(late).delays(support)
-        shown = np.where(late, np.square(delays), np.inf)
-        shown[late] /= np.square(errors)
+        shown = np.where(late, 0.0, np.inf)  # zero if rounding leaves no error to compare with
+        tells = errors > 0.0
+        shown[np.flatnonzero(late)[tells]] = np.square(delays[late][tells] / errors[tells])
         if shown.min() > log(problem.n_samples):
             return delays
         late = late & (np.arange(len(late)) != int(np.argmin(shown)))

@@ -21,11 +21,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.estimation.flow import Flow
 from ep2sindy.estimation.kernels import departures, eliminate
-from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
+from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 
 FREE_START = 100.0  # prior variance of the first state: ten times its RMS, squared
 MAX_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of a step tried
+STEERED = 1.0  # parting of paths, in nats per sample; chaotic systems that are resolved reach 0.3
+MAX_FOLLOWING, WORTH_FOLLOWING = 3, 0.5  # steps of the states alone; what each must leave at most
 SETTLED = 1e-2  # a fall of the squares that ends the fit; a term's price is about ten
 # Give up on a fit with mean square above FAR that falls by less than this share per step.
 FAR, CRAWLS = 10.0, 0.02
@@ -113,10 +116,14 @@ def squares(
     return np.where(np.isfinite(total), total, np.inf)
 
 
-def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> TrajectoryFit:
+def fit_paths(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, follow: bool = False
+) -> TrajectoryFit:
     """Minimise the squares over states and coefficients by Gauss-Newton with step halving.
 
-    The result is the nearest local minimum.
+    The result is the nearest local minimum. follow: before a step is halved, let the states follow
+    its coefficients, which takes far fewer steps where the flow is nearly exact. On the way there
+    it would lead into models that follow any samples.
     """
     fit = replace(fit, squares=squares(problem, fit.paths, fit.free, level))
     if not np.isfinite(fit.total):
@@ -129,10 +136,9 @@ def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> T
         share = 1.0
         while share > SHORTEST:
             paths = tuple(p + share * m for p, m in zip(fit.paths, moves, strict=True))
-            free = fit.free + share * change
-            tried = replace(
-                fit, paths=paths, free=free, squares=squares(problem, paths, free, level)
-            )
+            tried = _at(problem, replace(fit, free=fit.free + share * change), paths, level)
+            if follow:
+                tried = _follow(problem, tried, level, below=fit.total)
             if tried.total < fit.total:
                 break
             share /= 2.0
@@ -143,6 +149,59 @@ def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> T
         if crawls or (share == 1.0 and gain < SETTLED):
             return fit
     return fit
+
+
+def _at(
+    problem: EstimationProblem, fit: TrajectoryFit, paths: tuple[np.ndarray, ...], level: Level
+) -> TrajectoryFit:
+    return replace(fit, paths=paths, squares=squares(problem, paths, fit.free, level))
+
+
+def _follow(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, below: float
+) -> TrajectoryFit:
+    """Let the states follow their coefficients, until the squares fall below a value.
+
+    A step of both is straight, and at small rho the states must keep to a flow that is not.
+    """
+    first, none = fit, np.zeros_like(fit.support)
+    for _ in range(MAX_FOLLOWING):
+        if fit.total < below or not np.isfinite(fit.total):
+            break
+        flows = [
+            problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
+            for record, path in zip(problem.records, fit.paths, strict=True)
+        ]
+        moves = _moves(problem, fit, level, flows, np.empty(0))
+        paths = tuple(p + m for p, m in zip(fit.paths, moves, strict=True))
+        tried = _at(problem, fit, paths, level)
+        if not tried.total < WORTH_FOLLOWING * fit.total:
+            break
+        fit = tried
+    followed = fit is not first and fit.total < below
+    return fit if followed and parting(problem, fit, level) < STEERED else first
+
+
+def parting(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> float:
+    """How fast paths beside a fit part: nats per sample that are new, beyond a first state's.
+
+    In a long record it is twice the sum of the positive Lyapunov exponents, per mean step. Where it
+    is large, the least error of the flow steers the path to any sample, and the squares are no
+    likelihood.
+    """
+    told = 0.0
+    none = np.zeros_like(fit.support)
+    for record, path, variance, process in zip(
+        problem.records, fit.paths, level.variances, level.processes, strict=True
+    ):
+        flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
+        residuals, apparent, _ = observe(record, path, variance)
+        misses = flow.ends - path[1:]
+        logs = eliminate(flow.slopes, misses, residuals, apparent, process, FREE_START)[3]
+        precision = np.where(np.isfinite(residuals), 1.0 / apparent, 0.0)
+        at_rest = np.log1p(FREE_START * precision.sum(axis=0)).sum()
+        told += logs + np.log(precision[precision > 0.0]).sum() - at_rest
+    return max(float(told), 0.0) / problem.n_samples
 
 
 @np.errstate(over="ignore", invalid="ignore")  # `Gram.finite` says whether the result counts
@@ -202,16 +261,26 @@ def _step(
     step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
     change = np.zeros_like(fit.free)
     change[fit.support] = step
-    d = len(problem.states)
-    moves = []
+    return change, _moves(problem, fit, level, flows, step)
+
+
+def _moves(
+    problem: EstimationProblem,
+    fit: TrajectoryFit,
+    level: Level,
+    flows: list[Flow],
+    change: Float[np.ndarray, " support"],
+) -> list[np.ndarray]:
+    """Changes of every path, for a change of the support's coefficients."""
+    d, moves = len(problem.states), []
     for k, (record, path, flow) in enumerate(zip(problem.records, fit.paths, flows, strict=True)):
-        misses = flow.ends - path[1:] + flow.slopes[:, :, d:] @ step
+        misses = flow.ends - path[1:] + flow.slopes[:, :, d:] @ change
         by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
         residuals, variance, _ = observe(record, path, level.variances[k])
         moves.append(
             departures(by_state, misses, residuals, variance, level.processes[k], FREE_START)
         )
-    return change, moves
+    return moves
 
 
 def _hessian(

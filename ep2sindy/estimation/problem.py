@@ -13,12 +13,9 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import Watch
-from ep2sindy.estimation.kernels import sensitivities, term_values
+from ep2sindy.estimation.flow import Flow, RightHandSides, Steps
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, constraint
-
-# Position of each Runge-Kutta stage in its step, and the weight of its slope in the sum.
-STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +74,12 @@ class ScaledRecord:
             return np.empty((len(self.steps), 0))
         return self._curve(self.times[:-1] + share * self.steps)
 
+    def divided(self, n_substeps: int) -> Steps:
+        """The steps, each divided into equal substeps."""
+        shares = np.linspace(0.0, 1.0, 2 * n_substeps + 1)
+        inputs = np.array([self.inputs_at(share) for share in shares])
+        return Steps(self.steps / n_substeps, inputs)
+
     @cached_property
     def _curve(self) -> Callable[[np.ndarray], np.ndarray]:
         from scipy.interpolate import make_interp_spline  # imported only if there are inputs
@@ -85,18 +88,6 @@ class ScaledRecord:
         switched = (np.diff(self.inputs, axis=0) == 0.0).mean(axis=0) > 0.5
         degree = 1 if switched.any() else min(3, len(self.inputs) - 1)
         return make_interp_spline(self.times, self.inputs, k=degree)
-
-
-@dataclass(frozen=True, eq=False)
-class Flow:
-    """States at the end of each step of a model, and their derivatives.
-
-    ends: (steps, d). slopes: (steps, d, d + coefficients), derivatives by the state, then by the
-    coefficients.
-    """
-
-    ends: Float[np.ndarray, "steps d"]
-    slopes: Float[np.ndarray, "steps d columns"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +151,15 @@ class EstimationProblem:
     def candidates(self) -> EstimationProblem:
         """The problem with all terms that may be in the model."""
         return self.whole or self
+
+    @property
+    def taken(self) -> Bool[np.ndarray, " free"]:
+        """Mask of the candidates' coefficients that this problem has."""
+        if self.whole is None:
+            return np.ones(self.n_free, dtype=np.bool_)
+        n = len(self.whole.library)
+        own = self.equation * n + self.places[self.column]
+        return np.isin(self.whole.equation * n + self.whole.column, own)
 
     def record(self, run: Trajectory) -> ScaledRecord:
         """A run with the same states and inputs, in the scale of this problem."""
@@ -241,8 +241,7 @@ class EstimationProblem:
         self, record: ScaledRecord, states: Float[np.ndarray, "samples d"], free: np.ndarray
     ) -> Float[np.ndarray, "samples d"]:
         """Derivatives of the states at the samples, per mean step."""
-        values = self._product_values(states, record.inputs)
-        return values @ (self._shares[:, 0].T @ self.coef(free))
+        return self._right_hand_sides.rates(self.coef(free), states, record.inputs)
 
     def ends(
         self,
@@ -251,17 +250,8 @@ class EstimationProblem:
         free: Float[np.ndarray, " free"],
         n_substeps: int,
     ) -> Float[np.ndarray, "steps d"]:
-        """States at the end of each step, by `n_substeps` classical RK4 steps."""
-        rates = self._shares[:, 0].T @ self.coef(free)
-        h = record.steps[:, None] / n_substeps
-        for k in range(n_substeps):
-            slope, total = np.zeros_like(states), states
-            for lead, weight in STAGES:
-                here = states + lead * h * slope
-                slope = self._products_at(record, here, (k + lead) / n_substeps) @ rates
-                total = total + weight * h * slope
-            states = total
-        return states
+        """States at the end of each step, by `n_substeps` classical Runge-Kutta steps."""
+        return self._right_hand_sides.ends(self.coef(free), states, record.divided(n_substeps))
 
     @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
     def flow(
@@ -278,64 +268,20 @@ class EstimationProblem:
 
         n_more: columns of zeros behind them, for derivatives by something else.
         """
-        d = len(self.states)
         involved = np.flatnonzero(support if self.C is None else self.C[:, support].any(axis=1))
-        equation, column = self.equation[involved], self._places[self.column[involved]]
-        by_state = np.einsum("tjp,ti->pij", self._shares[:, 1:], self.coef(free))
-        rates = np.column_stack(
-            [self._shares[:, 0].T @ self.coef(free), by_state.reshape(-1, d * d)]
-        )
-        h = record.steps / n_substeps
-        slopes = np.zeros((len(states), d, d + len(involved) + n_more))
-        slopes[:, np.arange(d), np.arange(d)] = 1.0
-        for k in range(n_substeps):
-            slope, total = np.zeros_like(states), states
-            jacobians, values = [], []
-            for lead, weight in STAGES:
-                here = states + (lead * h)[:, None] * slope
-                values.append(self._products_at(record, here, (k + lead) / n_substeps))
-                both = values[-1] @ rates
-                slope = both[:, :d]
-                jacobians.append(both[:, d:].reshape(-1, d, d))
-                total = total + (weight * h)[:, None] * slope
-            leads, weights = np.array(STAGES).T
-            sensitivities(
-                np.stack(jacobians), np.stack(values), equation, column, leads, weights, h, slopes
-            )
-            states = total
-        if self.C is not None:
-            p = d + len(involved)
-            by_free = slopes[:, :, d:p] @ self.C[np.ix_(involved, support)]
-            slopes = np.concatenate([slopes[:, :, :d], by_free, slopes[:, :, p:]], axis=2)
-        return Flow(states, slopes)
-
-    def _products_at(
-        self, record: ScaledRecord, states: Float[np.ndarray, "steps d"], share: float
-    ) -> Float[np.ndarray, "steps products"]:
-        return self._product_values(states, record.inputs_at(share))
-
-    def _product_values(
-        self, states: Float[np.ndarray, "n d"], inputs: Float[np.ndarray, "n n_inputs"]
-    ) -> Float[np.ndarray, "n products"]:
-        columns = np.concatenate([states, inputs, np.ones((len(states), 1))], axis=1)
-        return term_values(self._products.with_functions(columns, axis=1), self._products.table)
+        by = self.equation[involved], self.column[involved]
+        steps = record.divided(n_substeps)
+        found = self._right_hand_sides.flow(self.coef(free), states, steps, by, n_more=n_more)
+        if self.C is None:
+            return found
+        d, p = len(self.states), len(self.states) + len(involved)
+        by_free = found.slopes[:, :, d:p] @ self.C[np.ix_(involved, support)]
+        slopes = [found.slopes[:, :, :d], by_free, found.slopes[:, :, p:]]
+        return replace(found, slopes=np.concatenate(slopes, axis=2))
 
     @cached_property
-    def _derived(self) -> tuple[Library, np.ndarray]:
-        return self.library.with_derivatives(len(self.states))
-
-    @property
-    def _products(self) -> Library:
-        return self._derived[0]
-
-    @property
-    def _shares(self) -> Float[np.ndarray, "terms columns products"]:
-        return self._derived[1]
-
-    @cached_property
-    def _places(self) -> Int[np.ndarray, " terms"]:
-        """Index of the product that equals each term."""
-        return np.argmax(self._shares[:, 0] != 0.0, axis=1)
+    def _right_hand_sides(self) -> RightHandSides:
+        return RightHandSides(self.library, len(self.states))
 
 
 def scale_problem(

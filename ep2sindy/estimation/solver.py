@@ -21,11 +21,13 @@ from ep2sindy.estimation.lateness import (
 )
 from ep2sindy.estimation.likelihood import (
     FAR,
+    STEERED,
     Level,
     TrajectoryFit,
     enough_substeps,
     fit_paths,
     gram,
+    parting,
     squares,
 )
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
@@ -67,7 +69,7 @@ class Solution:
     """Result from one start.
 
     score: -2 log likelihood plus prices, comparable between starts. astray: (d,), True for hidden
-    states that do not follow their own equations.
+    states that do not follow their own equations. parting: see `noise.parting`.
     """
 
     annealed: AnnealedFit
@@ -75,6 +77,7 @@ class Solution:
     prices: Float[np.ndarray, " free"]
     flow_error: float
     astray: Bool[np.ndarray, " d"]
+    parting: float = 0.0
 
     @property
     def score(self) -> float:
@@ -86,7 +89,8 @@ class Solution:
     def fits(self) -> bool:
         """True if the residuals look like noise."""
         exact = self.flow_error == 0.0 and not self.noise.unexplained.any()
-        return exact and not self.astray.any() and bool(np.isfinite(self.score))
+        followed = exact and not self.astray.any() and self.parting < STEERED
+        return followed and bool(np.isfinite(self.score))
 
 
 def from_smooth(
@@ -125,10 +129,11 @@ def _settle(problem: EstimationProblem, found: AnnealedFit, max_terms: int) -> S
             break
     found = polish(problem, found, prices, max_terms=max_terms)
     noise = noise_beside(problem, found.fit)
-    error = 0.0
+    error = steered = 0.0
     if np.isfinite(found.score) and (noise.std > FLOOR).any():
         error = flow_error(problem, found.fit, noise, found.level)
-    return Solution(found, noise, prices, error, astray(problem, found))
+        steered = parting(problem, found.fit, replace(found.level, noise=noise.white))
+    return Solution(found, noise, prices, error, astray(problem, found), steered)
 
 
 def astray(problem: EstimationProblem, found: AnnealedFit) -> Bool[np.ndarray, " d"]:
@@ -191,6 +196,8 @@ def polish(
     """
     if not found.fit.total < FAR * problem.n_squares:
         return found
+    fit, cold = at_level(problem, found.fit, found.level, follow=True)
+    found = AnnealedFit(fit, cold, float(fit.total + prices[fit.support].sum()))
     tried = {found.fit.support.tobytes()}
     for _ in range(MAX_ROUNDS):
         warmer, level = at_level(problem, found.fit, replace(found.level, rho=WEIGHED_AT))
@@ -206,9 +213,9 @@ def polish(
             tried.add(each.support.tobytes())
             start = replace(warmer, support=each.support, free=each.free)
             fit, cold = at_level(problem, start, level)
-            fit, cold = at_level(problem, fit, replace(cold, rho=found.level.rho))
+            fit, cold = at_level(problem, fit, replace(cold, rho=found.level.rho), follow=True)
             score = float(fit.total + prices[fit.support].sum())
-            if score < found.score:
+            if score < found.score and parting(problem, fit, cold) < STEERED:
                 found = AnnealedFit(fit, cold, score)
                 break
         else:
@@ -217,13 +224,13 @@ def polish(
 
 
 def at_level(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, follow: bool = False
 ) -> tuple[TrajectoryFit, Level]:
-    """Fit at a level, with as many substeps as it needs."""
+    """Fit at a level, with as many substeps as it needs; follow: see `fit_paths`."""
     level = replace(level, n_substeps=enough_substeps(problem, fit, level))
     if not np.isfinite(squares(problem, fit.paths, fit.free, level)).all():
         fit = replace(fit, free=np.zeros_like(fit.free))  # the zero flow is finite
-    return fit_paths(problem, fit, level), level
+    return fit_paths(problem, fit, level, follow=follow), level
 
 
 def _exchange_terms(

@@ -12,16 +12,21 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.likelihood import Gram, unit_sizes
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.regression.exchanges import exchanged_supports
-from ep2sindy.regression.searches import BestSubset
+from ep2sindy.regression.gram_kernels import fit_masks
+from ep2sindy.regression.searches import subsets_within
 
 MAX_SWEEPS = 10  # over the equations; two or three usually suffice
 # Weight of the cost of choosing among terms. Below 0.5 there are more false terms than true ones
 # are gained, above 1 the reverse: `python -m benchmarks.estimation prices`.
 GAMMA = 1.0
 PROVEN_TERMS = 7  # of one equation; larger supports are the best that exchanges find
+# Multiplications for a proof, some milliseconds. A choice is made a hundred times on the way, and
+# where a proof takes longer, exchanges from the best so far find nearly always the same.
+MOST_WORK = 3e6
 N_BEST = 4  # supports of each size of an equation, since terms of one size differ in price
 MAX_ALTERNATIVES = 24  # supports of one equation for which the others are searched again
 CUTOFF = 1e-11  # eigenvalues of a Gram matrix of unit diagonal, below which terms are dependent
+INDEPENDENT = 1e-9  # least square of a term that the others leave, for an inverse without cutoff
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,14 +182,16 @@ def _offer_supports(
     at_hand = square > 0.0
     unit = np.where(at_hand[:, None] & at_hand, xx / np.outer(size, size), 0.0)
     target = np.where(at_hand, xy / size, 0.0)
-    search = BestSubset(max_terms=min(max_terms, PROVEN_TERMS, int(own.sum())), n_best=N_BEST)
-    share_of_yy = target / np.sqrt(yy)
-    masks = search.supports(unit, share_of_yy, 1.0)
-    if max_terms > PROVEN_TERMS and own.sum() > PROVEN_TERMS:
-        masks = exchanged_supports(
-            unit[None], share_of_yy[None], np.ones(1),
-            max_terms=max_terms, n_best=N_BEST, known=masks,
-        )  # fmt: skip
+    problem_of_one = unit[None], (target / np.sqrt(yy))[None], np.ones(1)
+    size = int(own.sum())
+    masks, proven = subsets_within(
+        *problem_of_one,
+        max_terms=min(max_terms, PROVEN_TERMS, size),
+        n_best=N_BEST,
+        most_work=MOST_WORK,
+    )
+    if not proven or min(max_terms, size) > PROVEN_TERMS:
+        masks = exchanged_supports(*problem_of_one, max_terms=max_terms, n_best=N_BEST, known=masks)
     found = []
     for mask, gain in zip(masks, _gains(unit, target, masks), strict=True):
         support = kept.copy()
@@ -198,19 +205,26 @@ def _gains(
     target: Float[np.ndarray, " own"],
     masks: Bool[np.ndarray, "supports own"],
 ) -> Float[np.ndarray, " supports"]:
-    """Fall of the squares by each support, supports of one size at once."""
-    gains, sizes = np.zeros(len(masks)), masks.sum(axis=1)
-    for size in np.unique(sizes[sizes > 0]):
-        here = sizes == size
-        terms = np.nonzero(masks[here])[1].reshape(-1, size)
-        y = target[terms]
-        pairs = unit[terms[:, :, None], terms[:, None]]
-        inverse = np.linalg.pinv(pairs, rcond=CUTOFF, hermitian=True)
-        gains[here] = np.einsum("ks,kst,kt->k", y, inverse, y)
+    """Fall of the squares by each support."""
+    gains = fit_masks(unit, target, masks) @ target
+    for k in np.flatnonzero(np.isnan(gains)):  # dependent terms explain what is left without them
+        y, mask = target[masks[k]], masks[k]
+        gains[k] = y @ inverse_of(unit[np.ix_(mask, mask)]) @ y
     return gains
 
 
 def inverse_of(quadratic: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Inverse of a Gram matrix; directions in which its terms depend on each other stay out."""
     size = unit_sizes(quadratic)
     unit = quadratic / np.outer(size, size)
-    return np.linalg.pinv(unit, rcond=CUTOFF, hermitian=True) / np.outer(size, size)
+    try:
+        independent = np.square(np.diag(np.linalg.cholesky(unit))) > INDEPENDENT
+    except np.linalg.LinAlgError:
+        independent = np.zeros(len(unit), dtype=np.bool_)
+    # The eigenvalues cost ten times as much.
+    inverse = (
+        np.linalg.inv(unit)
+        if independent.all()
+        else np.linalg.pinv(unit, rcond=CUTOFF, hermitian=True)
+    )
+    return inverse / np.outer(size, size)

@@ -16,9 +16,10 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.cost import SMALL
+from ep2sindy.estimation.flow import Flow
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, hessian, observe
-from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
+from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 from ep2sindy.estimation.solver import (
     WEIGHED_AT,
     Solution,
@@ -41,12 +42,21 @@ def search_within(
     problem: EstimationProblem, *, max_terms: int
 ) -> tuple[EstimationProblem, Solution]:
     """The solution from smoothed states by a working set, and the problem of the set's terms."""
-    kept = first_set(problem, max_terms)
-    part = problem.restricted(kept)
+    part = problem.restricted(first_set(problem, max_terms))
     with problem.watch.stage(_weighed(part)):
         found = from_smooth(part, None, max_terms=max_terms)
+    # About a solution that does not fit first order tells little, and other starts cost less.
+    return with_entrances(part, found, max_terms=max_terms) if found.fits else (part, found)
+
+
+def with_entrances(
+    part: EstimationProblem, found: Solution, *, max_terms: int
+) -> tuple[EstimationProblem, Solution]:
+    """Let terms into the working set as long as they make the solution likelier."""
+    problem = part.candidates
     problem.watch.best = part, found
     for _ in range(MAX_ENTRANCES):
+        kept = part.taken
         entering = ~kept & _would_pay(problem, kept, part, found)
         if not entering.any():
             break
@@ -59,10 +69,9 @@ def search_within(
         )
         with problem.watch.stage(_weighed(whole)):
             tried = settle(whole, widened, found.noise.effective, max_terms=max_terms)
-        # About a solution that does not fit, first order tells little.
         if (not tried.fits, tried.score) >= (not found.fits, found.score):
             break
-        kept, part, found = larger, whole, tried
+        part, found = whole, tried
         problem.watch.best = part, found
     return part, found
 

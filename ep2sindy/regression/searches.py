@@ -122,30 +122,49 @@ class BestSubset:
         of its own variance and the same number of rows, this maximises the likelihood. No
         weights are needed, since the scale of one problem multiplies all products alike.
         """
-        depth = min(self.max_terms, xy.shape[1])
-        check_memory(
-            8.0 * (depth + 1) * len(xy) * (xy.shape[1] + 1.0) ** 2,
-            f"Gram matrices of {xy.shape[1]} terms at each of {depth} sizes",
-            way_out="lower max_terms, take fewer terms, or a lower degree",
+        found, proven = subsets_within(
+            xx, xy, yy, max_terms=self.max_terms, n_best=self.n_best, most_work=MOST_WORK
         )
-        # Branches are cut sooner if the columns closest to the targets come first.
-        order = np.argsort(-np.square(xy).sum(axis=0), kind="stable")
-        ordered = xx.take(order, axis=1).take(order, axis=2), xy.take(order, axis=1), yy
-        found, proven = best_subsets(*ordered, self.max_terms, self.n_best, MOST_WORK)
-        if not proven:
-            warnings.warn(
-                f"the best supports of {xy.shape[1]} terms were found by exchanges and are not "
-                f"proven best: a proof for up to {depth} terms would take too long; lower "
-                "max_terms or take fewer terms for a proof",
-                Unproven,
-                stacklevel=2,
-            )
-            found = exchanged_supports(
-                *ordered, max_terms=self.max_terms, n_best=self.n_best, known=found
-            )
-        masks = np.zeros_like(found)
-        masks[:, order] = found
-        return masks
+        if proven:
+            return found
+        warnings.warn(
+            f"the best supports of {xy.shape[1]} terms were found by exchanges and are not "
+            f"proven best: a proof for up to {min(self.max_terms, xy.shape[1])} terms would take "
+            "too long; lower max_terms or take fewer terms for a proof",
+            Unproven,
+            stacklevel=2,
+        )
+        return exchanged_supports(
+            xx, xy, yy, max_terms=self.max_terms, n_best=self.n_best, known=found
+        )
+
+
+def subsets_within(
+    xx: Float[np.ndarray, "problems terms terms"],
+    xy: Float[np.ndarray, "problems terms"],
+    yy: Float[np.ndarray, " problems"],
+    *,
+    max_terms: int,
+    n_best: int,
+    most_work: float,
+) -> tuple[Masks, bool]:
+    """The best supports of every size, as for `BestSubset`, and whether they are proven best.
+
+    most_work: multiplications after which the search ends with the best supports so far.
+    """
+    depth, n_terms = min(max_terms, xy.shape[1]), xy.shape[1]
+    check_memory(
+        8.0 * (depth + 1) * len(xy) * (n_terms + 1.0) ** 2,
+        f"Gram matrices of {n_terms} terms at each of {depth} sizes",
+        way_out="lower max_terms, take fewer terms, or a lower degree",
+    )
+    # Branches are cut sooner if the columns closest to the targets come first.
+    order = np.argsort(-np.square(xy).sum(axis=0), kind="stable")
+    ordered = xx.take(order, axis=1).take(order, axis=2), xy.take(order, axis=1), yy
+    found, proven = best_subsets(*ordered, max_terms, n_best, most_work)
+    masks = np.zeros_like(found)
+    masks[:, order] = found
+    return masks, proven
 
 
 def _where_set(max_terms: int | None) -> dict[str, int]:

@@ -1,0 +1,206 @@
+"""The flow of a library's models over the steps of a record, and its derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ep2sindy.estimation.kernels import LEADS, WEIGHTS, advance, sensitivities, term_values
+from ep2sindy.library.library import Library
+
+# Equation and term of each coefficient by which a flow is differentiated.
+Coefficients = tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """States at the end of each step of a model, and their derivatives.
+
+    ends: (steps, d). slopes: (steps, d, d + coefficients), derivatives by the state, then by the
+    coefficients.
+    """
+
+    ends: Float[np.ndarray, "steps d"]
+    slopes: Float[np.ndarray, "steps d columns"]
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Steps of a record, each divided into substeps.
+
+    h: (steps,), length of one substep. inputs: (2 substeps + 1, steps, inputs), at the ends and the
+    middles of the substeps.
+    """
+
+    h: Float[np.ndarray, " steps"]
+    inputs: Float[np.ndarray, "positions steps n_inputs"]
+
+    @property
+    def n_substeps(self) -> int:
+        return len(self.inputs) // 2
+
+    def inputs_at(self, substep: int, stage: int) -> Float[np.ndarray, "steps n_inputs"]:
+        return self.inputs[2 * substep + (stage + 1) // 2]
+
+
+@dataclass(frozen=True, eq=False)
+class RightHandSides:
+    """Models of d states whose terms are of one library: rates = terms' values @ coef (terms, d).
+
+    library: of the states, then the inputs.
+    """
+
+    library: Library
+    d: int
+
+    def rates(
+        self,
+        coef: Float[np.ndarray, "terms d"],
+        states: Float[np.ndarray, "n d"],
+        inputs: Float[np.ndarray, "n n_inputs"],
+    ) -> Float[np.ndarray, "n d"]:
+        return self._products_of(states, inputs) @ (self._shares[:, 0].T @ coef)
+
+    def ends(
+        self,
+        coef: Float[np.ndarray, "terms d"],
+        states: Float[np.ndarray, "steps d"],
+        steps: Steps,
+    ) -> Float[np.ndarray, "steps d"]:
+        """States at the end of each step, by classical Runge-Kutta substeps."""
+        if not self._products.functions:
+            none = np.empty(0, dtype=np.int64)
+            return self._compiled(coef, states, steps, (none, none), np.empty((*states.shape, 0)))
+        rates = self._shares[:, 0].T @ coef
+        h = steps.h[:, None]
+        for k in range(steps.n_substeps):
+            slope, total = np.zeros_like(states), states
+            for s, (lead, weight) in enumerate(zip(LEADS, WEIGHTS, strict=True)):
+                here = states + lead * h * slope
+                slope = self._products_of(here, steps.inputs_at(k, s)) @ rates
+                total = total + weight * h * slope
+            states = total
+        return states
+
+    def flow(
+        self,
+        coef: Float[np.ndarray, "terms d"],
+        states: Float[np.ndarray, "steps d"],
+        steps: Steps,
+        by: Coefficients,
+        *,
+        n_more: int = 0,
+    ) -> Flow:
+        """`ends` with its derivatives by the states, and by some of the coefficients.
+
+        n_more: columns of zeros behind them, for derivatives by something else.
+        """
+        slopes = np.zeros((len(states), self.d, self.d + len(by[0]) + n_more))
+        route = self._in_arrays if self._products.functions else self._compiled
+        return Flow(route(coef, states, steps, by, slopes), slopes)
+
+    def _compiled(
+        self,
+        coef: Float[np.ndarray, "terms d"],
+        states: Float[np.ndarray, "steps d"],
+        steps: Steps,
+        by: Coefficients,
+        slopes: Float[np.ndarray, "steps d columns"],
+    ) -> Float[np.ndarray, "steps d"]:
+        """Ends of the steps by the compiled kernel; derivatives go to slopes, unless it is empty.
+
+        Products that neither the coefficients nor the derivatives need stay out.
+        """
+        terms, equations = np.nonzero(coef)
+        first, n_addends = self._first_addend[terms], self._n_addends[terms]
+        which = np.repeat(np.arange(len(terms)), n_addends)  # coefficient of each entry
+        place = np.arange(len(which)) - np.repeat(np.cumsum(n_addends) - n_addends, n_addends)
+        entry = np.repeat(first, n_addends) + place
+        if not slopes.shape[2]:
+            kept = self._addends[1][entry] == 0
+            which, entry = which[kept], entry[kept]
+        _, column, product = (each[entry] for each in self._addends)
+        target = equations[which]
+        slope_of = column > 0
+        pairs, pair = np.unique(
+            target[slope_of] * self.d + column[slope_of] - 1, return_inverse=True
+        )
+        target[slope_of] = self.d + pair
+        weight = self._shares[terms[which], column, product] * coef[terms, equations][which]
+        wanted = self._places[by[1]]
+        needed = np.union1d(product, wanted)
+        ends = np.empty_like(states)
+        advance(
+            np.ascontiguousarray(states), steps.inputs, steps.h, self._products.table[needed],
+            np.searchsorted(needed, product), target, weight, pairs // self.d, pairs % self.d,
+            by[0], np.searchsorted(needed, wanted), ends, slopes,
+        )  # fmt: skip
+        return ends
+
+    def _in_arrays(
+        self,
+        coef: Float[np.ndarray, "terms d"],
+        states: Float[np.ndarray, "steps d"],
+        steps: Steps,
+        by: Coefficients,
+        slopes: Float[np.ndarray, "steps d columns"],
+    ) -> Float[np.ndarray, "steps d"]:
+        """`_compiled` for libraries with functions, which are evaluated at all samples at once."""
+        d, of = self.d, (by[0], self._places[by[1]])
+        by_state = np.einsum("tjp,ti->pij", self._shares[:, 1:], coef)
+        rates = np.column_stack([self._shares[:, 0].T @ coef, by_state.reshape(-1, d * d)])
+        slopes[:, np.arange(d), np.arange(d)] = 1.0
+        for k in range(steps.n_substeps):
+            slope, total = np.zeros_like(states), states
+            jacobians, values = [], []
+            for s, (lead, weight) in enumerate(zip(LEADS, WEIGHTS, strict=True)):
+                here = states + (lead * steps.h)[:, None] * slope
+                values.append(self._products_of(here, steps.inputs_at(k, s)))
+                both = values[-1] @ rates
+                slope = both[:, :d]
+                jacobians.append(both[:, d:].reshape(-1, d, d))
+                total = total + (weight * steps.h)[:, None] * slope
+            leads, weights = np.array(LEADS), np.array(WEIGHTS)
+            stages = np.stack(jacobians), np.stack(values)
+            sensitivities(*stages, *of, leads, weights, steps.h, slopes)
+            states = total
+        return states
+
+    def _products_of(
+        self, states: Float[np.ndarray, "n d"], inputs: Float[np.ndarray, "n n_inputs"]
+    ) -> Float[np.ndarray, "n products"]:
+        columns = np.concatenate([states, inputs, np.ones((len(states), 1))], axis=1)
+        return term_values(self._products.with_functions(columns, axis=1), self._products.table)
+
+    @cached_property
+    def _derived(self) -> tuple[Library, np.ndarray]:
+        return self.library.with_derivatives(self.d)
+
+    @property
+    def _products(self) -> Library:
+        return self._derived[0]
+
+    @property
+    def _shares(self) -> Float[np.ndarray, "terms columns products"]:
+        return self._derived[1]
+
+    @cached_property
+    def _places(self) -> Int[np.ndarray, " terms"]:
+        """Index of the product that equals each term."""
+        return np.argmax(self._shares[:, 0] != 0.0, axis=1)
+
+    @cached_property
+    def _addends(self) -> tuple[np.ndarray, ...]:
+        """Term, column and product of every share that is not zero, in the order of the terms."""
+        return np.nonzero(self._shares)
+
+    @cached_property
+    def _n_addends(self) -> Int[np.ndarray, " terms"]:
+        return np.bincount(self._addends[0], minlength=len(self.library))
+
+    @cached_property
+    def _first_addend(self) -> Int[np.ndarray, " terms"]:
+        return np.cumsum(self._n_addends) - self._n_addends
