@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from itertools import islice, pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
-from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.trajectory import ConstantStateError, Trajectory
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding, constraint
@@ -42,6 +42,10 @@ MAX_COMBINATIONS = 100_000
 # For a correct equation chi-squared per row is 1 within its standard error, and a little more,
 # since the noise is estimated from the same samples. Measured: 0.7 to 1.3 with 70 rows.
 MAX_CHI_SQUARED, STANDARD_ERRORS = 1.2, 3.0
+
+# Samples that are tested, and those of one block. More would say the same: the standard error of
+# chi-squared is 2 % then.
+MOST_TESTED, BLOCK = 20_000, 4_000
 
 SMALLEST = np.finfo(np.float64).tiny  # for exact fits, without residuals
 
@@ -198,7 +202,7 @@ def noise_test(
     the model's own coefficients are tested. Otherwise the terms are fitted again to the weak rows,
     which are whitened, and that fit is tested: coefficients of a formulation that does not weigh
     its rows are not. A state without such rows, for example for a record of a few samples, is not
-    tested.
+    tested. Of long records, blocks of 20,000 samples together are tested.
     estimate: of states and coefficients together, which has tested whole trajectories already. It
     counts only if the chosen model is its own.
     """
@@ -222,7 +226,7 @@ def _left_of_weak_rows(
         used = np.isin(model.library.names, [name for s in states for name in model.terms(s)])
         used[0] |= not used.any()  # a library needs a term
         form, rng = Weak(split=RandomSplit(0.0)), np.random.default_rng(0)
-        rows = form.assemble(runs, model.library.take(used), rng=rng)
+        rows = form.assemble(blocks_of(runs), model.library.take(used), rng=rng)
     except (ValueError, np.linalg.LinAlgError):
         return {}
     problems = {problem.equations[0]: problem for problem in rows}
@@ -234,6 +238,28 @@ def _left_of_weak_rows(
             elif (tested := reweight(problem, fit).left) is not None:
                 left[state] = tested
     return left
+
+
+def blocks_of(runs: Sequence[Trajectory]) -> list[Trajectory]:
+    """Blocks of neighbouring samples that tell a misfit as well as all of a long record.
+
+    They are spread evenly over the records, whose noise may change. Records of at most MOST_TESTED
+    samples together come back whole.
+    """
+    if sum(run.n_samples for run in runs) <= MOST_TESTED:
+        return list(runs)
+    bounds = [
+        (run, np.linspace(0, run.n_samples, -(-run.n_samples // BLOCK) + 1).astype(int))
+        for run in runs
+    ]
+    pieces = [(run, *pair) for run, each in bounds for pair in pairwise(each.tolist())]
+    longest = max(last - first for _, first, last in pieces)
+    chosen = np.linspace(0, len(pieces) - 1, MOST_TESTED // longest).round().astype(int)
+    found = []
+    for run, first, last in (pieces[k] for k in np.unique(chosen)):
+        with suppress(ConstantStateError):  # a state may rest for as long as a block
+            found.append(run.window(first, last))
+    return found or list(runs)
 
 
 def _fit_in(model: SparseModel, state: str) -> EquationFit:

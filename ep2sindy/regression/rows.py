@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,6 +14,7 @@ from scipy.sparse import csr_array
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.regression.window_kernels import band_width
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.trust.memory import check_memory
@@ -39,7 +40,8 @@ class NoisyRows:
     """Dependence of the training rows of one equation on the noisy samples x.
 
     Targets are slope @ x[state], terms are mean @ library(x); both matrices are sparse, (rows,
-    samples). values: (samples, variables), the library's variables, then states that it lacks.
+    samples), with sorted columns. values: (samples, variables), the library's variables, then
+    states that it lacks.
     smoothed: an estimate of their true values. noise_std: standard deviation of their independent
     noise.
     """
@@ -50,6 +52,36 @@ class NoisyRows:
     values: Float[np.ndarray, "samples variables"]
     smoothed: Float[np.ndarray, "samples variables"]
     noise_std: Float[np.ndarray, "samples variables"]
+
+    @cached_property
+    def stretches(self) -> Stretches:
+        """The windows of all rows as stretches of neighbouring samples."""
+        first = np.minimum(*(_ends(matrix)[0] for matrix in (self.mean, self.slope)))
+        last = np.maximum(*(_ends(matrix)[1] for matrix in (self.mean, self.slope)))
+        starts = np.append(0, np.cumsum(last + 1 - first))
+        mean, slope = np.zeros((2, starts[-1]))
+        for weights, matrix in ((mean, self.mean), (slope, self.slope)):
+            row = np.repeat(np.arange(len(first)), np.diff(matrix.indptr))
+            weights[starts[row] + matrix.indices - first[row]] = matrix.data
+        return Stretches(starts, first, mean, slope, band_width(first, last))
+
+
+class Stretches(NamedTuple):
+    """Windows of rows: that of row i is mean[starts[i]:starts[i + 1]] from sample first[i] on.
+
+    slope: in the same places. width: largest distance between rows that overlap, plus one.
+    """
+
+    starts: Int[np.ndarray, " bounds"]
+    first: Int[np.ndarray, " rows"]
+    mean: Float[np.ndarray, " weights"]
+    slope: Float[np.ndarray, " weights"]
+    width: int
+
+
+def _ends(matrix: csr_array) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " rows"]]:
+    """First and last sample of every row of a sparse matrix with sorted columns."""
+    return matrix.indices[matrix.indptr[:-1]], matrix.indices[matrix.indptr[1:] - 1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -199,15 +199,21 @@ def spectral_change_point(x: Float[np.ndarray, " samples"]) -> int:
     with the least sum of squares is chosen.
     """
     total = np.cumsum(np.abs(np.fft.rfft(x - x.mean())))
-    bins = np.arange(len(total))
-    if len(bins) < 3:
+    last = len(total) - 1
+    if last < 2:
         return 1
     # Two hundred trial corners, denser at low bins, locate the bend well enough.
-    corners = np.unique(np.geomspace(1, len(bins) - 2, 200).astype(int))
-    misfit = [
-        np.square(total - np.interp(bins, [0, c, bins[-1]], total[[0, c, -1]])).sum()
-        for c in corners
-    ]
+    corners = np.unique(np.geomspace(1, last - 1, 200).astype(int))
+    bins = np.arange(last + 1.0)
+    sums = np.cumsum([np.ones_like(bins), bins, bins**2, total, bins * total, total**2], axis=1)
+    misfit = np.zeros(len(corners))
+    for first, end in ((np.zeros_like(corners), corners), (corners, np.full_like(corners, last))):
+        rise = (total[end] - total[first]) / (end - first)
+        start = total[first] - rise * first
+        # Squares of the bins after the first one; at both ends of a chord there is no misfit.
+        n, k, kk, y, ky, yy = sums[:, end] - sums[:, first]
+        misfit += yy + n * start**2 + kk * rise**2
+        misfit += 2.0 * (k * start * rise - y * start - ky * rise)
     return int(corners[np.argmin(misfit)])
 
 

@@ -203,7 +203,8 @@ def _pieces(run: Trajectory) -> list[Trajectory]:
 
 def _stack(blocks: Iterable[csr_array]) -> csr_array:
     """Block-diagonal matrix of the windows of all trajectories over all their samples."""
-    return block_diag(list(blocks), format="csr")
+    first, *others = blocks
+    return block_diag([first, *others], format="csr") if others else first
 
 
 def _noisy_rows(

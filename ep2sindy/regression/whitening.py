@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
+from ep2sindy.regression.window_kernels import banded_covariance
 
 # Largest correction of a sample, in standard deviations of its noise; with a wrong model the
 # corrections would otherwise grow without limit.
@@ -29,6 +30,8 @@ ROUNDING = 1e-8
 RISE = 10.0
 
 MAX_HALVED = 6
+
+SETTLED = 1e-8  # change of the coefficients, as a share of the largest, that ends the steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +71,15 @@ def whitened_rows(
     rows = _Linearised.at(problem, problem.noisy.smoothed, coef, noisy=False)
     least = rows.misfit
     for _ in range(n_steps):
+        before = rows.coef
         following = _following(problem, rows, terms, limit=least + RISE * len(rows.target))
         if following is None:
             break
         rows, least = following, min(least, following.misfit)
+        if np.abs(rows.coef - before).max(initial=0.0) <= SETTLED * np.abs(rows.coef).max(
+            initial=0.0
+        ):
+            break
     return WhitenedRows(
         theta=rows.theta,
         target=rows.target - (rows.drifted - rows.theta) @ rows.coef,
@@ -107,7 +115,7 @@ class _Linearised:
 
     x: (samples, variables). coef: (terms,), in scaled columns.
     drifted: the terms at x plus their change from x to the raw samples, to first order.
-    noise: one sparse (rows, samples) matrix per variable, from its unit noise to the residuals.
+    sensitivity: (samples, variables), change of the model's rate per unit noise of each variable.
     """
 
     x: Float[np.ndarray, "samples variables"]
@@ -115,8 +123,9 @@ class _Linearised:
     theta: Float[np.ndarray, "rows terms"]
     drifted: Float[np.ndarray, "rows terms"]
     target: Float[np.ndarray, " rows"]
-    noise: list[csr_array]
+    sensitivity: Float[np.ndarray, "samples variables"]
     factor: Float[np.ndarray, "band rows"]
+    slope: csr_array
     source: NoisyRows
 
     @staticmethod
@@ -141,22 +150,20 @@ class _Linearised:
         terms = library.evaluate(known) / problem.theta_scale
         if noisy and library.functions:
             terms = terms - _lift(problem, known) / problem.theta_scale
+        sensitivity = np.zeros_like(rows.noise_std)
+        sensitivity[:, :n_variables] = (slopes @ coef).T
+        sensitivity *= rows.noise_std
         slope = rows.slope / problem.target_scale[0]
-        noise = []
-        for v, std in enumerate(rows.noise_std.T):
-            sensitivity = slopes[v] @ coef if v < n_variables else np.zeros(len(x))
-            residual = _times(rows.mean, sensitivity)
-            if v == rows.state:
-                residual = residual - slope
-            noise.append(_times(residual, std))
-        factor = _banded_cholesky(sum(m @ m.T for m in noise))
+        factor = _banded_cholesky(_covariance(rows, sensitivity, problem.target_scale[0]))
         theta = rows.mean @ terms
         columns = np.column_stack(
             [theta, theta + rows.mean @ change, slope @ rows.values[:, rows.state]]
         )
         white = _solve(factor, columns)
         n = len(library)
-        return _Linearised(x, coef, white[:, :n], white[:, n:-1], white[:, -1], noise, factor, rows)
+        return _Linearised(
+            x, coef, white[:, :n], white[:, n:-1], white[:, -1], sensitivity, factor, slope, rows
+        )
 
     @property
     def misfit(self) -> float:
@@ -183,9 +190,11 @@ class _Linearised:
     def correct(self, coef: Float[np.ndarray, " terms"]) -> Float[np.ndarray, "samples variables"]:
         """Samples minus their most likely noise."""
         weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
-        noise = np.stack([m.T @ weighted for m in self.noise], axis=1)
+        rows = self.source
+        noise = (rows.mean.T @ weighted)[:, None] * self.sensitivity
+        noise[:, rows.state] -= (self.slope.T @ weighted) * rows.noise_std[:, rows.state]
         limited = np.clip(noise, -LARGEST_CORRECTION, LARGEST_CORRECTION)
-        return self.source.values - limited * self.source.noise_std
+        return rows.values - limited * rows.noise_std
 
 
 def _lift(
@@ -214,19 +223,22 @@ def _lift(
     return lift
 
 
-def _times(matrix: csr_array, columns: np.ndarray) -> csr_array:
-    """Multiply each column of a sparse matrix by its own number."""
-    data = matrix.data * columns[matrix.indices]
-    return csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+def _covariance(
+    rows: NoisyRows, sensitivity: Float[np.ndarray, "samples variables"], target_scale: float
+) -> Float[np.ndarray, "band rows"]:
+    """Covariance of the rows by the samples' noise, from its diagonal downwards."""
+    windows = rows.stretches
+    own, std = sensitivity[:, rows.state], rows.noise_std[:, rows.state] / target_scale
+    band = np.zeros((windows.width, len(windows.first)))
+    banded_covariance(
+        windows.starts, windows.first, windows.mean, windows.slope,
+        np.square(sensitivity).sum(axis=1), own * std, np.square(std), band,
+    )  # fmt: skip
+    return band
 
 
-def _banded_cholesky(covariance: csr_array) -> np.ndarray:
+def _banded_cholesky(band: Float[np.ndarray, "band rows"]) -> Float[np.ndarray, "band rows"]:
     """Lower Cholesky factor of the covariance, banded since distant windows do not overlap."""
-    entries = covariance.tocoo()
-    row, column = entries.coords
-    below = row >= column
-    band = np.zeros((int((row - column).max(initial=0)) + 1, covariance.shape[0]))
-    band[(row - column)[below], column[below]] = entries.data[below]
     band[0] += RIDGE * band[0].mean() + ROUNDING**2 / len(band[0])
     return cholesky_banded(band, lower=True)
 

@@ -19,6 +19,10 @@ from ep2sindy.runtime.compilation import compiled
 ROUNDING = np.finfo(np.float64).eps ** 2
 
 
+# Difference of two steps that count as even, and change of the filter's variances that ends them.
+EVEN, SETTLED = 1e-9, 1e-13
+
+
 class Gains(NamedTuple):
     """Kalman gains and covariances, the same for all columns.
 
@@ -133,7 +137,15 @@ def gains(steps, ratio):
     gain, variance = np.zeros((n_samples, 3)), np.ones(n_samples)
     slope_cov = np.empty((n_samples, 3))
     parabola, lower, diagonal = _start(steps, ratio, slope_cov)
+    settled = False  # at even steps the covariance soon repeats itself
     for k in range(3, n_samples):
+        settled = settled and abs(steps[k - 1] - steps[k - 2]) <= EVEN
+        if settled:
+            variance[k] = variance[k - 1]
+            for i in range(3):
+                gain[k, i], slope_cov[k, i] = gain[k - 1, i], slope_cov[k - 1, i]
+            continue
+        before = diagonal
         lower, (d0, d1, d2) = _predict(steps[k - 1], ratio, lower, diagonal)
         l10, l20, l21 = lower
         variance[k] = d0 + 1.0
@@ -143,6 +155,9 @@ def gains(steps, ratio):
         slope_cov[k, 0] = l10 * d0
         slope_cov[k, 1] = l10 * l10 * d0 + d1
         slope_cov[k, 2] = l10 * l20 * d0 + l21 * d1
+        settled = abs(steps[k - 1] - steps[k - 2]) <= EVEN
+        for i in range(3):
+            settled = settled and abs(diagonal[i] - before[i]) <= SETTLED * diagonal[i]
     return Gains(parabola, gain, variance, slope_cov)
 
 
@@ -187,10 +202,13 @@ def likelihood(steps, values, ratio):
     known = gains(steps, ratio)
     innovation, _ = _filter(steps, values, known)
     n_samples, n_columns = values.shape
-    total, noise, log_variance = np.zeros(n_columns), np.empty(n_columns), 0.0
+    total, noise = np.zeros(n_columns), np.empty(n_columns)
+    log, log_variance = 0.0, 0.0
     for k in range(3, n_samples):
         weight = 1.0 / known.variance[k]
-        log_variance += np.log(known.variance[k])
+        if known.variance[k] != known.variance[k - 1]:
+            log = np.log(known.variance[k])
+        log_variance += log
         for j in range(n_columns):
             total[j] += weight * innovation[k, j] ** 2
     for j in range(n_columns):

@@ -1,0 +1,113 @@
+"""The test of a regression's residuals: fast kernels against plain forms, and blocks of records."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array, diags_array
+
+import ep2sindy as ep
+from ep2sindy.discovery import choice
+from ep2sindy.discovery.choice import blocks_of
+from ep2sindy.regression.rows import NoisyRows
+from ep2sindy.regression.test_functions import spectral_change_point
+from ep2sindy.regression.whitening import _covariance
+from ep2sindy.signals.kernels import likelihood, smooth
+
+
+def plain_covariance(rows: NoisyRows, sensitivity: np.ndarray, target_scale: float) -> np.ndarray:
+    """The sum over variables of M M', where M is the rows' change per unit noise of a variable."""
+    total = np.zeros((rows.mean.shape[0],) * 2)
+    for v, std in enumerate(rows.noise_std.T):
+        change = rows.mean @ diags_array(sensitivity[:, v])
+        if v == rows.state:
+            change = change - rows.slope @ diags_array(std) / target_scale
+        total += (change @ change.T).toarray()
+    return total
+
+
+@pytest.mark.parametrize("order", ["as they come", "shuffled"])
+@pytest.mark.parametrize("steps", ["even", "uneven"])
+def test_the_banded_covariance_is_that_of_sparse_products(steps: str, order: str) -> None:
+    rng = np.random.default_rng(0)
+    run = ep.lorenz().trajectory(noise=0.02, rng=0).window(0, 400)
+    if steps == "uneven":
+        kept = np.sort(rng.choice(400, size=300, replace=False))
+        run = ep.Trajectory(run.t[kept], run.states[kept], run.state_names)
+    problems = ep.Weak(split=ep.RandomSplit(0.0)).assemble(
+        [run], ep.polynomial(run.state_names, degree=2), rng=rng
+    )
+    rows = problems[1].noisy
+    assert rows is not None
+    if order == "shuffled":
+        mixed = rng.permutation(rows.mean.shape[0])
+        rows = replace(rows, mean=csr_array(rows.mean[mixed]), slope=csr_array(rows.slope[mixed]))
+    sensitivity = rng.normal(size=rows.noise_std.shape)
+    band, plain = _covariance(rows, sensitivity, 3.0), plain_covariance(rows, sensitivity, 3.0)
+    n = len(plain)
+    for k in range(n):
+        below = np.diagonal(plain, -k)
+        found = band[k, : n - k] if k < len(band) else np.zeros(n - k)
+        np.testing.assert_allclose(found, below, atol=1e-12 * plain.max())
+
+
+def test_long_records_are_tested_in_blocks_spread_over_them() -> None:
+    t, rng = np.arange(50_000.0), np.random.default_rng(0)
+    long = ep.Trajectory(t, np.cumsum(rng.normal(size=(50_000, 1)), axis=0), ["x"])
+    short = long.window(0, 20_000)
+    assert blocks_of([short]) == [short]
+    blocks = blocks_of([long, short, short])
+    assert sum(block.n_samples for block in blocks) <= 20_000
+    assert len(blocks) == 5
+    assert {block.n_samples for block in blocks} == {3846, 3847, 4000}
+    assert blocks[0].t[0] == 0.0
+    assert blocks[-1].t[-1] == 19_999.0
+
+
+def test_blocks_in_which_a_state_rests_are_left_out() -> None:
+    x = np.append(np.zeros(30_000), np.sin(0.01 * np.arange(30_000.0)))
+    blocks = blocks_of([ep.Trajectory(np.arange(60_000.0), x[:, None], ["x"])])
+    assert len(blocks) == 3
+    assert all(block.t[0] >= 28_000.0 for block in blocks)
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_blocks_give_the_verdict_of_the_whole_record(
+    monkeypatch: pytest.MonkeyPatch, right: bool
+) -> None:
+    run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
+    library = ep.polynomial(run.state_names, degree=2 if right else 1)
+    method = ep.Regression(search=ep.BestSubset(max_terms=3))
+    whole = ep.discover(run, library, method=method, seed=0)
+    monkeypatch.setattr(choice, "MOST_TESTED", run.n_samples // 2)
+    monkeypatch.setattr(choice, "BLOCK", run.n_samples // 8)
+    method = ep.Regression(ep.Weak(), ep.BestSubset(max_terms=3))
+    blocks = ep.discover(run, library, method=method, seed=0)
+    assert bool(whole.misfit) == bool(blocks.misfit) == (not right)
+
+
+def test_the_change_point_is_the_corner_of_least_squares() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        x = np.sin(rng.uniform(0.05, 0.5) * np.arange(500)) + 0.1 * rng.normal(size=500)
+        total = np.cumsum(np.abs(np.fft.rfft(x - x.mean())))
+        bins = np.arange(len(total))
+        corners = np.unique(np.geomspace(1, len(bins) - 2, 200).astype(int))
+        left = [
+            np.square(total - np.interp(bins, [0, c, bins[-1]], total[[0, c, -1]])).sum()
+            for c in corners
+        ]
+        assert spectral_change_point(x) == corners[np.argmin(left)]
+
+
+@pytest.mark.parametrize("ratio", [1e-10, 1e-3, 10.0])
+def test_even_steps_give_what_nearly_even_ones_give(ratio: float) -> None:
+    """At even steps the gains are repeated once they have settled, and otherwise never."""
+    rng = np.random.default_rng(0)
+    values = np.cumsum(rng.normal(size=(3000, 1)), axis=0) / 100.0
+    even, nearly = np.ones(2999), 1.0 + 2e-9 * (-1.0) ** np.arange(2999)
+    for route in (likelihood, smooth):
+        for found, plain in zip(
+            route(even, values, ratio), route(nearly, values, ratio), strict=True
+        ):
+            np.testing.assert_allclose(found, plain, rtol=1e-6, atol=1e-7)
