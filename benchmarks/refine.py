@@ -28,9 +28,10 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.methods.nelder_mead import window_paths
-from ep2sindy.refinement.ode import ODE, HermiteSimpson
+from ep2sindy.refinement.ode import ODE
 from ep2sindy.refinement.problem import Iteration, RefinementProblem, RefinementSettings
 from ep2sindy.refinement.refine import refine
+from ep2sindy.refinement.steps import HermiteSimpson
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from tests.single_shooting import SingleShooting
 

@@ -9,7 +9,6 @@ import torch
 from scipy.optimize import least_squares
 from torchdiffeq import odeint
 
-from ep2sindy.refinement.ode import RungeKutta
 from ep2sindy.refinement.problem import (
     Iteration,
     RefinementFit,
@@ -17,6 +16,7 @@ from ep2sindy.refinement.problem import (
     join,
     residual_weights,
 )
+from ep2sindy.refinement.steps import RungeKutta
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from torchdiffeq import odeint
 from ep2sindy.library.library import named_terms
 from ep2sindy.library.relations import constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.refinement.ode import ODE, Drive, HermiteSimpson, RungeKutta, augment
+from ep2sindy.refinement.ode import ODE, Drive, augment
+from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
 from ep2sindy.systems.systems import lotka_volterra
 
 SCALE = np.array([2.0, 3.0])

@@ -14,9 +14,9 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.methods.nelder_mead import NelderMead
-from ep2sindy.refinement.ode import HermiteSimpson, RungeKutta
 from ep2sindy.refinement.problem import Iteration, Method, RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine
+from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
 from ep2sindy.refinement.windows import cut_windows, dominant_window
 from ep2sindy.systems.systems import System, lorenz, lotka_volterra
 from tests.single_shooting import SingleShooting

@@ -8,8 +8,18 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.estimation.kernels import LEADS, WEIGHTS, advance, sensitivities, term_values
+from ep2sindy.estimation.kernels import sensitivities, term_values
 from ep2sindy.library.library import Library
+from ep2sindy.model.flow_kernels import SumsOfProducts, Tableau, advance
+
+LEADS = (0.0, 0.5, 0.5, 1.0)  # of the stages of a step, and their weights
+WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
+CLASSICAL = Tableau(
+    leads=np.diag(LEADS[1:], k=-1),
+    weights=np.array(WEIGHTS),
+    places=np.array([0, 1, 1, 2]),
+    stride=2,
+)
 
 # Equation and term of each coefficient by which a flow is differentiated.
 Coefficients = tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]
@@ -114,7 +124,7 @@ class RightHandSides:
 
         Products that neither the coefficients nor the derivatives need stay out.
         """
-        terms, equations = np.nonzero(coef)
+        terms, states_of = np.nonzero(coef)
         first, n_addends = self._first_addend[terms], self._n_addends[terms]
         which = np.repeat(np.arange(len(terms)), n_addends)  # coefficient of each entry
         place = np.arange(len(which)) - np.repeat(np.cumsum(n_addends) - n_addends, n_addends)
@@ -123,21 +133,25 @@ class RightHandSides:
             kept = self._addends[1][entry] == 0
             which, entry = which[kept], entry[kept]
         _, column, product = (each[entry] for each in self._addends)
-        target = equations[which]
+        target = states_of[which]
         slope_of = column > 0
         pairs, pair = np.unique(
             target[slope_of] * self.d + column[slope_of] - 1, return_inverse=True
         )
         target[slope_of] = self.d + pair
-        weight = self._shares[terms[which], column, product] * coef[terms, equations][which]
-        wanted = self._places[by[1]]
-        needed = np.union1d(product, wanted)
-        ends = np.empty_like(states)
-        advance(
-            np.ascontiguousarray(states), steps.inputs, steps.h, self._products.table[needed],
-            np.searchsorted(needed, product), target, weight, pairs // self.d, pairs % self.d,
-            by[0], np.searchsorted(needed, wanted), ends, slopes,
+        weight = self._shares[terms[which], column, product] * coef[terms, states_of][which]
+        # Each coefficient's own product is a sum by itself.
+        own, p = self._places[by[1]], np.arange(len(by[0]))
+        product = np.append(product, own)
+        target = np.append(target, self.d + len(pairs) + p)
+        needed = np.unique(product)
+        equations = SumsOfProducts(
+            self._products.table[needed], np.searchsorted(needed, product), target,
+            np.append(weight, np.ones(len(p))), pairs // self.d, pairs % self.d, by[0], p,
         )  # fmt: skip
+        ends = np.empty_like(states)
+        states = np.ascontiguousarray(states)
+        advance(states, steps.inputs, steps.h, CLASSICAL, equations, ends, slopes)
         return ends
 
     def _in_arrays(

@@ -1,4 +1,4 @@
-"""Compiled kernels of the trajectory likelihood: flow, filter, smoother.
+"""Compiled kernels of the trajectory likelihood: sensitivities, filter, smoother.
 
 A record has n samples of d states; p coefficients are free. The flow maps a state over one step
 between samples; `flow`: (n - 1, d, d + p) holds its derivatives with respect to the state, then to
@@ -6,24 +6,12 @@ the coefficients. Everything is linearised about a path: `misses` (n - 1, d) is 
 next state of the path, `residuals` (n, d) is the samples minus the path, and the unknowns are
 departures from the path.
 
-The flow itself, of products of states, takes classical Runge-Kutta steps. LANES samples go through
-all stages side by side: what they need stays in the cache, and every innermost loop is over the
-lanes, so that it is one vector operation. Its derivatives are not integrated column by column: a
-change of the slope at stage s changes the end of the step by the matrix `gains[s]`, which follows
-from the Jacobians of the later stages. So each coefficient costs four products per state, however
-the states are coupled. `EstimationProblem` takes the same steps in array expressions if the library
-has functions.
-
 The kernels are loops because array expressions take seconds more to compile.
 """
 
 import numpy as np
 
 from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
-
-LANES = 16
-LEADS = (0.0, 0.5, 0.5, 1.0)  # of the stages of a step, and their weights
-WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
 
 
 @compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
@@ -247,154 +235,3 @@ def departures(flow, misses, residuals, variance, process, free_start):
             for j in range(d):
                 means[k, i] -= covs[k, i, j] * adjoint[j]
     return means
-
-
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def _sum_products(columns, table, product, target, weight, values, sums):
-    """Products of the columns, and the weighted sums of products: slopes, then Jacobian."""
-    one = len(columns) - 1
-    for m in range(len(table)):
-        for i in range(LANES):
-            values[m, i] = columns[table[m, 0], i]
-        for k in range(1, table.shape[1]):
-            if table[m, k] != one:
-                for i in range(LANES):
-                    values[m, i] *= columns[table[m, k], i]
-    sums[:] = 0.0
-    for e in range(len(product)):
-        for i in range(LANES):
-            sums[target[e], i] += weight[e] * values[product[e], i]
-
-
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def _add_product(matrix, jacobian, row, factor, scale, total):
-    """Add scale (lanes,) times a matrix (d, d, lanes) times the sparse Jacobian to the total."""
-    for j in range(len(matrix)):
-        for q in range(len(row)):
-            for i in range(LANES):
-                total[j, factor[q], i] += scale[i] * matrix[j, row[q], i] * jacobian[q, i]
-
-
-@compiled
-def _gains(sums, row, factor, h, scale, gains, by_state):
-    """Change of the end of a step per change of the slope at each stage, and of its start."""
-    d = len(by_state)
-    gains[:], by_state[:] = 0.0, 0.0
-    for s in range(3, -1, -1):
-        if s < 3:
-            for i in range(LANES):
-                scale[i] = LEADS[s + 1] * h[i]
-            _add_product(gains[s + 1], sums[s + 1, d:], row, factor, scale, gains[s])
-        for j in range(d):
-            for i in range(LANES):
-                gains[s, j, j, i] += WEIGHTS[s] * h[i]
-        scale[:] = 1.0
-        _add_product(gains[s], sums[s, d:], row, factor, scale, by_state)
-    for j in range(d):
-        for i in range(LANES):
-            by_state[j, j, i] += 1.0
-
-
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def _derivatives(by, gains, by_state, values, reach, equation, column, first, total):
-    """One step of all derivatives (columns, d, lanes); before the first one they are trivial."""
-    d = len(by_state)
-    for c in range(len(by)):
-        for j in range(d):
-            for i in range(LANES):
-                total[j, i] = by_state[j, c, i] if first and c < d else 0.0
-            if not first:
-                for k in range(d):
-                    if reach[j, k]:
-                        for i in range(LANES):
-                            total[j, i] += by_state[j, k, i] * by[c, k, i]
-            if c >= d and reach[j, equation[c - d]]:
-                e, m = equation[c - d], column[c - d]
-                for i in range(LANES):
-                    total[j, i] += (
-                        gains[0, j, e, i] * values[0, m, i]
-                        + gains[1, j, e, i] * values[1, m, i]
-                        + gains[2, j, e, i] * values[2, m, i]
-                        + gains[3, j, e, i] * values[3, m, i]
-                    )
-        for j in range(d):
-            for i in range(LANES):
-                by[c, j, i] = total[j, i]
-
-
-@compiled
-def _reach(d, row, factor):
-    """Which states a step carries to which: along at most four entries of the Jacobian."""
-    reach, far = np.eye(d) > 0.0, np.eye(d) > 0.0
-    for _ in range(4):
-        for q in range(len(row)):
-            for k in range(d):
-                if reach[factor[q], k]:
-                    far[row[q], k] = True
-        reach[:] = far
-    return reach
-
-
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def _stages(here, inputs, h, columns, table, product, target, weight, values, sums, total):
-    """The stages of one step from `here`; its end goes to `total`, both (d, lanes)."""
-    d, last = len(here), inputs.shape[1] - 1
-    total[:] = here
-    for s in range(4):
-        for m in range(inputs.shape[2]):
-            for i in range(LANES):
-                columns[d + m, i] = inputs[(s + 1) // 2, min(i, last), m]
-        for j in range(d):
-            for i in range(LANES):
-                columns[j, i] = here[j, i]
-                if s > 0:
-                    columns[j, i] += LEADS[s] * h[i] * sums[s - 1, j, i]
-        _sum_products(columns, table, product, target, weight, values[s], sums[s])
-        for j in range(d):
-            for i in range(LANES):
-                total[j, i] += WEIGHTS[s] * h[i] * sums[s, j, i]
-
-
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def advance(
-    states, inputs, steps, table, product, target, weight, row, factor, equation, column, ends,
-    slopes,
-):  # fmt: skip
-    """Write the states at the end of every step to `ends` (n, d), and derivatives to `slopes`.
-
-    slopes: (n, d, d + p) and more, whose further columns are not touched, or (n, d, 0) if none are
-    asked for. inputs: (2 substeps + 1, n, inputs), at the ends and middles of the substeps; steps:
-    (n,), of one substep.
-    table: (products, factors), columns whose product it is; the column of ones is the last.
-    Entry e adds weight[e] times product[e] to sum target[e]: sum j < d is the slope of state j, and
-    sum d + q the derivative of the slope of state row[q] by state factor[q].
-    Coefficient c multiplies product column[c] in equation[c].
-    """
-    n, d = states.shape
-    n_columns = d + len(equation) if slopes.shape[2] else 0
-    columns = np.ones((d + inputs.shape[2] + 1, LANES))
-    values, sums = np.empty((4, len(table), LANES)), np.empty((4, d + len(row), LANES))
-    here, total = np.empty((d, LANES)), np.empty((d, LANES))
-    h, scale = np.empty(LANES), np.empty(LANES)
-    by, by_state = np.empty((n_columns, d, LANES)), np.empty((d, d, LANES))
-    gains, reach = np.empty((4, d, d, LANES)), _reach(d, row, factor)
-    for first in range(0, n, LANES):
-        n_here = min(LANES, n - first)
-        for i in range(LANES):  # lanes beyond the end repeat the last sample
-            h[i] = steps[first + min(i, n_here - 1)]
-            for j in range(d):
-                here[j, i] = states[first + min(i, n_here - 1), j]
-        for substep in range(len(inputs) // 2):
-            at = inputs[2 * substep : 2 * substep + 3, first : first + n_here]
-            _stages(here, at, h, columns, table, product, target, weight, values, sums, total)
-            here[:] = total
-            if n_columns:
-                _gains(sums, row, factor, h, scale, gains, by_state)
-                _derivatives(
-                    by, gains, by_state, values, reach, equation, column, substep == 0, total
-                )
-        for i in range(n_here):
-            for j in range(d):
-                ends[first + i, j] = here[j, i]
-                for c in range(n_columns):
-                    slopes[first + i, j, c] = by[c, j, i]

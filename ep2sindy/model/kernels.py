@@ -260,3 +260,35 @@ def run_many(table, coefs, start, steps_s, drive, n_substeps, centre, reach):
                     paths[k, i, m, w] = last[i]
                 inside[k, m, w] = bounded
     return paths, inside
+
+
+@compiled(error_model="numpy")
+def approach(
+    terms, coef, products, derivatives, centre, bound, until, times_rate, floor, y, t, left
+):
+    """Runge-Kutta steps of many starts until a time, each of length times_rate / max(rate, floor).
+
+    terms, coef, products, derivatives: of a `ScaledModel`, whose Jacobian's norm is the rate. y:
+    (starts, n), t and left: (starts,), the steps that each start may still take, are updated in
+    place. Returns flags, false for starts that left the bound about the centre.
+    """
+    n_starts, n = y.shape
+    kept, jacobian = np.ones(n_starts, dtype=np.bool_), np.empty(n * n)
+    total, slope, columns = np.empty(n), np.empty(n), np.ones(n + 1)
+    none = np.empty((0, 3))
+    for p in range(n_starts):
+        x = y[p]
+        while kept[p] and left[p] > 0 and t[p] < until:
+            for i in range(n):
+                columns[i] = x[i]
+            _add_terms(products, derivatives, columns, jacobian)
+            square = 0.0
+            for i in range(n * n):
+                square += jacobian[i] * jacobian[i]
+            h = times_rate / max(np.sqrt(square), floor)
+            _runge_kutta(terms, coef, none, h, x, total, slope, columns)
+            t[p] += h
+            left[p] -= 1
+            for i in range(n):
+                kept[p] = kept[p] and abs(x[i] - centre[i]) <= bound
+    return kept

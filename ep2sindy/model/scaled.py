@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.library.library import Library
+from ep2sindy.model.kernels import approach
 from ep2sindy.model.model import SparseModel
 
 
@@ -66,6 +68,34 @@ class ScaledModel:
         """Frobenius norm of the Jacobian at many states: no smaller than its largest eigenvalue."""
         jacobian = self.weights[:, len(y) :].T @ _evaluate(self.products, y)
         return np.sqrt(np.einsum("jp,jp->p", jacobian, jacobian))
+
+    def approach(
+        self,
+        y: Float[np.ndarray, "n_states starts"],
+        centre: Float[np.ndarray, " n_states"],
+        bound: float,
+        until: float,
+        n_steps: int,
+        *,
+        times_rate: float,
+        floor: float,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Starts that stay within the bound about the centre, run until a time.
+
+        Each takes Runge-Kutta steps of its own, times_rate / max(rate, floor) long, at most
+        n_steps. Returns the states, their times and the steps left. With functions in the library,
+        which no kernel evaluates, nothing has been run yet.
+        """
+        t, left = np.zeros(y.shape[1]), np.full(y.shape[1], n_steps)
+        if self.terms.functions:
+            return y, t, left
+        points, copied = np.array(y.T, order="C"), partial(np.array, order="C")
+        kept = approach(
+            self.terms.table, copied(self.coef),
+            self.products.table, copied(self.weights[:, len(y) :]),
+            centre, bound, until, times_rate, floor, points, t, left,
+        )  # fmt: skip
+        return points[kept].T, t[kept], left[kept]
 
 
 def _evaluate(library: Library, y: np.ndarray) -> np.ndarray:

@@ -184,15 +184,16 @@ def _on_cycle(
     nearest = KDTree(_interpolate(curve))
     centre = curve.mean(axis=0)[:, None]
     bound = BLOW_UP * np.abs(y - centre).max()
-    t, quarters = np.zeros(y.shape[1]), np.zeros((y.shape[1], 4), dtype=np.bool_)
-    for _ in range(n_steps):
-        running = t < n_periods
-        if not running.any():
-            break
+    y, t, left = scaled.approach(
+        y, centre[:, 0], float(bound), n_periods - N_LATE, n_steps,
+        times_rate=STEP_TIMES_RATE, floor=STEP_TIMES_RATE * MIN_STEPS,
+    )  # fmt: skip
+    quarters = np.zeros((len(t), 4), dtype=np.bool_)
+    while (running := (t < n_periods) & (left > 0)).any():
         with np.errstate(over="ignore", invalid="ignore"):  # runs that overflow are dropped
             step = np.where(running, _steps(scaled, y), 0.0)
             y = rk4_step(lambda x, _: scaled.slope(x), y, (t, t, t), step)
-            t = t + step
+            t, left = t + step, left - running
             kept = (np.abs(y - centre) <= bound).all(axis=0)
         late = np.flatnonzero(kept & (t >= n_periods - N_LATE))
         if len(late):
@@ -200,7 +201,7 @@ def _on_cycle(
             kept[late] = distance <= REACHED_WITHIN
             quarters[late, 4 * place // nearest.n] = True
         if not kept.all():
-            y, t, quarters = y[:, kept], t[kept], quarters[kept]
+            y, t, left, quarters = y[:, kept], t[kept], left[kept], quarters[kept]
     return int(np.count_nonzero(quarters.all(axis=1) & (t >= n_periods)))
 
 

@@ -6,8 +6,8 @@ from ep2sindy.refinement.methods.gradient_descent import (
     GradientDescent as GradientDescent,
 )  # for configs
 from ep2sindy.refinement.methods.nelder_mead import NelderMead as NelderMead  # for configs
-from ep2sindy.refinement.ode import RungeKutta as RungeKutta  # for configs
-from ep2sindy.refinement.ode import HermiteSimpson as HermiteSimpson  # for configs
+from ep2sindy.refinement.steps import RungeKutta as RungeKutta  # for configs
+from ep2sindy.refinement.steps import HermiteSimpson as HermiteSimpson  # for configs
 from ep2sindy.refinement.ode import ODE as ODE
 from ep2sindy.refinement.windows import cut_windows as cut_windows
 from ep2sindy.refinement.windows import WindowBatch as WindowBatch

@@ -15,7 +15,8 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.ode import ODE, ONE_RUNGE_KUTTA, Augmented, Drive, Step, augment
+from ep2sindy.refinement.ode import ODE, Augmented, Drive, augment
+from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
 from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.refinement.windows import (
     PERIODS,

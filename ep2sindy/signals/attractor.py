@@ -244,9 +244,13 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
 
 def _columns(phase: np.ndarray, order: int) -> np.ndarray:
     """Constant, then cosine and sine of each harmonic: (samples, 1 + 2 order)."""
-    turns = np.exp(1j * np.outer(phase, np.arange(1, order + 1)))
+    # Powers of one exponential: each costs a product instead of a sine and a cosine.
+    turns = np.empty((order, len(phase)), dtype=np.complex128)
+    turns[0] = turn = np.exp(1j * phase)
+    for k in range(1, order):
+        np.multiply(turns[k - 1], turn, out=turns[k])
     columns = np.empty((len(phase), 1 + 2 * order))
-    columns[:, 0], columns[:, 1::2], columns[:, 2::2] = 1.0, turns.real, turns.imag
+    columns[:, 0], columns[:, 1::2], columns[:, 2::2] = 1.0, turns.real.T, turns.imag.T
     return columns
 
 

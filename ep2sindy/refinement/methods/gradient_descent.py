@@ -12,7 +12,7 @@ import torch
 from torch import nn
 from torchdiffeq import odeint
 
-from ep2sindy.refinement.ode import ODE, Drive, RungeKutta
+from ep2sindy.refinement.ode import ODE, Drive
 from ep2sindy.refinement.problem import (
     Iteration,
     RefinementFit,
@@ -20,6 +20,7 @@ from ep2sindy.refinement.problem import (
     join,
     residual_weights,
 )
+from ep2sindy.refinement.steps import RungeKutta
 
 Optimizer = Callable[[list[nn.Parameter]], torch.optim.Optimizer]
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ep2sindy.refinement.kernels import condense, propagate, starts
-from ep2sindy.refinement.ode import ONE_RUNGE_KUTTA, Drive, Step
+from ep2sindy.refinement.ode import Drive
 from ep2sindy.refinement.problem import (
     Iteration,
     LawMap,
@@ -16,6 +16,7 @@ from ep2sindy.refinement.problem import (
     RefinementProblem,
     residual_weights,
 )
+from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
 
 # Directions of the scalings weaker than this share of the strongest are dropped.
 RANK = 1e-12

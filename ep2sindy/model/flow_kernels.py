@@ -1,0 +1,209 @@
+"""Compiled Runge-Kutta steps of many samples at once, with the derivatives of their ends.
+
+LANES samples go through all stages side by side: what they need stays in the cache, and every
+innermost loop is over the lanes, so that it is one vector operation.
+
+The derivatives are not integrated column by column. A change of the slope at stage s changes the
+end of the step by the matrix `gains[s]`, which follows from the Jacobians of the later stages. So
+each coefficient costs four products per state, however the states are coupled.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
+
+LANES = 16
+
+
+class Tableau(NamedTuple):
+    """An explicit scheme of four stages, in shares of a step.
+
+    leads: (4, 4), weight of each earlier slope in the state of a stage; weights: (4,), of the
+    slopes in the end of the step. places: (4,), of the stages among the positions at which inputs
+    are given; every step begins `stride` positions after the one before.
+    """
+
+    leads: np.ndarray
+    weights: np.ndarray
+    places: np.ndarray
+    stride: int
+
+
+class SumsOfProducts(NamedTuple):
+    """Right-hand sides and their derivatives as weighted sums of products of columns.
+
+    table: (products, factors), columns whose product it is: states, inputs, and ones last.
+    Entry e adds weight[e] times product[e] to sum target[e]. The sums are the slopes of the d
+    states, then the derivative of the slope of state row[q] by state factor[q], then the derivative
+    of the slope of state equation[r] by coefficient column[r].
+    """
+
+    table: np.ndarray
+    product: np.ndarray
+    target: np.ndarray
+    weight: np.ndarray
+    row: np.ndarray
+    factor: np.ndarray
+    equation: np.ndarray
+    column: np.ndarray
+
+
+@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
+def _sum_products(columns, table, product, target, weight, values, sums):
+    """Values of the products, and their weighted sums."""
+    one = len(columns) - 1
+    for m in range(len(table)):
+        for i in range(LANES):
+            values[m, i] = columns[table[m, 0], i]
+        for k in range(1, table.shape[1]):
+            if table[m, k] != one:
+                for i in range(LANES):
+                    values[m, i] *= columns[table[m, k], i]
+    sums[:] = 0.0
+    for e in range(len(product)):
+        for i in range(LANES):
+            sums[target[e], i] += weight[e] * values[product[e], i]
+
+
+@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
+def _add_product(matrix, jacobian, row, factor, scale, total):
+    """Add scale (lanes,) times a matrix (d, d, lanes) times the sparse Jacobian to the total."""
+    for j in range(len(matrix)):
+        for q in range(len(row)):
+            for i in range(LANES):
+                total[j, factor[q], i] += scale[i] * matrix[j, row[q], i] * jacobian[q, i]
+
+
+@compiled
+def _gains(sums, row, factor, tableau, h, scale, gains, by_state):
+    """Change of the end of a step per change of the slope at each stage, and of its start."""
+    d = len(by_state)
+    gains[:], by_state[:] = 0.0, 0.0
+    for s in range(3, -1, -1):
+        for later in range(s + 1, 4):
+            lead = tableau.leads[later, s]
+            if lead != 0.0:
+                for i in range(LANES):
+                    scale[i] = lead * h[i]
+                _add_product(gains[later], sums[later, d:], row, factor, scale, gains[s])
+        for j in range(d):
+            for i in range(LANES):
+                gains[s, j, j, i] += tableau.weights[s] * h[i]
+        scale[:] = 1.0
+        _add_product(gains[s], sums[s, d:], row, factor, scale, by_state)
+    for j in range(d):
+        for i in range(LANES):
+            by_state[j, j, i] += 1.0
+
+
+@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
+def _carry(by, by_state, reach, first, total):
+    """Carry all derivatives (columns, d, lanes) over a step; before the first they are trivial."""
+    d = len(by_state)
+    for c in range(len(by)):
+        for j in range(d):
+            for i in range(LANES):
+                total[j, i] = by_state[j, c, i] if first and c < d else 0.0
+            if not first:
+                for k in range(d):
+                    if reach[j, k]:
+                        for i in range(LANES):
+                            total[j, i] += by_state[j, k, i] * by[c, k, i]
+        for j in range(d):
+            for i in range(LANES):
+                by[c, j, i] = total[j, i]
+
+
+@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
+def _add_sources(by, gains, sources, reach, equation, column):
+    """Add what the coefficients change directly within the step."""
+    d = gains.shape[1]
+    for r in range(len(equation)):
+        c, e = d + column[r], equation[r]
+        for j in range(d):
+            if reach[j, e]:
+                for i in range(LANES):
+                    by[c, j, i] += (
+                        gains[0, j, e, i] * sources[0, r, i]
+                        + gains[1, j, e, i] * sources[1, r, i]
+                        + gains[2, j, e, i] * sources[2, r, i]
+                        + gains[3, j, e, i] * sources[3, r, i]
+                    )
+
+
+@compiled
+def _reach(d, row, factor):
+    """Which states a step carries to which: along at most four entries of the Jacobian."""
+    reach, far = np.eye(d) > 0.0, np.eye(d) > 0.0
+    for _ in range(4):
+        for q in range(len(row)):
+            for k in range(d):
+                if reach[factor[q], k]:
+                    far[row[q], k] = True
+        reach[:] = far
+    return reach
+
+
+@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
+def _stages(here, inputs, h, tableau, columns, table, product, target, weight, values, sums, total):
+    """The stages of one step from `here`; its end goes to `total`, both (d, lanes)."""
+    d, last = len(here), inputs.shape[1] - 1
+    total[:] = here
+    for s in range(4):
+        for m in range(inputs.shape[2]):
+            for i in range(LANES):
+                columns[d + m, i] = inputs[tableau.places[s], min(i, last), m]
+        for j in range(d):
+            for i in range(LANES):
+                columns[j, i] = here[j, i]
+            for earlier in range(s):
+                lead = tableau.leads[s, earlier]
+                if lead != 0.0:
+                    for i in range(LANES):
+                        columns[j, i] += lead * h[i] * sums[earlier, j, i]
+        _sum_products(columns, table, product, target, weight, values, sums[s])
+        for j in range(d):
+            for i in range(LANES):
+                total[j, i] += tableau.weights[s] * h[i] * sums[s, j, i]
+
+
+@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
+def advance(states, inputs, steps, tableau, equations, ends, slopes):
+    """Write the states at the end of every step to `ends` (n, d), and derivatives to `slopes`.
+
+    slopes: (n, d, d + coefficients) and more, whose further columns are not touched, or (n, d, 0)
+    if none are asked for; by the states at the start, then by the coefficients. steps: (n,), length
+    of one substep. inputs: (stride * substeps + 1, n, inputs), at the positions of the tableau.
+    """
+    table, product, target, weight, row, factor, equation, column = equations
+    n, d = states.shape
+    n_columns = min(slopes.shape[2], d + (column.max() + 1 if len(column) else 0))
+    columns = np.ones((d + inputs.shape[2] + 1, LANES))
+    values, sums = np.empty((len(table), LANES)), np.empty((4, d + len(row) + len(column), LANES))
+    here, total = np.empty((d, LANES)), np.empty((d, LANES))
+    h, scale = np.empty(LANES), np.empty(LANES)
+    by, by_state = np.empty((n_columns, d, LANES)), np.empty((d, d, LANES))
+    gains, reach = np.empty((4, d, d, LANES)), _reach(d, row, factor)
+    for first in range(0, n, LANES):
+        n_here = min(LANES, n - first)
+        for i in range(LANES):  # lanes beyond the end repeat the last sample
+            h[i] = steps[first + min(i, n_here - 1)]
+            for j in range(d):
+                here[j, i] = states[first + min(i, n_here - 1), j]
+        for place in range(0, len(inputs) - 1, tableau.stride):
+            at = inputs[place : place + tableau.stride + 1, first : first + n_here]
+            _stages(
+                here, at, h, tableau, columns, table, product, target, weight, values, sums, total
+            )
+            here[:] = total
+            if n_columns:
+                _gains(sums, row, factor, tableau, h, scale, gains, by_state)
+                _carry(by, by_state, reach, place == 0, total)
+                _add_sources(by, gains, sums[:, d + len(row) :], reach, equation, column)
+        for i in range(n_here):
+            for j in range(d):
+                ends[first + i, j] = here[j, i]
+                for c in range(n_columns):
+                    slopes[first + i, j, c] = by[c, j, i]

@@ -1,0 +1,76 @@
+"""Kernels of refinement and free runs against plain forms, which serve functions and GPUs."""
+
+import numpy as np
+import pytest
+import torch
+
+import ep2sindy as ep
+from ep2sindy.model.scaled import ScaledModel
+from ep2sindy.model.stability import LimitCycle, share_reaching
+from ep2sindy.refinement.ode import ODE, Augmented, Drive, augment
+from ep2sindy.refinement.steps import RungeKutta
+from tests.models import model_of
+
+CASES = {
+    "two states": {"x": {"x": 0.5, "x*y": -0.3}, "y": {"y": -0.7, "x*y": 0.2, "1": 0.1}},
+    "an input": {"x": {"y*u": 1.2}, "y": {"x": -1.0, "u^2": 0.4, "x^2*y": -0.1}},
+}
+
+
+@pytest.mark.parametrize("n_substeps", [1, 2])
+@pytest.mark.parametrize("case", CASES)
+def test_compiled_steps_are_those_of_torchdiffeq(
+    monkeypatch: pytest.MonkeyPatch, case: str, n_substeps: int
+) -> None:
+    rng, variables = np.random.default_rng(0), sorted({*"xy", *("u" if case == "an input" else "")})
+    library = ep.polynomial(variables, degree=3)
+    coef = np.zeros((len(library), 2))
+    for k, terms in enumerate(CASES[case].values()):
+        for name, value in terms.items():
+            coef[library.index(name), k] = value
+    scale, n_inputs = np.array([2.0, 0.5, 3.0])[: len(variables)], len(variables) - 2
+    order = ["x", "y", *variables[:n_inputs]] if n_inputs else variables
+    model = ep.SparseModel(library, ["x", "y"], coef)
+    odes = [ODE(model, scale=scale, step_s=0.2) for _ in range(3)]
+    system, steps = augment(odes), RungeKutta(n_substeps)
+    drive = Drive(
+        torch.tensor(rng.uniform(0.5, 1.5, size=(1, 3, 20))),
+        torch.tensor(0.3 * rng.normal(size=(1, 4, 3, n_inputs, 20))),
+    )
+    scaling, nodes = rng.uniform(0.5, 1.5, (3, system.n_free)), rng.normal(size=(3, 4, 6, 2))
+    assert system.compiled, order
+    fast = steps.maps(system, drive, scaling, nodes), steps.finer(system, drive, scaling, nodes)
+    monkeypatch.setattr(Augmented, "compiled", False)
+    slow = steps.maps(system, drive, scaling, nodes), steps.finer(system, drive, scaling, nodes)
+    for ours, torchs in zip(fast, slow, strict=True):
+        assert ours.shape == torchs.shape
+        np.testing.assert_allclose(ours, torchs, rtol=1e-11, atol=1e-13)
+
+
+def test_starts_that_a_kernel_brings_near_the_end_reach_what_a_loop_reaches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """van der Pol with a second, repelling cycle far out: some starts leave."""
+    model = model_of({"x": {"y": 1.0}, "y": {"x": -1.0, "y": 1.0, "x^2*y": -1.0, "x^4*y": 0.05}})
+    t = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
+    cycle = LimitCycle(6.6, 2.0 * np.stack([np.sin(t), np.cos(t)], axis=1), np.array([1.0, 0.001]))
+    found = share_reaching(model, cycle, n_starts=32, n_periods=8.0)
+
+    def as_they_are(self: ScaledModel, y: np.ndarray, *_: object, **__: object) -> tuple:
+        return y, np.zeros(y.shape[1]), np.full(y.shape[1], 100_000)
+
+    monkeypatch.setattr(ScaledModel, "approach", as_they_are)
+    assert share_reaching(model, cycle, n_starts=32, n_periods=8.0) == found
+    assert 0.0 <= found < 1.0
+
+
+def test_each_start_takes_no_more_steps_than_allowed() -> None:
+    model = model_of({"x": {"y": 1.0}, "y": {"x": -1.0}})
+    scaled = ScaledModel.of(model, np.ones(2), 1.0)
+    settings = {"times_rate": 1.0, "floor": 10.0}
+    y, t, left = scaled.approach(np.ones((2, 3)), np.zeros(2), 5.0, 1.0, 4, **settings)
+    np.testing.assert_array_equal(left, 0)
+    np.testing.assert_allclose(t, 0.4)
+    np.testing.assert_allclose(y[0], np.cos(0.4) + np.sin(0.4), rtol=1e-6)
+    y, t, left = scaled.approach(np.ones((2, 3)), np.zeros(2), 1.2, 1.0, 40, **settings)
+    assert y.shape == (2, 0)
