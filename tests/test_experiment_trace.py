@@ -59,7 +59,7 @@ def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_p
     assert summary["states"]["2"]["unexplained"] is None
     assert not summary["misfit"]
     found = summary["model"]["equations"]
-    assert found["I"] == {"I*g": 1.0}
+    assert found["I"] == pytest.approx({"I*g": 1.0})
     assert found["g"] == pytest.approx(CYCLE, rel=0.02)
     for term, (low, high) in summary["model"]["intervals"]["g"].items():
         assert low < CYCLE[term] < high
@@ -96,7 +96,7 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
     assert living["waveform_error"] < 0.1
     assert living["multiplier"] < 0.5
     assert living["n_terms_known"] == 1
-    assert summary["model"]["equations"]["I"] == {"I*g": 1.0}
+    assert summary["model"]["equations"]["I"] == pytest.approx({"I*g": 1.0})
     assert summary["signal"]["embedding"] == "LogRate"
     assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
     log = (folder / "run.log").read_text()
