@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from ep2sindy.estimation.kernels import sensitivities, term_values
 from ep2sindy.library.library import Library
-from ep2sindy.model.flow_kernels import SumsOfProducts, Tableau, advance
+from ep2sindy.model.flow_kernels import SumsOfProducts, Tableau, advance, reach_of
 
 LEADS = (0.0, 0.5, 0.5, 1.0)  # of the stages of a step, and their weights
 WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
@@ -145,9 +145,11 @@ class RightHandSides:
         product = np.append(product, own)
         target = np.append(target, self.d + len(pairs) + p)
         needed = np.unique(product)
+        row, factor = np.divmod(pairs, self.d)
         equations = SumsOfProducts(
             self._products.table[needed], np.searchsorted(needed, product), target,
-            np.append(weight, np.ones(len(p))), pairs // self.d, pairs % self.d, by[0], p,
+            np.append(weight, np.ones(len(p))), row, factor, by[0], p,
+            reach_of(self.d, row, factor),
         )  # fmt: skip
         ends = np.empty_like(states)
         states = np.ascontiguousarray(states)

@@ -37,7 +37,7 @@ class SumsOfProducts(NamedTuple):
     table: (products, factors), columns whose product it is: states, inputs, and ones last.
     Entry e adds weight[e] times product[e] to sum target[e]. The sums are the slopes of the d
     states, then the derivative of the slope of state row[q] by state factor[q], then the derivative
-    of the slope of state equation[r] by coefficient column[r].
+    of the slope of state equation[r] by coefficient column[r]. reach: (d, d), see `reach_of`.
     """
 
     table: np.ndarray
@@ -48,6 +48,14 @@ class SumsOfProducts(NamedTuple):
     factor: np.ndarray
     equation: np.ndarray
     column: np.ndarray
+    reach: np.ndarray
+
+
+def reach_of(d, row, factor):
+    """(d, d), true where a step carries a change of state k to state j: four entries at most."""
+    one = np.eye(d)
+    one[row, factor] = 1.0
+    return np.linalg.matrix_power(one, 4) > 0.0
 
 
 @compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
@@ -61,7 +69,9 @@ def _sum_products(columns, table, product, target, weight, values, sums):
             if table[m, k] != one:
                 for i in range(LANES):
                     values[m, i] *= columns[table[m, k], i]
-    sums[:] = 0.0
+    for e in range(len(sums)):
+        for i in range(LANES):
+            sums[e, i] = 0.0
     for e in range(len(product)):
         for i in range(LANES):
             sums[target[e], i] += weight[e] * values[product[e], i]
@@ -80,7 +90,12 @@ def _add_product(matrix, jacobian, row, factor, scale, total):
 def _gains(sums, row, factor, tableau, h, scale, gains, by_state):
     """Change of the end of a step per change of the slope at each stage, and of its start."""
     d = len(by_state)
-    gains[:], by_state[:] = 0.0, 0.0
+    for j in range(d):
+        for k in range(d):
+            for i in range(LANES):
+                by_state[j, k, i] = 1.0 if j == k else 0.0
+                for s in range(4):
+                    gains[s, j, k, i] = tableau.weights[s] * h[i] if j == k else 0.0
     for s in range(3, -1, -1):
         for later in range(s + 1, 4):
             lead = tableau.leads[later, s]
@@ -88,14 +103,9 @@ def _gains(sums, row, factor, tableau, h, scale, gains, by_state):
                 for i in range(LANES):
                     scale[i] = lead * h[i]
                 _add_product(gains[later], sums[later, d:], row, factor, scale, gains[s])
-        for j in range(d):
-            for i in range(LANES):
-                gains[s, j, j, i] += tableau.weights[s] * h[i]
-        scale[:] = 1.0
-        _add_product(gains[s], sums[s, d:], row, factor, scale, by_state)
-    for j in range(d):
         for i in range(LANES):
-            by_state[j, j, i] += 1.0
+            scale[i] = 1.0
+        _add_product(gains[s], sums[s, d:], row, factor, scale, by_state)
 
 
 @compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
@@ -133,24 +143,13 @@ def _add_sources(by, gains, sources, reach, equation, column):
                     )
 
 
-@compiled
-def _reach(d, row, factor):
-    """Which states a step carries to which: along at most four entries of the Jacobian."""
-    reach, far = np.eye(d) > 0.0, np.eye(d) > 0.0
-    for _ in range(4):
-        for q in range(len(row)):
-            for k in range(d):
-                if reach[factor[q], k]:
-                    far[row[q], k] = True
-        reach[:] = far
-    return reach
-
-
 @compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
 def _stages(here, inputs, h, tableau, columns, table, product, target, weight, values, sums, total):
     """The stages of one step from `here`; its end goes to `total`, both (d, lanes)."""
     d, last = len(here), inputs.shape[1] - 1
-    total[:] = here
+    for j in range(d):
+        for i in range(LANES):
+            total[j, i] = here[j, i]
     for s in range(4):
         for m in range(inputs.shape[2]):
             for i in range(LANES):
@@ -177,15 +176,17 @@ def advance(states, inputs, steps, tableau, equations, ends, slopes):
     if none are asked for; by the states at the start, then by the coefficients. steps: (n,), length
     of one substep. inputs: (stride * substeps + 1, n, inputs), at the positions of the tableau.
     """
-    table, product, target, weight, row, factor, equation, column = equations
+    table, product, target, weight, row, factor, equation, column, reach = equations
     n, d = states.shape
-    n_columns = min(slopes.shape[2], d + (column.max() + 1 if len(column) else 0))
+    n_columns = min(slopes.shape[2], d)
+    for c in column:
+        n_columns = max(n_columns, d + c + 1)
     columns = np.ones((d + inputs.shape[2] + 1, LANES))
     values, sums = np.empty((len(table), LANES)), np.empty((4, d + len(row) + len(column), LANES))
     here, total = np.empty((d, LANES)), np.empty((d, LANES))
     h, scale = np.empty(LANES), np.empty(LANES)
     by, by_state = np.empty((n_columns, d, LANES)), np.empty((d, d, LANES))
-    gains, reach = np.empty((4, d, d, LANES)), _reach(d, row, factor)
+    gains = np.empty((4, d, d, LANES))
     for first in range(0, n, LANES):
         n_here = min(LANES, n - first)
         for i in range(LANES):  # lanes beyond the end repeat the last sample
@@ -197,7 +198,9 @@ def advance(states, inputs, steps, tableau, equations, ends, slopes):
             _stages(
                 here, at, h, tableau, columns, table, product, target, weight, values, sums, total
             )
-            here[:] = total
+            for j in range(d):
+                for i in range(LANES):
+                    here[j, i] = total[j, i]
             if n_columns:
                 _gains(sums, row, factor, tableau, h, scale, gains, by_state)
                 _carry(by, by_state, reach, place == 0, total)

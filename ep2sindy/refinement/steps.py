@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torchdiffeq import odeint
 
-from ep2sindy.model.flow_kernels import SumsOfProducts, Tableau, advance
+from ep2sindy.model.flow_kernels import SumsOfProducts, Tableau, advance, reach_of
 from ep2sindy.refinement.kernels import propagate
 from ep2sindy.refinement.ode import Augmented, Drive
 
@@ -144,9 +144,10 @@ def _equations(
     target[by_state] = n + pair
     target[by_scaling] = n + len(pairs) + source
     width = weights.shape[1]
+    row, factor = pairs // width, pairs % width - 1
     return SumsOfProducts(
-        table, product, target, weights[state, column, product],
-        pairs // width, pairs % width - 1, sources // width, sources % width - 1 - n,
+        table, product, target, weights[state, column, product], row, factor,
+        sources // width, sources % width - 1 - n, reach_of(n, row, factor),
     )  # fmt: skip
 
 
