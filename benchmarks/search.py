@@ -6,21 +6,29 @@ training rows per support: for the support of every alpha, as the thesis's algor
 for each distinct support once, which already takes some care. All start from the same
 assembled rows and end with the best candidate of every size on the held-out rows.
 
+Then the calls that a user makes: `ep.discover` by the thesis's recipe, by one threshold sweep, and
+by default, each with its test whether the model leaves more than noise; and of 100,000 samples.
+
     python -m benchmarks.search
 """
+
+import warnings
+from functools import partial
 
 import numpy as np
 import sklearn
 from sklearn.linear_model import lasso_path
 from threadpoolctl import threadpool_limits
 
+import ep2sindy as ep
 from benchmarks.timing import cpu_s
+from ep2sindy.model.many import rk4_step
 from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.front import ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso
-from ep2sindy.systems.systems import lorenz
+from ep2sindy.systems.systems import System, lorenz
 
 BOOTSTRAPS = Bootstraps(n=32, n_culled=1)
 # scikit-learn 1.7 renamed the argument.
@@ -100,6 +108,42 @@ def main() -> None:
         print(
             f"the plain way, {name:<22}       {1e3 * plain_s[distinct]:8.1f} ms, {ratio:.0f} times"
         )
+    calls()
+
+
+METHODS = {
+    "thesis": ep.Regression(Differential(), AdaptiveLasso(), ep.Knee(), BOOTSTRAPS),
+    "STLSQ": ep.Regression(Differential(), ep.STLSQ(), ep.Knee(), Bootstraps(n=0)),
+    "default": ep.TrajectorySearch(),
+}
+
+
+def calls() -> None:
+    """CPU time of whole calls, their noise tests included."""
+    system = lorenz()
+    run = system.trajectory(noise=0.05, rng=np.random.default_rng(0))
+    long = continued(system, 100_000)
+    with threadpool_limits(limits=1), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name, method in METHODS.items():
+            call = partial(ep.discover, run, method=method, seed=0)
+            print(f"discover, {name:<34}{1e3 * cpu_s(call, n_runs=9):8.1f} ms")
+        call = partial(ep.discover, long, method=METHODS["thesis"], seed=0)
+        print(f"discover, {f'thesis, {long.n_samples} samples':<34}{cpu_s(call, n_runs=3):8.2f} s")
+
+
+def continued(system: System, n_samples: int) -> ep.Trajectory:
+    """A record of many samples at the step of the system's own, with 5 % noise."""
+    start = system.trajectory()
+    step_s = float(start.t[1] - start.t[0])
+    t, states = step_s * np.arange(n_samples), np.empty((n_samples, 3))
+    states[0] = start.states[0]
+    for k in range(1, n_samples):
+        states[k] = rk4_step(
+            lambda x, _: system.model.derivative(x, np.empty(0)), states[k - 1], (t, t, t), step_s
+        )
+    noise = np.random.default_rng(0).normal(size=states.shape) * states.std(axis=0)
+    return ep.Trajectory(t, states + 0.05 * noise, start.state_names)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.estimation.kernels import sensitivities, term_values
+from ep2sindy.estimation.kernels import sensitivities
 from ep2sindy.library.library import Library
 from ep2sindy.model.flow_kernels import SumsOfProducts, Tableau, advance, reach_of
 
@@ -188,8 +188,7 @@ class RightHandSides:
     def _products_of(
         self, states: Float[np.ndarray, "n d"], inputs: Float[np.ndarray, "n n_inputs"]
     ) -> Float[np.ndarray, "n products"]:
-        columns = np.concatenate([states, inputs, np.ones((len(states), 1))], axis=1)
-        return term_values(self._products.with_functions(columns, axis=1), self._products.table)
+        return self._products.evaluate(np.concatenate([states, inputs], axis=1))
 
     @cached_property
     def _derived(self) -> tuple[Library, np.ndarray]:

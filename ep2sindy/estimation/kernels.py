@@ -15,20 +15,6 @@ from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
 
 
 @compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def term_values(columns, table):
-    """Products of the columns named by each row of a table: (samples, rows)."""
-    n_factors = table.shape[1]
-    values = np.empty((len(columns), len(table)))
-    for k in range(len(columns)):
-        for j in range(len(table)):
-            value = columns[k, table[j, 0]]
-            for i in range(1, n_factors):
-                value *= columns[k, table[j, i]]
-            values[k, j] = value
-    return values
-
-
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
 def sensitivities(jacobians, terms, equation, column, leads, weights, steps, slopes):
     """One Runge-Kutta step of the sensitivities; `slopes` (n, d, d + p) is advanced in place.
 

@@ -58,7 +58,9 @@ def _advance(
         for c in range(n_start, n_columns - 1):
             new[j, c] += maps[p, j, 1 + n + c - n_start, w, k]
         new[j, n_columns - 1] += maps[p, j, 0, w, k] - nodes[p, w, k + 1, j]
-    x[:] = new
+    for j in range(n):
+        for c in range(n_columns):
+            x[j, c] = new[j, c]
 
 
 @compiled
