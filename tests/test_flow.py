@@ -1,12 +1,16 @@
 """The compiled flow against array expressions, which serve libraries with functions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.estimation.explanation import _misfit
 from ep2sindy.estimation.flow import RightHandSides, Steps
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, parting
 from ep2sindy.estimation.problem import scale_problem
+from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.systems.draws import realization
 
 N = 37  # no multiple of the lanes
@@ -70,6 +74,19 @@ def test_paths_part_by_twice_the_positive_exponents(rate: float, expected: float
     fit = TrajectoryFit((np.zeros((400, 1)),), free, free != 0.0, np.array([np.inf]))
     level = Level((np.full((400, 1), 0.1),), 1e-4, n_substeps=4)
     assert parting(problem, fit, level) == pytest.approx(expected, abs=0.05)
+
+
+def test_a_model_that_could_follow_any_samples_is_a_misfit() -> None:
+    run = ep.lotka_volterra().trajectory(noise=0.05, rng=0).window(0, 400)
+    problem = scale_problem([run], ep.polynomial(run.state_names, degree=2))
+    found = from_smooth(problem, None, max_terms=7)
+    assert found.fits
+    assert found.parting < 0.05
+    steered = replace(found, parting=4.0)
+    assert not steered.fits
+    assert "part by a factor of 7.4 per sample, so it could follow any samples" in _misfit(
+        problem, steered
+    )
 
 
 def test_a_likelier_support_a_long_curved_way_off_is_reached() -> None:

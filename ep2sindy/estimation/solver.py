@@ -69,7 +69,7 @@ class Solution:
     """Result from one start.
 
     score: -2 log likelihood plus prices, comparable between starts. astray: (d,), True for hidden
-    states that do not follow their own equations. parting: see `noise.parting`.
+    states that do not follow their own equations. parting: see `likelihood.parting`.
     """
 
     annealed: AnnealedFit

@@ -183,14 +183,14 @@ def _offer_supports(
     unit = np.where(at_hand[:, None] & at_hand, xx / np.outer(size, size), 0.0)
     target = np.where(at_hand, xy / size, 0.0)
     problem_of_one = unit[None], (target / np.sqrt(yy))[None], np.ones(1)
-    size = int(own.sum())
+    n_own = int(own.sum())
     masks, proven = subsets_within(
         *problem_of_one,
-        max_terms=min(max_terms, PROVEN_TERMS, size),
+        max_terms=min(max_terms, PROVEN_TERMS, n_own),
         n_best=N_BEST,
         most_work=MOST_WORK,
     )
-    if not proven or min(max_terms, size) > PROVEN_TERMS:
+    if not proven or min(max_terms, n_own) > PROVEN_TERMS:
         masks = exchanged_supports(*problem_of_one, max_terms=max_terms, n_best=N_BEST, known=masks)
     found = []
     for mask, gain in zip(masks, _gains(unit, target, masks), strict=True):

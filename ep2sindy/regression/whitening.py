@@ -31,7 +31,7 @@ RISE = 10.0
 
 MAX_HALVED = 6
 
-SETTLED = 1e-8  # change of the coefficients, as a share of the largest, that ends the steps
+SETTLED = 1e-8  # change of the scaled coefficients, as a share of them, that ends the steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +76,7 @@ def whitened_rows(
         if following is None:
             break
         rows, least = following, min(least, following.misfit)
-        if np.abs(rows.coef - before).max(initial=0.0) <= SETTLED * np.abs(rows.coef).max(
-            initial=0.0
-        ):
+        if np.linalg.norm(rows.coef - before) <= SETTLED * np.linalg.norm(rows.coef):
             break
     return WhitenedRows(
         theta=rows.theta,
@@ -161,9 +159,8 @@ class _Linearised:
         )
         white = _solve(factor, columns)
         n = len(library)
-        return _Linearised(
-            x, coef, white[:, :n], white[:, n:-1], white[:, -1], sensitivity, factor, slope, rows
-        )
+        theta, drifted, target = white[:, :n], white[:, n:-1], white[:, -1]
+        return _Linearised(x, coef, theta, drifted, target, sensitivity, factor, slope, rows)
 
     @property
     def misfit(self) -> float:
