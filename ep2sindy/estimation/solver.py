@@ -32,7 +32,7 @@ from ep2sindy.estimation.likelihood import (
 )
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
-from ep2sindy.estimation.supports import alternatives, best_support, excess, term_prices
+from ep2sindy.estimation.supports import alternatives, best_support, excess, penalise, term_prices
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 
 SAMPLES_PER_TERM = 5  # of the library: fewer samples do not tell which terms are present
@@ -47,6 +47,9 @@ MAX_EXCHANGES = 3  # exchanges of supports at one level
 # rho at which supports are compared again. At lower rho the linearised flow says too little about
 # other supports; at higher rho free states hide their differences.
 WEIGHED_AT = 0.003
+# rho, and the share of the prices, at which another support may show that the solution is a wrong
+# optimum; and by how much it must explain more of the squares.
+REHEATED, EXPLAINS_MORE = (1.0, 0.5), 4.0
 WITHIN, MAX_TRIED, MAX_ROUNDS = 12.0, 6, 6  # score above the chosen one; supports per round; rounds
 UNSURE = 0.05  # share of the RMS: least noise at a start where the smoother's is not trusted
 CUTOFF = 1e-8  # of singular values of unit columns: smaller ones fit noise
@@ -128,6 +131,7 @@ def _settle(problem: EstimationProblem, found: AnnealedFit, max_terms: int) -> S
         if np.array_equal(before, found.fit.support):
             break
     found = polish(problem, found, prices, max_terms=max_terms)
+    found = reheat(problem, found, prices, max_terms=max_terms)
     noise = noise_beside(problem, found.fit)
     error = steered = 0.0
     if np.isfinite(found.score) and (noise.std > FLOOR).any():
@@ -221,6 +225,41 @@ def polish(
         else:
             return replace(found, around=around)
     return found
+
+
+def reheat(
+    problem: EstimationProblem,
+    found: AnnealedFit,
+    prices: Float[np.ndarray, " free"],
+    *,
+    max_terms: int,
+) -> AnnealedFit:
+    """Anneal again if states that are let go show a better support; the likelier of both.
+
+    Exchanges between nearly exact flows cannot leave a wrong optimum of many terms. Free states
+    hide part of what a term explains, so a support counts as better there only if it explains more
+    by no more terms.
+    """
+    if not found.fit.total < FAR * problem.n_squares:
+        return found
+    rho, share = REHEATED
+    warm, level = at_level(problem, found.fit, replace(found.level, rho=rho))
+    pair = gram(problem, warm, level)
+    if not (pair.finite and np.isfinite(found.score)):
+        return found
+    cheap = share * prices
+    here = penalise(pair, warm.support, cheap)
+    other = best_support(problem, pair, cheap, warm.support, max_terms=max_terms)
+    n_more = int(other.support.sum()) - int(here.support.sum())
+    gain = here.score - other.score - float(cheap[here.support].sum() - cheap[other.support].sum())
+    if n_more > 0 or gain < EXPLAINS_MORE:
+        return found
+    start = replace(warm, support=other.support, free=other.free)
+    schedule = (*COOLING, COLD[-1])
+    again = anneal(problem, start, found.level.noise, prices, schedule, max_terms=max_terms)
+    again = polish(problem, again, prices, max_terms=max_terms)
+    likelier = again.score < found.score and parting(problem, again.fit, again.level) < STEERED
+    return again if likelier else found
 
 
 def at_level(
