@@ -16,6 +16,7 @@ from ep2sindy.estimation.problem import EstimationProblem
 FLOOR = 1e-3  # least noise, as a share of the RMS: no model and no integration is exact
 SIGNIFICANT = 3.5  # standard errors of an autocorrelation
 MAX_LASTING = 0.98
+SLOW, LARGE = 0.9, 0.3  # autocorrelation, and share of the spread, that no noise has together
 ALIKE = 7.0  # tolerance of the log mean square of differences, which scatters by 2.15/sqrt(n)
 LONGER = 6.0  # tolerance of autocorrelations, which scatter by up to 1.7/sqrt(n)
 NOISE_SHARES = 2.0 ** np.arange(-6.0, 1.1, 0.25)  # of the residuals' RMS, tried for limits
@@ -99,6 +100,9 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
     memory = _memory(unit)
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
     believed = shows & _forgets(unit, memory) & _shown_by_samples(problem, fit, std, memory)
+    # Slow residuals of a signal's size tell that the model ignores the signal.
+    spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
+    believed &= ~((memory > SLOW) & (std > LARGE * spread))
     std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std[~hidden]).mean()
