@@ -226,7 +226,7 @@ def _left_of_weak_rows(
         used = np.isin(model.library.names, [name for s in states for name in model.terms(s)])
         used[0] |= not used.any()  # a library needs a term
         form, rng = Weak(split=RandomSplit(0.0)), np.random.default_rng(0)
-        rows = form.assemble(blocks_of(runs), model.library.take(used), rng=rng)
+        rows = form.assemble(spread_blocks(runs), model.library.take(used), rng=rng)
     except (ValueError, np.linalg.LinAlgError):
         return {}
     problems = {problem.equations[0]: problem for problem in rows}
@@ -240,7 +240,7 @@ def _left_of_weak_rows(
     return left
 
 
-def blocks_of(runs: Sequence[Trajectory]) -> list[Trajectory]:
+def spread_blocks(runs: Sequence[Trajectory]) -> list[Trajectory]:
     """Blocks of neighbouring samples that tell a misfit as well as all of a long record.
 
     They are spread evenly over the records, whose noise may change. Records of at most MOST_TESTED

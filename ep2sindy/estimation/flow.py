@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -81,19 +82,8 @@ class RightHandSides:
         steps: Steps,
     ) -> Float[np.ndarray, "steps d"]:
         """States at the end of each step, by classical Runge-Kutta substeps."""
-        if not self._products.functions:
-            none = np.empty(0, dtype=np.int64)
-            return self._compiled(coef, states, steps, (none, none), np.empty((*states.shape, 0)))
-        rates = self._shares[:, 0].T @ coef
-        h = steps.h[:, None]
-        for k in range(steps.n_substeps):
-            slope, total = np.zeros_like(states), states
-            for s, (lead, weight) in enumerate(zip(LEADS, WEIGHTS, strict=True)):
-                here = states + lead * h * slope
-                slope = self._products_of(here, steps.inputs_at(k, s)) @ rates
-                total = total + weight * h * slope
-            states = total
-        return states
+        none = np.empty(0, dtype=np.int64)
+        return self._route(coef, states, steps, (none, none), np.empty((*states.shape, 0)))
 
     def flow(
         self,
@@ -109,8 +99,11 @@ class RightHandSides:
         n_more: columns of zeros behind them, for derivatives by something else.
         """
         slopes = np.zeros((len(states), self.d, self.d + len(by[0]) + n_more))
-        route = self._in_arrays if self._products.functions else self._compiled
-        return Flow(route(coef, states, steps, by, slopes), slopes)
+        return Flow(self._route(coef, states, steps, by, slopes), slopes)
+
+    @property
+    def _route(self) -> Callable[..., Float[np.ndarray, "steps d"]]:
+        return self._in_arrays if self._products.functions else self._compiled
 
     def _compiled(
         self,
@@ -165,23 +158,26 @@ class RightHandSides:
         slopes: Float[np.ndarray, "steps d columns"],
     ) -> Float[np.ndarray, "steps d"]:
         """`_compiled` for libraries with functions, which are evaluated at all samples at once."""
-        d, of = self.d, (by[0], self._places[by[1]])
-        by_state = np.einsum("tjp,ti->pij", self._shares[:, 1:], coef)
-        rates = np.column_stack([self._shares[:, 0].T @ coef, by_state.reshape(-1, d * d)])
-        slopes[:, np.arange(d), np.arange(d)] = 1.0
+        d, of, wanted = self.d, (by[0], self._places[by[1]]), slopes.shape[2] > 0
+        rates = self._shares[:, 0].T @ coef
+        if wanted:
+            by_state = np.einsum("tjp,ti->pij", self._shares[:, 1:], coef)
+            rates = np.column_stack([rates, by_state.reshape(-1, d * d)])
+            slopes[:, np.arange(d), np.arange(d)] = 1.0
+        leads, weights = np.array(LEADS), np.array(WEIGHTS)
         for k in range(steps.n_substeps):
             slope, total = np.zeros_like(states), states
             jacobians, values = [], []
-            for s, (lead, weight) in enumerate(zip(LEADS, WEIGHTS, strict=True)):
+            for s, (lead, weight) in enumerate(zip(leads, weights, strict=True)):
                 here = states + (lead * steps.h)[:, None] * slope
                 values.append(self._products_of(here, steps.inputs_at(k, s)))
                 both = values[-1] @ rates
                 slope = both[:, :d]
-                jacobians.append(both[:, d:].reshape(-1, d, d))
+                jacobians.append(both[:, d:])
                 total = total + (weight * steps.h)[:, None] * slope
-            leads, weights = np.array(LEADS), np.array(WEIGHTS)
-            stages = np.stack(jacobians), np.stack(values)
-            sensitivities(*stages, *of, leads, weights, steps.h, slopes)
+            if wanted:
+                by_state = np.stack(jacobians).reshape(4, -1, d, d)
+                sensitivities(by_state, np.stack(values), *of, leads, weights, steps.h, slopes)
             states = total
         return states
 

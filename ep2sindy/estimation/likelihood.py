@@ -12,7 +12,7 @@ an apparent noise, so that the same filter serves both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import log, pi
 from typing import Any, NamedTuple
@@ -190,18 +190,32 @@ def parting(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> flo
     likelihood.
     """
     told = 0.0
+    for _, seen, _, logs in innovations(problem, fit, level):
+        precision = np.where(np.isfinite(seen.residuals), 1.0 / seen.variance, 0.0)
+        at_rest = np.log1p(FREE_START * precision.sum(axis=0)).sum()
+        told += logs + np.log(precision[precision > 0.0]).sum() - at_rest
+    return max(float(told), 0.0) / problem.n_samples
+
+
+def innovations(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level
+) -> Iterator[tuple[ScaledRecord, Seen, float, float]]:
+    """Of each record what a fit leaves of its samples, and what these add to what came before.
+
+    The latter are the sum of the squares of the innovations, in their standard deviations, and the
+    sum of the logarithms of their variances.
+    """
     none = np.zeros_like(fit.support)
     for record, path, variance, process in zip(
         problem.records, fit.paths, level.variances, level.processes, strict=True
     ):
         flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
-        residuals, apparent, _ = observe(record, path, variance)
+        seen = observe(record, path, variance)
         misses = flow.ends - path[1:]
-        logs = eliminate(flow.slopes, misses, residuals, apparent, process, FREE_START)[3]
-        precision = np.where(np.isfinite(residuals), 1.0 / apparent, 0.0)
-        at_rest = np.log1p(FREE_START * precision.sum(axis=0)).sum()
-        told += logs + np.log(precision[precision > 0.0]).sum() - at_rest
-    return max(float(told), 0.0) / problem.n_samples
+        _, _, least, logs = eliminate(
+            flow.slopes, misses, seen.residuals, seen.variance, process, FREE_START
+        )
+        yield record, seen, least, logs
 
 
 @np.errstate(over="ignore", invalid="ignore")  # `Gram.finite` says whether the result counts

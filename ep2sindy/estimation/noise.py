@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ep2sindy.estimation.kernels import eliminate
-from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, fit_paths, observe
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit, fit_paths, innovations, observe
 from ep2sindy.estimation.likelihood import squares as squares_of
 from ep2sindy.estimation.problem import EstimationProblem
 
@@ -233,19 +232,11 @@ def _deviance(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> f
     mere scale factor.
     """
     least = spread = by_limits = 0.0
-    none = np.zeros_like(fit.support)
-    for record, path, variance, process in zip(
-        problem.records, fit.paths, level.variances, level.processes, strict=True
-    ):
-        flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
-        residuals, apparent, _ = observe(record, path, variance)
-        misses = flow.ends - path[1:]
-        _, _, squares, logs = eliminate(
-            flow.slopes, misses, residuals, apparent, process, FREE_START
-        )
+    for record, seen, squares, logs in innovations(problem, fit, level):
         least, spread = least + squares, spread + logs
         if record.limits is not None:
-            by_limits -= np.log(apparent[record.limits.at & np.isfinite(residuals)]).sum()
+            known = record.limits.at & np.isfinite(seen.residuals)
+            by_limits -= np.log(seen.variance[known]).sum()
     if problem.limited.any():
         return spread + by_limits + float(squares_of(problem, fit.paths, fit.free, level).sum())
     n = problem.n_squares
