@@ -29,7 +29,8 @@ from benchmarks.timing import cpu_s
 from ep2sindy.data.open import read_field
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
-from ep2sindy.discovery.pointwise import PointSearch, blocks_of, pointwise
+from ep2sindy.discovery.point_search import PointSearch
+from ep2sindy.discovery.pointwise import blocks_of, pointwise
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
@@ -95,7 +96,9 @@ def rows_at(field: xr.Dataset, iz: int, ir: int) -> RegressionRows:
     names = SEARCH.variables[len(SEARCH.states) :]
     inputs = np.stack([point[name].values for name in names], axis=1)
     run = Trajectory(point["time"].values, states, SEARCH.states, inputs, names)
-    (problem,) = SEARCH.formulation.assemble([run], SEARCH.library, rng=np.random.default_rng(0))
+    (problem,) = SEARCH.method.formulation.assemble(
+        [run], SEARCH.library, rng=np.random.default_rng(0)
+    )
     return problem
 
 
@@ -108,7 +111,7 @@ def plain_way(problem: RegressionRows, *, once: bool = False) -> None:
     theta = problem.train_theta
     for target in map(problem.train_target, range(len(problem.equations))):
         supports = []
-        for _ in range(SEARCH.bootstraps.n):
+        for _ in range(SEARCH.method.bootstraps.n):
             size = int(rng.uniform(0.2, 0.8) * len(theta))
             rows = rng.integers(len(theta), size=size)
             with warnings.catch_warnings():
@@ -127,7 +130,7 @@ def ensemble_way(problem: RegressionRows) -> None:
         optimizer = pysindy.EnsembleOptimizer(
             pysindy.STLSQ(threshold=threshold, alpha=0.0),
             bagging=True,
-            n_models=SEARCH.bootstraps.n,
+            n_models=SEARCH.method.bootstraps.n,
             n_subset=len(theta) // 2,
         )
         with warnings.catch_warnings():

@@ -13,6 +13,7 @@ import psutil
 import pytest
 from threadpoolctl import threadpool_info
 
+from ep2sindy.runtime import parallel
 from ep2sindy.runtime.parallel import Dask, Loky, Serial, Workers, collect, rows_in_order
 
 PATIENCE_S = 300.0  # for what comes at once on an idle machine: only what hangs is longer
@@ -179,6 +180,22 @@ def test_large_pieces_are_not_kept_on_disk(monkeypatch: pytest.MonkeyPatch, tmp_
     for _ in Loky(n_jobs=2).run(total, pieces):
         sizes.append(sum(path.stat().st_size for path in tmp_path.rglob("*.pkl")))
     assert max(sizes) == 0
+
+
+def process_of(piece: int) -> tuple[int, int]:
+    return piece, os.getpid()
+
+
+def test_pieces_that_are_alike_leave_this_process_only_where_it_pays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for start_s, leave in ((-1.0, True), (np.inf, False)):
+        monkeypatch.setattr(parallel, "START_S", start_s)
+        found = dict(Loky(n_jobs=2).run_alike(process_of, [5, 6, 7], 3))
+        assert [found[k][0] for k in range(3)] == [5, 6, 7]
+        assert found[0][1] == os.getpid()
+        assert all((found[k][1] != os.getpid()) == leave for k in (1, 2))
+    assert not list(Loky(n_jobs=2).run_alike(process_of, [], 0))
 
 
 def test_a_number_of_processes_must_be_one() -> None:

@@ -10,13 +10,15 @@ import xarray as xr
 from ep2sindy.data.sampling import point_samples
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
-from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
+from ep2sindy.discovery.point_search import PointSearch
+from ep2sindy.discovery.pointwise import STATUSES, Kept, blocks_of, pointwise
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
+from ep2sindy.runtime import parallel
 from ep2sindy.runtime.parallel import Dask, Loky, Serial
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.refined import RefinedScore
@@ -135,7 +137,11 @@ def test_blocks_do_not_show_in_the_result(block_points: int, noisy_bytes: dict[s
     assert bytes_of(result) == noisy_bytes
 
 
-def test_processes_give_the_same_bits(noisy_bytes: dict[str, bytes]) -> None:
+@pytest.mark.parametrize("start_s", [-1.0, np.inf], ids=["processes", "too little for them"])
+def test_processes_give_the_same_bits(
+    start_s: float, noisy_bytes: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parallel, "START_S", start_s)
     result = pointwise(noisy(), searching(), workers=Loky(n_jobs=2), block_points=2)
     assert bytes_of(result) == noisy_bytes
 

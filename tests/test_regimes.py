@@ -6,7 +6,8 @@ import xarray as xr
 from sklearn.metrics import adjusted_rand_score
 
 from ep2sindy.discovery.method import Regression
-from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.discovery.point_search import PointSearch
+from ep2sindy.discovery.pointwise import pointwise
 from ep2sindy.discovery.regimes import Regimes, find_regimes, group_points
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential

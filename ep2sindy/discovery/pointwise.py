@@ -10,25 +10,28 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from ep2sindy.data.coerce import Task
 from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.method import Regression
-from ep2sindy.library.library import Library
+from ep2sindy.discovery.point_search import (
+    LAYOUT,
+    PointSearch,
+    compiled_points,
+    nothing,
+    search_point,
+)
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.files import WriteError, fingerprint, replacing, sweep
-from ep2sindy.runtime.parallel import Workers
+from ep2sindy.runtime.parallel import Loky, Workers
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
-from ep2sindy.runtime.values import check_kind, check_list
 
 NO_FIT = "no_fit"
 
@@ -36,41 +39,9 @@ KEY = "key"  # of the arrays in the file of a finished block, the one that says 
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
+TRANSPOSED = 64  # samples turned at once, few enough to stay in the cache
+
 STATUSES = ("fitted", "no_plasma", "missing_samples", "too_little_variation", NO_FIT)
-
-
-@dataclass(frozen=True, eq=False)
-class PointSearch:
-    """Settings of the search at every point, whose spread is taken over the bootstraps.
-
-    least_variation: standard deviation of every state, as a share of its root mean square, below
-    which a point counts as having no dynamics. seed: every point has the same split and the same
-    draws, so that results differ by place alone.
-    """
-
-    states: Sequence[str]
-    library: Library
-    method: Regression
-    least_variation: float = 1e-3
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_list("states", self.states)
-        check_kind("library", self.library, Library, "ep.polynomial(['x', 'y'], degree=2)")
-        object.__setattr__(self, "states", tuple(self.states))
-        if not 0.0 <= self.least_variation < 1.0:
-            raise ValueError(
-                f"least_variation must lie in [0, 1): {self.least_variation} came; it is a share"
-            )
-        check_kind("method", self.method, Regression, "ep.Regression(bootstraps=ep.Bootstraps())")
-        if not (n := self.method.bootstraps.n):
-            raise ValueError(f"a pointwise study needs bootstraps for its spread: n={n} came")
-
-    @cached_property
-    def variables(self) -> tuple[str, ...]:
-        """States, then the other variables that the library needs."""
-        others = (v for v in self.library.variables if v not in self.states)
-        return (*self.states, *others)
 
 
 def pointwise(
@@ -144,8 +115,13 @@ def _search_blocks(
             waiting.append(block)
         else:
             yield block, done
-    pieces = (part.isel(block.slices) for block in waiting)
-    for number, done in workers.run(partial(_search_block, search), pieces):
+    function = partial(_search_block, search)
+    pieces = (part.isel(block.slices) for block in waiting)  # once read, none is held
+    if isinstance(workers, Loky):
+        results = workers.run_alike(function, pieces, len(waiting))
+    else:
+        results = workers.run(function, pieces)
+    for number, done in results:
         if kept:
             kept.write(waiting[number], done)
         yield waiting[number], done
@@ -205,19 +181,6 @@ def _empty(field: xr.Dataset, search: PointSearch) -> xr.Dataset:
     )
 
 
-# Dimensions of every result, followed by those of space.
-LAYOUT: Mapping[str, tuple[str, ...]] = {
-    "coef": ("equation", "term"),
-    "inclusion": ("equation", "term"),
-    "weight": ("equation", "term"),
-    "coef_draws": ("draw", "equation", "term"),
-    "weight_draws": ("draw", "equation", "term"),
-    "r2_train": ("equation",),
-    "r2_test": ("equation",),
-    "n_terms": ("equation",),
-}
-
-
 def _place(result: xr.Dataset, block: Block, done: Mapping[str, np.ndarray]) -> None:
     reasons = {str(result.attrs[NO_FIT]), str(done[NO_FIT])} - {""}
     result.attrs[NO_FIT] = min(reasons, default="")  # independent of the division into blocks
@@ -234,12 +197,13 @@ def _search_block(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarra
     status = np.array([_status(values, search) for values in columns], dtype=np.int8)
     found: dict[str, list[np.ndarray]] = {name: [] for name in LAYOUT}
     reasons = []
-    nothing = _nothing(search)
+    no_result, compiled = nothing(search), compiled_points(search, t)
     for k, values in enumerate(columns):
-        point = nothing
+        point = no_result
         if status[k] == 0:
             try:
-                point = _at_point(_trajectory(t, values, block, search), search)
+                fast = compiled.at(values) if compiled else None
+                point = fast or search_point(_trajectory(t, values, block, search), search)
             except ValueError as error:
                 status[k] = STATUSES.index(NO_FIT)
                 reasons.append(str(error))
@@ -257,7 +221,9 @@ def _columns(
     columns = np.empty((shape[1] * shape[2], len(names), shape[0]))
     for j, name in enumerate(names):
         values = np.broadcast_to(grid_values(block[name]), shape)
-        columns[:, j] = values.reshape(shape[0], -1).T
+        rows = values.reshape(shape[0], -1)
+        for start in range(0, len(rows), TRANSPOSED):
+            columns[:, j, start : start + TRANSPOSED] = rows[start : start + TRANSPOSED].T
     return columns
 
 
@@ -287,40 +253,6 @@ def _trajectory(
         input_names=search.variables[n:],
         units={name: str(block[name].attrs["units"]) for name in search.variables},
     )
-
-
-def _nothing(search: PointSearch) -> dict[str, np.ndarray]:
-    sizes = (search.method.bootstraps.n, len(search.states), len(search.library))
-    first = {"draw": 0, "equation": 1, "term": 2}
-    return {name: np.full([sizes[first[d]] for d in dims], np.nan) for name, dims in LAYOUT.items()}
-
-
-def _at_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
-    """Search, select and fit at one point, and the spread over the bootstraps."""
-    rng = np.random.default_rng(search.seed)
-    task = Task([run], search.library)
-    equations = search.method.search_equations(task, rng=rng)
-    fronts = [equation.front for equation in equations]
-    choice = search.method.choose(fronts, task)
-    point = _nothing(search)
-    for row, (equation, chosen) in enumerate(zip(equations, choice.chosen, strict=True)):
-        problem = equation.front.rows
-        mask: Bool[np.ndarray, " terms"] = np.isin(search.library.names, chosen.terms)
-        point["coef"][row] = choice.model.coef[:, row]
-        point["inclusion"][row] = equation.supports.inclusion[chosen.n_terms]
-        point["weight"][row] = _shares(point["coef"][row] * problem.theta_scale)
-        fits = equation.draws.fits(equation.number, equation.found, mask)
-        point["coef_draws"][:, row] = problem.coef_SI(fits, equation.number)
-        point["weight_draws"][:, row] = _shares(fits)
-        point["r2_train"][row], point["r2_test"][row] = chosen.r2_train, chosen.r2_test
-        point["n_terms"][row] = chosen.n_terms
-    return point
-
-
-def _shares(contributions: Float[np.ndarray, "*draws terms"]) -> Float[np.ndarray, "*draws terms"]:
-    """Each term's part in the sum of absolute values, with its sign; zeros if all are zero."""
-    total = np.abs(contributions).sum(axis=-1, keepdims=True)
-    return contributions / np.where(total > 0.0, total, 1.0)
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,11 @@ def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
 
 def largest_support(problem: RegressionRows) -> int:
     """Largest number of terms in an equation: all usable ones, or fewer if there are few rows."""
-    n_terms, n_rows = int(usable_terms(problem).sum()), len(problem.train_rows)
+    return row_limit(int(usable_terms(problem).sum()), len(problem.train_rows))
+
+
+def row_limit(n_terms: int, n_rows: int) -> int:
+    """Largest number of terms in an equation for so many usable terms and training rows."""
     return n_terms if n_rows >= FEW * n_terms else max(1, n_rows // ROWS_PER_COEFFICIENT)
 
 
@@ -71,13 +75,14 @@ def few_rows(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     return (Ambiguity((), message, True),)
 
 
-def _simplest_first(library: Library) -> Int[np.ndarray, " terms"]:
+def simplest_first(library: Library) -> Int[np.ndarray, " terms"]:
+    """Terms by degree, and of one degree in the order of the library."""
     return np.argsort(library.degrees, kind="stable")
 
 
 def _distinct(library: Library, xx: Float[np.ndarray, "terms terms"]) -> Bool[np.ndarray, " terms"]:
     """Terms that are not zero and do not repeat a simpler one."""
-    order = _simplest_first(library)
+    order = simplest_first(library)
     distinct = np.diag(xx) > 0.0
     repeats = np.triu(np.abs(xx[np.ix_(order, order)]) > 1.0 - SAME, k=1)
     for first, second in order[np.argwhere(repeats)]:
@@ -112,7 +117,7 @@ def _zero(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambigu
 
 def _alike(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
     """Pairs of proportional terms, the simpler one first; a term left out is reported once."""
-    names, order = library.names, _simplest_first(library)
+    names, order = library.names, simplest_first(library)
     kept = _distinct(library, xx)
     cosines = np.abs(xx[np.ix_(order, order)])
     found = []
@@ -154,7 +159,7 @@ def _combinations(
     xx: Float[np.ndarray, "terms terms"],
 ) -> list[tuple[int, list[int]]]:
     """Distinct terms that depend on simpler ones, each with the indices of those terms."""
-    order = _simplest_first(library)
+    order = simplest_first(library)
     columns = order[_distinct(library, xx)[order]]
     independent = independent_terms(xx[np.ix_(columns, columns)])
     found = []

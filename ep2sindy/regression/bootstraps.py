@@ -52,12 +52,6 @@ class Bootstraps:
         """Gram matrices and kept terms of every bootstrap, chosen among the usable `terms`."""
         if self.n == 0:
             return problem.train_gram, terms[None]
-        usable = np.flatnonzero(terms)
-        if self.n_culled >= len(usable):
-            raise ValueError(
-                f"n_culled must leave a term: {self.n_culled} of {len(usable)} would go; lower it "
-                "or use a larger library"
-            )
         if self.block > 1 and len(problem.trajectories) > 1:
             raise ValueError(
                 f"blocks of {self.block} would cross from one trajectory to the next: "
@@ -65,15 +59,28 @@ class Bootstraps:
             )
         _, group = np.unique(problem.groups[~problem.test], return_inverse=True)
         n_groups = int(group.max()) + 1
+        counts, kept = self.draw_groups(n_groups, terms, rng)
+        if n_groups < len(group):
+            counts = counts[:, group]
+        return problem.resampled_grams(counts), kept
+
+    def draw_groups(
+        self, n_groups: int, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "draws groups"], Bool[np.ndarray, "draws terms"]]:
+        """How often every training group occurs in each bootstrap, and the terms that it keeps."""
+        usable = np.flatnonzero(terms)
+        if self.n_culled >= len(usable):
+            raise ValueError(
+                f"n_culled must leave a term: {self.n_culled} of {len(usable)} would go; lower it "
+                "or use a larger library"
+            )
         counts = np.empty((self.n, n_groups))
         kept = np.repeat(terms[None], self.n, axis=0)
         for k in range(self.n):
             size = max(1, round(rng.uniform(self.smallest, self.largest) * n_groups))
             counts[k] = moving_block_counts(n_groups, n_drawn=size, block=self.block, rng=rng)
             kept[k, rng.permutation(usable)[: self.n_culled]] = False
-        if n_groups < len(group):
-            counts = counts[:, group]
-        return problem.resampled_grams(counts), kept
+        return counts, kept
 
 
 @dataclass(frozen=True, eq=False)

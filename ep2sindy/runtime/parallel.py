@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from threading import RLock
+from time import perf_counter
 from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,6 +21,9 @@ from joblib import Parallel, delayed, effective_n_jobs
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.trust.interruption import end_with
 from ep2sindy.trust.user_code import isolate_children, own_packages
+
+# Wall time that the start of processes costs, each with its imports.
+START_S = 4.5
 
 # Pieces submitted to a cluster per thread, including the running one; they queue with their data.
 AHEAD = 2
@@ -127,7 +131,12 @@ ONE_BY_ONE = Serial()
 
 @dataclass(frozen=True)
 class Loky:
-    """Workers in parallel processes on this machine. n_jobs: their number; -1 for one per core."""
+    """Workers in parallel processes on this machine.
+
+    n_jobs: their number; -1 for one per core. Where pieces are alike and many, as the blocks of a
+    pointwise study, the first is done in this process, and the others too if they would take less
+    time than the start of the processes.
+    """
 
     n_jobs: int = -1
 
@@ -137,6 +146,18 @@ class Loky:
                 f"n_jobs must be a number of processes, or -1 for one per core: {self.n_jobs!r} "
                 "came"
             )
+
+    def run_alike(
+        self, function: Callable[[Any], Any], pieces: Iterable[Any], n_pieces: int
+    ) -> Iterator[tuple[int, Any]]:
+        """Run pieces of which each takes about as long; processes start only if they save time."""
+        waiting, begin = iter(pieces), perf_counter()
+        yield from ONE_BY_ONE.run(function, islice(waiting, 1))
+        rest_s = (perf_counter() - begin) * (n_pieces - 1)
+        pays = rest_s * (1.0 - 1.0 / effective_n_jobs(self.n_jobs)) > START_S
+        workers: Workers = self if pays else ONE_BY_ONE
+        for number, result in workers.run(function, waiting):
+            yield number + 1, result
 
     def run(
         self, function: Callable[[Any], Any], pieces: Iterable[Any]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import comb, log
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,6 +17,24 @@ from ep2sindy.selection.rule import FLOOR
 
 # Rounds of weighting the rows by the covariance under the leading candidate.
 MAX_ROUNDS = 5
+
+
+class Fits(NamedTuple):
+    """Candidates of one equation, fitted to rows whose noise is not known.
+
+    terms: of each candidate. errors: 1 - R2 as in `ParetoFront.errors`. squares: sums of squares
+    of the residuals of the training rows, for a target of unit norm. n_rows: for training.
+    """
+
+    library: Library
+    terms: Sequence[Sequence[str]]
+    errors: Float[np.ndarray, " candidates"]
+    squares: Float[np.ndarray, " candidates"]
+    n_rows: int
+
+    @property
+    def sizes(self) -> Float[np.ndarray, " candidates"]:
+        return np.array([float(len(terms)) for terms in self.terms])
 
 
 @dataclass(frozen=True)
@@ -35,8 +53,12 @@ class AICc:
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         return [_criterion(front, self._penalty) for front in fronts]
 
-    def _penalty(self, candidate: Candidate, n_rows: float) -> float:
-        k = candidate.n_terms
+    def score(self, fits: Fits) -> Float[np.ndarray, " candidates"]:
+        """Scores of candidates from their fits alone."""
+        return _criterion_of(fits, self._penalty)
+
+    def _penalty(self, terms: Sequence[str], n_rows: float, library: Library) -> float:
+        k = len(terms)
         return 2.0 * k + 2.0 * k * (k + 1) / (n_rows - k - 1) if n_rows > k + 1 else np.inf
 
 
@@ -79,16 +101,14 @@ class EBIC:
         return replace(self, gamma=self.gamma / n_points)
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        found = []
-        for front in fronts:
-            library = front.rows.library
+        return [_criterion(front, self._penalty, self.coarsening) for front in fronts]
 
-            def penalty(candidate: Candidate, n_rows: float, library: Library = library) -> float:
-                ways = log_supports(library, candidate.terms)
-                return candidate.n_terms * log(n_rows) + 2.0 * self.gamma * ways
+    def score(self, fits: Fits) -> Float[np.ndarray, " candidates"]:
+        """Scores of candidates from their fits alone."""
+        return _criterion_of(fits, self._penalty, self.coarsening)
 
-            found.append(_criterion(front, penalty, coarsening=self.coarsening))
-        return found
+    def _penalty(self, terms: Sequence[str], n_rows: float, library: Library) -> float:
+        return len(terms) * log(n_rows) + 2.0 * self.gamma * log_supports(library, terms)
 
 
 def log_supports(library: Library, terms: Sequence[str]) -> float:
@@ -98,28 +118,27 @@ def log_supports(library: Library, terms: Sequence[str]) -> float:
     return log(comb(int((degrees <= highest).sum()), len(terms)))
 
 
+Penalty = Callable[[Sequence[str], float, Library], float]
+
+
 def _criterion(
-    front: ParetoFront,
-    penalty: Callable[[Candidate, float], float],
-    *,
-    coarsening: float | None = None,
+    front: ParetoFront, penalty: Penalty, coarsening: float | None = None
 ) -> Float[np.ndarray, " candidates"]:
-    """n log(RSS / n) + penalty of every candidate, its rows weighted where their noise is known.
+    """The criterion of every candidate, its rows weighted where their noise is known.
 
     The weights depend on the model. Those of the leading candidate serve all, and are updated until
     the leader stays the same.
     """
     problem = front.rows
-    n_rows = len(problem.train_rows)
-    n_effective = float(n_rows if coarsening is None else n_rows / (1.0 + n_rows / coarsening))
-    penalties = np.array([penalty(c, n_effective) for c in front.candidates])
     masks = np.array([np.isin(problem.term_names, c.terms) for c in front.candidates])
     equation = problem.equations.index(front.equation)
     theta, target = problem.train_theta, problem.train_target(equation)
     leader = -1
     for _ in range(MAX_ROUNDS):
         squares, coef = _fits(theta, target, masks)
-        scores = n_effective * np.log(squares / n_rows) + penalties
+        terms = [candidate.terms for candidate in front.candidates]
+        fits = Fits(problem.library, terms, front.errors, squares, len(target))
+        scores = _criterion_of(fits, penalty, coarsening, FLOOR * (target @ target))
         if problem.noisy is None or int(np.argmin(scores)) == leader:
             break
         leader = int(np.argmin(scores))
@@ -128,20 +147,29 @@ def _criterion(
     return scores
 
 
+def _criterion_of(
+    fits: Fits, penalty: Penalty, coarsening: float | None = None, floor: float = FLOOR
+) -> Float[np.ndarray, " candidates"]:
+    """n log(RSS / n) + penalty of every candidate. floor: of RSS; the default is for norm 1."""
+    n_rows = float(fits.n_rows)
+    n_effective = n_rows if coarsening is None else n_rows / (1.0 + n_rows / coarsening)
+    penalties = np.array([penalty(terms, n_effective, fits.library) for terms in fits.terms])
+    return n_effective * np.log(np.maximum(fits.squares, floor) / n_rows) + penalties
+
+
 def _fits(
     theta: Float[np.ndarray, "rows terms"],
     target: Float[np.ndarray, " rows"],
     masks: Bool[np.ndarray, "candidates terms"],
 ) -> tuple[Float[np.ndarray, " candidates"], Float[np.ndarray, "candidates terms"]]:
-    """Least squares on every support: residual squares, at least the floor, and coefficients."""
+    """Least squares on every support: residual squares and coefficients."""
     # R of the QR factors holds all that least squares needs, without squaring the condition number.
     triangle = np.asarray(np.linalg.qr(np.column_stack([theta, target]), mode="r"))
     columns, right = triangle[:, :-1], triangle[:, -1]
     coef = np.zeros(masks.shape)
     for fit, mask in zip(coef, masks, strict=True):
         fit[mask] = np.linalg.lstsq(columns[:, mask], right)[0]
-    squares = np.square(right - coef @ columns.T).sum(axis=1)
-    return np.maximum(squares, FLOOR * (right @ right)), coef
+    return np.square(right - coef @ columns.T).sum(axis=1), coef
 
 
 @dataclass(frozen=True)
@@ -195,23 +223,25 @@ class Knee:
         return "d_log" if self.scale == "log" else "d_pareto"
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        return [
-            np.hypot(self._height(front), front.sizes / _norm_of_sizes(front, self.n_norm))
-            for front in fronts
-        ]
+        pairs = [(front, front.rows.library) for front in fronts]
+        return [self._score(front.errors, front.sizes, len(library)) for front, library in pairs]
 
-    def _height(self, front: ParetoFront) -> Float[np.ndarray, " candidates"]:
-        """Errors, or their logarithms scaled to the range from 0 to 1."""
+    def score(self, fits: Fits) -> Float[np.ndarray, " candidates"]:
+        """Scores of candidates from their fits alone."""
+        return self._score(fits.errors, fits.sizes, len(fits.library))
+
+    def _score(
+        self,
+        errors: Float[np.ndarray, " candidates"],
+        sizes: Float[np.ndarray, " candidates"],
+        n_terms: int,
+    ) -> Float[np.ndarray, " candidates"]:
+        norm = float(n_terms) if self.n_norm == "library" else float(sizes.max()) + 1.0
         if self.scale == "linear":
-            return front.errors
-        height = np.log(np.maximum(front.errors, FLOOR))
-        return (height - height.min()) / max(float(np.ptp(height)), np.finfo(float).tiny)
-
-
-def _norm_of_sizes(front: ParetoFront, n_norm: str) -> float:
-    if n_norm == "library":
-        return float(len(front.rows.library))
-    return float(front.sizes.max()) + 1.0
+            return np.hypot(errors, sizes / norm)
+        height = np.log(np.maximum(errors, FLOOR))
+        height = (height - height.min()) / max(float(np.ptp(height)), np.finfo(float).tiny)
+        return np.hypot(height, sizes / norm)
 
 
 @dataclass(frozen=True)

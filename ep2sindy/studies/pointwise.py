@@ -17,11 +17,11 @@ import xarray as xr
 
 from ep2sindy.data.fields import SPACE, write_netcdf
 from ep2sindy.discovery.method import AnyMethod
+from ep2sindy.discovery.point_search import PointSearch
 from ep2sindy.discovery.pointwise import (
     PACKAGE,
     STATUSES,
     Kept,
-    PointSearch,
     blocks_of,
     pointwise,
 )

@@ -1,0 +1,404 @@
+"""One point of a pointwise study, compiled: rows, Gram matrices of all draws, and supports.
+
+At each of thousands of points the arrays are small, and calls of NumPy would cost several times the
+arithmetic. A support is held as a code, in which bit j stands for term j; -1 is none. Columns are
+terms, then targets, each contiguous in memory.
+"""
+
+import numpy as np
+
+from ep2sindy.regression.gram_kernels import independent_terms, solve_masks
+from ep2sindy.regression.search_kernels import best_subsets
+from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
+
+# Correction of coefficients, as a share of them, after which another one would be rounding.
+SETTLED = 1e-9
+
+FAST = {"fastmath": {"reassoc", "contract"}, "error_model": "numpy", **SEPARATE_ARRAYS}
+
+
+@compiled(**FAST)
+def smooth(values, first, middle, last, out):
+    """Write weighted sums over the window about each sample; at the ends, over the last full one.
+
+    values, out: (variables, samples). middle: (window,) weights. first, last: (half, window).
+    """
+    n_samples, half = values.shape[1], len(middle) // 2
+    for v in range(len(values)):
+        for i in range(half):
+            begin, end = 0.0, 0.0
+            for k in range(len(middle)):
+                begin += first[i, k] * values[v, k]
+                end += last[i, k] * values[v, n_samples - len(middle) + k]
+            out[v, i], out[v, n_samples - half + i] = begin, end
+        within = out[v, half : n_samples - half]
+        within[:] = 0.0
+        for k in range(len(middle)):  # outermost, so that the samples fill the vector units
+            moved = values[v, k : k + len(within)]
+            for i in range(len(within)):
+                within[i] += middle[k] * moved[i]
+
+
+@compiled(**FAST)
+def differentiate(values, weights, out):
+    """Write second-order differences. weights: (3, samples), of three neighbours of each sample."""
+    last = values.shape[1] - 1
+    for v in range(len(values)):
+        for i in range(1, last):
+            out[v, i] = (
+                weights[0, i] * values[v, i - 1]
+                + weights[1, i] * values[v, i]
+                + weights[2, i] * values[v, i + 1]
+            )
+        out[v, 0], out[v, last] = 0.0, 0.0
+        for k in range(3):
+            out[v, 0] += weights[k, 0] * values[v, k]
+            out[v, last] += weights[k, last] * values[v, last - 2 + k]
+
+
+@compiled(**FAST)
+def fill_rows(known, table, rates, train, test, train_rows, test_rows, scale):
+    """Write the scaled columns of terms and targets at the training and the held-out samples.
+
+    known: (variables + 1, samples), the last of ones. table: `Library.table`. scale: (columns,),
+    to be filled with the norms of the training columns, 1 for a column of zeros.
+    """
+    n_terms, column = len(table), np.empty(known.shape[1])
+    for j in range(len(scale)):
+        if j < n_terms:
+            column[:] = known[table[j, 0]]
+            for k in range(1, table.shape[1]):
+                if table[j, k] < len(known) - 1:
+                    factor = known[table[j, k]]
+                    for i in range(len(column)):
+                        column[i] *= factor[i]
+        else:
+            column[:] = rates[j - n_terms]
+        largest, squares = 0.0, 0.0
+        for i in range(len(train)):
+            train_rows[j, i] = column[train[i]]
+            largest = max(largest, abs(train_rows[j, i]))
+        over = 1.0 / largest if largest > 0.0 else 1.0  # squares of densities would overflow
+        for i in range(len(train)):
+            squares += (train_rows[j, i] * over) ** 2
+        scale[j] = largest * np.sqrt(squares) if largest > 0.0 else 1.0
+        share = 1.0 / scale[j]
+        for i in range(len(train)):
+            train_rows[j, i] *= share
+        for i in range(len(test)):
+            test_rows[j, i] = column[test[i]] * share
+
+
+@compiled(**FAST)
+def fill_products(rows, products):
+    """Write the product of every pair of columns: (pairs, rows)."""
+    pair = 0
+    for a in range(len(rows)):
+        for b in range(a, len(rows)):
+            for i in range(rows.shape[1]):
+                products[pair, i] = rows[a, i] * rows[b, i]
+            pair += 1
+
+
+@compiled(**FAST)
+def fill_running_sums(rows, means, sums):
+    """Write the sums over the rows before of the products of all pairs, less their means.
+
+    About their means sums stay small, and keep their digits. means: (pairs,). sums: (rows + 1,
+    pairs).
+    """
+    n_columns = len(rows)
+    sums[0] = 0.0
+    row = np.empty(n_columns)
+    for i in range(rows.shape[1]):
+        for a in range(n_columns):
+            row[a] = rows[a, i]
+        pair = 0
+        for a in range(n_columns):
+            for b in range(a, n_columns):
+                sums[i + 1, pair] = sums[i, pair] + (row[a] * row[b] - means[pair])
+                pair += 1
+
+
+@compiled(**FAST)
+def add_steps(starts, places, steps, running, means, n_drawn, sums):
+    """Write the sums of products of every draw, from the places where its weights change.
+
+    The weight of row i less that of the row before is minus a step; by parts, the weighted sum is
+    that of steps times running sums. Draws of blocks have few steps.
+    starts: (draws + 1,), of each draw in places and steps. means: taken off the running sums.
+    n_drawn: (draws,) sum of weights.
+    """
+    for d in range(len(sums)):
+        sums[d] = n_drawn[d] * means
+        for k in range(starts[d], starts[d + 1]):
+            for pair in range(sums.shape[1]):
+                sums[d, pair] += steps[k] * running[places[k], pair]
+
+
+@compiled(**FAST)
+def _product(left, right):
+    """Scalar product."""
+    total = 0.0
+    for i in range(len(left)):
+        total += left[i] * right[i]
+    return total
+
+
+@compiled(**FAST)
+def gram(rows, out):
+    """Write the products of all columns: (columns, columns)."""
+    for a in range(len(rows)):
+        for b in range(a, len(rows)):
+            out[a, b] = out[b, a] = _product(rows[a], rows[b])
+
+
+@compiled
+def all_usable(gram, order, same):
+    """True if all is finite, and no term is zero, repeats another, or combines others.
+
+    order: terms, the simplest first. same: 1 - |cosine| below which two terms are the same.
+    """
+    n_terms = len(order)
+    for a in range(len(gram)):
+        for b in range(len(gram)):
+            if not np.isfinite(gram[a, b]):
+                return False
+    xx = np.empty((n_terms, n_terms))
+    for a in range(n_terms):
+        for b in range(n_terms):
+            xx[a, b] = gram[order[a], order[b]]
+            if a != b and abs(xx[a, b]) > 1.0 - same:
+                return False
+        if xx[a, a] <= 0.0:
+            return False
+    return independent_terms(xx).all()
+
+
+@compiled(**FAST)
+def alike(states, limit):
+    """True if two states are correlated by more than `limit`."""
+    unit = np.empty(states.shape)
+    for s in range(len(states)):
+        unit[s] = states[s] - states[s].mean()
+        unit[s] /= np.sqrt(_product(unit[s], unit[s]))
+        for r in range(s):
+            if abs(_product(unit[r], unit[s])) >= limit:
+                return True
+    return False
+
+
+@compiled
+def _code(mask):
+    """Code of a mask."""
+    code = 0
+    for j in range(len(mask)):
+        if mask[j]:
+            code |= 1 << j
+    return code
+
+
+@compiled
+def _write_mask(code, mask):
+    """Write the mask of a code; returns its number of terms."""
+    size = 0
+    for j in range(len(mask)):
+        mask[j] = (code >> j) & 1 == 1
+        size += mask[j]
+    return size
+
+
+@compiled
+def scale_draws(sums, kept, xx, xy, yy, scale):
+    """Write the Gram matrices of every draw, its kept terms scaled to unit norm.
+
+    sums: (draws, pairs). kept: (draws, terms). xx, xy, yy, scale: as in `Resamples`.
+    """
+    n_terms = kept.shape[1]
+    n_columns = n_terms + xy.shape[1]
+    for d in range(len(sums)):
+        pair = 0
+        for a in range(n_columns):
+            if a < n_terms:
+                is_there = kept[d, a] and sums[d, pair] > 0.0
+                scale[d, a] = 1.0 / np.sqrt(sums[d, pair]) if is_there else 0.0
+            for b in range(a, n_columns):
+                if b < n_terms:
+                    xx[d, a, b] = xx[d, b, a] = sums[d, pair]
+                elif a < n_terms:
+                    xy[d, b - n_terms, a] = sums[d, pair] * scale[d, a]
+                elif a == b:
+                    yy[d, a - n_terms] = sums[d, pair]
+                pair += 1
+        for a in range(n_terms):
+            for b in range(n_terms):
+                xx[d, a, b] *= scale[d, a] * scale[d, b]
+
+
+@compiled
+def supports_of_draws(xx, xy, yy, largest, max_terms, most_work, codes):
+    """Write the best support of every size in every draw, for each equation.
+
+    codes: (equations, draws, sizes), with -1 where there is none. Returns false if a support is not
+    proven best.
+    """
+    n_draws, n_equations, n_terms = xy.shape
+    ordered_xx, ordered_xy = np.empty((1, n_terms, n_terms)), np.empty((1, n_terms))
+    ordered_yy, mask = np.empty(1), np.empty(n_terms, dtype=np.bool_)
+    codes[:] = -1
+    for e in range(n_equations):
+        for d in range(n_draws):
+            order = np.argsort(-(xy[d, e] ** 2), kind="mergesort")
+            for a in range(n_terms):
+                ordered_xy[0, a] = xy[d, e, order[a]]
+                for b in range(n_terms):
+                    ordered_xx[0, a, b] = xx[d, order[a], order[b]]
+            ordered_yy[0] = yy[d, e]
+            found, proven = best_subsets(
+                ordered_xx, ordered_xy, ordered_yy, max_terms, 1, most_work
+            )
+            if not proven:
+                return False
+            for k in range(len(found)):
+                for a in range(n_terms):
+                    mask[order[a]] = found[k, a]
+                size = mask.sum()
+                if size <= largest:
+                    codes[e, d, size] = _code(mask)
+    return True
+
+
+@compiled
+def best_of_sizes(codes, train, judge, best):
+    """Write the support of each size that explains most on the rows that judge.
+
+    train, judge: (columns, columns), Gram matrices. best: (equations, sizes) of codes.
+    """
+    n_equations, n_draws, n_sizes = codes.shape
+    n_terms = len(train) - n_equations
+    xx = np.ascontiguousarray(train[:n_terms, :n_terms])
+    mask, rhs = np.empty((1, n_terms), dtype=np.bool_), np.empty((1, n_terms))
+    best[:] = -1
+    best[:, 0] = 0
+    for e in range(n_equations):
+        y = n_terms + e
+        for size in range(1, n_sizes):
+            most = -np.inf
+            for d in range(n_draws):
+                code = codes[e, d, size]
+                if code < 0 or code in codes[e, :d, size]:
+                    continue
+                _write_mask(code, mask[0])
+                for a in range(n_terms):
+                    rhs[0, a] = train[y, a] if mask[0, a] else 0.0
+                coef = solve_masks(xx, rhs, mask)[0]
+                explained = 0.0
+                for a in range(n_terms):
+                    change = 2.0 * judge[y, a]
+                    for b in range(n_terms):
+                        change -= coef[b] * judge[a, b]
+                    explained += coef[a] * change
+                if explained > most:  # false for the NaN of dependent terms
+                    most, best[e, size] = explained, code
+
+
+@compiled(**FAST)
+def _residual(rows, target, coef, out):
+    """Write target - sum of coef times column; returns its sum of squares."""
+    out[:] = rows[target]
+    for a in range(len(coef)):
+        if coef[a] != 0.0:
+            row = rows[a]
+            for i in range(len(out)):
+                out[i] -= coef[a] * row[i]
+    return _product(out, out)
+
+
+@compiled(**FAST)
+def _spread(row):
+    """Sum of squares about the mean."""
+    mean, squares = 0.0, 0.0
+    for i in range(len(row)):
+        mean += row[i]
+    mean /= len(row)
+    for i in range(len(row)):
+        squares += (row[i] - mean) ** 2
+    return squares
+
+
+@compiled(**FAST)
+def fit_best(best, gram, train_rows, test_rows, coef, squares, r2_train, r2_test):
+    """Fit the best support of every size to the training rows, and score it on both.
+
+    As in `pareto_front`, solutions of the Gram matrix are refined by the residuals of the rows.
+    best: (equations, sizes) of codes. coef: (equations, sizes, terms), of scaled columns. squares:
+    of the training residuals. r2_test: NaN if no rows are held out.
+    """
+    n_equations, n_sizes, n_terms = coef.shape
+    xx = np.ascontiguousarray(gram[:n_terms, :n_terms])
+    mask, rhs = np.empty((1, n_terms), dtype=np.bool_), np.empty((1, n_terms))
+    left, left_test = np.empty(train_rows.shape[1]), np.empty(test_rows.shape[1])
+    for e in range(n_equations):
+        y = n_terms + e
+        total = _spread(train_rows[y])
+        total_test = _spread(test_rows[y])
+        for size in range(n_sizes):
+            coef[e, size] = 0.0
+            if best[e, size] < 0:
+                continue
+            _write_mask(best[e, size], mask[0])
+            for a in range(n_terms):
+                rhs[0, a] = gram[y, a] if mask[0, a] else 0.0
+            coef[e, size] = solve_masks(xx, rhs, mask)[0]
+            for _ in range(2):
+                _residual(train_rows, y, coef[e, size], left)
+                for a in range(n_terms):
+                    rhs[0, a] = _product(left, train_rows[a]) if mask[0, a] else 0.0
+                step = solve_masks(xx, rhs, mask)[0]
+                coef[e, size] += step
+                if np.abs(step).max() <= SETTLED * np.abs(coef[e, size]).max():
+                    break  # the next step would be as much smaller again
+            squares[e, size] = _residual(train_rows, y, coef[e, size], left)
+            r2_train[e, size] = 1.0 - squares[e, size] / total
+            tested = _residual(test_rows, y, coef[e, size], left_test)
+            r2_test[e, size] = 1.0 - tested / total_test
+
+
+@compiled
+def count_terms(codes, kept, inclusion):
+    """Write the share of draws, of those that kept a term, whose support of each size held it.
+
+    inclusion: (equations, sizes, terms).
+    """
+    n_equations, n_draws, n_sizes = codes.shape
+    n_terms = kept.shape[1]
+    for a in range(n_terms):
+        n_kept = 0
+        for d in range(n_draws):
+            n_kept += kept[d, a]
+        for e in range(n_equations):
+            for size in range(n_sizes):
+                n_held = 0
+                for d in range(n_draws):
+                    code = codes[e, d, size]
+                    n_held += code >= 0 and (code >> a) & 1 == 1
+                inclusion[e, size, a] = n_held / max(n_kept, 1)
+
+
+@compiled
+def fit_draws(codes, chosen, xx, xy, scale, coef):
+    """Fit each draw's own support of the size chosen for an equation: as `Resamples.fits`.
+
+    chosen: (equations,) of codes. coef: (draws, equations, terms), of the problem's scaled columns.
+    """
+    n_draws, n_equations, n_terms = coef.shape
+    mask, rhs = np.empty((1, n_terms), dtype=np.bool_), np.empty((1, n_terms))
+    for e in range(n_equations):
+        size = _write_mask(chosen[e], mask[0])
+        for d in range(n_draws):
+            own = codes[e, d, size]
+            _write_mask(own if own >= 0 else chosen[e], mask[0])
+            for a in range(n_terms):
+                mask[0, a] &= scale[d, a] > 0.0
+                rhs[0, a] = xy[d, e, a] if mask[0, a] else 0.0
+            coef[d, e] = solve_masks(xx[d], rhs, mask)[0] * scale[d]
