@@ -99,7 +99,7 @@ def grid_points(field: xr.Dataset, axis: str) -> Float[np.ndarray, " points"]:
 def grid_values(array: xr.DataArray) -> Float[np.ndarray, "time z r"]:
     """Load a variable as (time, z, r) in float64; a dimension it lacks has length 1."""
     missing = [axis for axis in DIMS if axis not in array.dims]
-    return array.expand_dims(missing).transpose(*DIMS).values.astype(np.float64)
+    return array.expand_dims(missing).transpose(*DIMS).values.astype(np.float64, copy=False)
 
 
 def mask_cells(array: xr.DataArray) -> Bool[np.ndarray, "1 z r"]:

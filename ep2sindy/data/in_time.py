@@ -156,7 +156,7 @@ def interpolate(field: xr.Dataset, *, max_gap_s: float | None = None) -> xr.Data
     t = grid_points(field, "time")
     filled = {}
     for name in _of_time(field):
-        values = grid_values(field[name])
+        values = grid_values(field[name]).copy()
         absent = np.isnan(values)
         some = absent.any(axis=0) & ~absent.all(axis=0)
         for cell in np.argwhere(some):

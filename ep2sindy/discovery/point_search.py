@@ -140,11 +140,12 @@ class Draws(NamedTuple):
     """The weight of every training row in every bootstrap, and the terms that were not culled.
 
     weights: (rows, draws). steps: (draws, rows + 1), where weights change: that of the row before,
-    less that of the row. kept: (draws, terms).
+    less that of the row. n_drawn: (draws,), sums of weights. kept: (draws, terms).
     """
 
     weights: Float[np.ndarray, "rows draws"]
     steps: csr_array
+    n_drawn: Float[np.ndarray, " draws"]
     kept: Bool[np.ndarray, "draws terms"]
 
 
@@ -214,10 +215,10 @@ class CompiledPoints:
         steps = self.draws.steps
         if FEW_STEPS * steps.nnz < self.draws.weights.size:
             sums, running = np.empty((n_draws, n_pairs)), np.empty((n_rows + 1, n_pairs))
-            means = rows.gram[np.triu_indices(n_columns)] / n_rows
+            means = rows.gram[self._pairs] / n_rows
             fill_running_sums(rows.train, means, running)
-            n_drawn = self.draws.weights.sum(axis=0)
-            add_steps(steps.indptr, steps.indices, steps.data, running, means, n_drawn, sums)
+            places = steps.indptr, steps.indices, steps.data
+            add_steps(*places, running, means, self.draws.n_drawn, sums)
         else:
             products = np.empty((n_pairs, n_rows))
             fill_products(rows.train, products)
@@ -290,6 +291,10 @@ class CompiledPoints:
         return self.search.library.over(self.search.variables).table
 
     @cached_property
+    def _pairs(self) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
+        return np.triu_indices(len(self.search.library) + len(self.search.states))
+
+    @cached_property
     def _simplest(self) -> Int[np.ndarray, " terms"]:
         return simplest_first(self.search.library)
 
@@ -360,7 +365,9 @@ def compiled_points(search: PointSearch, t: Float[np.ndarray, " samples"]) -> Co
         return None
     padded = np.pad(weights, ((0, 0), (1, 1)))
     weights_of_rows = np.ascontiguousarray(weights.T)
-    draws = Draws(weights_of_rows, csr_array(padded[:, :-1] - padded[:, 1:]), kept)
+    draws = Draws(
+        weights_of_rows, csr_array(padded[:, :-1] - padded[:, 1:]), weights.sum(axis=1), kept
+    )
     rows = np.flatnonzero(~test), np.flatnonzero(test)
     return CompiledPoints(
         search, rule, proposer.max_terms, form.smooth_library, filter, *rows, draws

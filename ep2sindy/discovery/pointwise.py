@@ -39,7 +39,8 @@ KEY = "key"  # of the arrays in the file of a finished block, the one that says 
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
-TRANSPOSED = 64  # samples turned at once, few enough to stay in the cache
+# Points and samples that are turned at once from rows to columns, few enough to stay in the cache.
+TURNED_POINTS, TURNED_SAMPLES = 16, 64
 
 STATUSES = ("fitted", "no_plasma", "missing_samples", "too_little_variation", NO_FIT)
 
@@ -50,7 +51,7 @@ def pointwise(
     *,
     workers: Workers,
     kept: Kept | None = None,
-    block_points: int = 128,
+    block_points: int = 256,
     progress: Progress | Advance | bool = False,
 ) -> xr.Dataset:
     """Search at every point of a (time, z, r), (time, z) or (time, r) field, block by block.
@@ -193,38 +194,40 @@ def _search_block(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarra
     """Results at every point of a block, points along the last axis; a reason if a fit failed."""
     block = block.load(scheduler="synchronous")  # chunks, if any, are read on this thread
     t = grid_points(block, "time")
-    columns = _columns(block, search.variables)
-    status = np.array([_status(values, search) for values in columns], dtype=np.int8)
     found: dict[str, list[np.ndarray]] = {name: [] for name in LAYOUT}
-    reasons = []
+    status, reasons = [], []
     no_result, compiled = nothing(search), compiled_points(search, t)
-    for k, values in enumerate(columns):
+    for values in _columns(block, search.variables):
         point = no_result
-        if status[k] == 0:
+        status.append(_status(values, search))
+        if status[-1] == 0:
             try:
                 fast = compiled.at(values) if compiled else None
                 point = fast or search_point(_trajectory(t, values, block, search), search)
             except ValueError as error:
-                status[k] = STATUSES.index(NO_FIT)
+                status[-1] = STATUSES.index(NO_FIT)
                 reasons.append(str(error))
         for name, value in point.items():
             found[name].append(value)
     stacked = {name: np.stack(each, axis=-1) for name, each in found.items()}
-    return stacked | {"status": status, NO_FIT: np.array(min(reasons, default=""))}
+    flags = np.array(status, dtype=np.int8)
+    return stacked | {"status": flags, NO_FIT: np.array(min(reasons, default=""))}
 
 
 def _columns(
     block: xr.Dataset, names: Sequence[str]
-) -> Float[np.ndarray, "points variables samples"]:
-    """All variables at all points, the samples of each contiguous in memory."""
+) -> Iterator[Float[np.ndarray, "variables samples"]]:
+    """All variables at one point after another, the samples of each contiguous in memory."""
     shape = (block.sizes["time"], *(block.sizes.get(axis, 1) for axis in SPACE))
-    columns = np.empty((shape[1] * shape[2], len(names), shape[0]))
-    for j, name in enumerate(names):
-        values = np.broadcast_to(grid_values(block[name]), shape)
-        rows = values.reshape(shape[0], -1)
-        for start in range(0, len(rows), TRANSPOSED):
-            columns[:, j, start : start + TRANSPOSED] = rows[start : start + TRANSPOSED].T
-    return columns
+    grids = [np.broadcast_to(grid_values(block[n]), shape).reshape(shape[0], -1) for n in names]
+    for start in range(0, grids[0].shape[1], TURNED_POINTS):
+        parts = [grid[:, start : start + TURNED_POINTS] for grid in grids]
+        group = np.empty((parts[0].shape[1], len(parts), shape[0]))
+        for j, part in enumerate(parts):
+            for first in range(0, len(part), TURNED_SAMPLES):
+                rows = slice(first, first + TURNED_SAMPLES)
+                group[:, j, rows] = part[rows].T
+        yield from group
 
 
 def _status(values: Float[np.ndarray, "variables samples"], search: PointSearch) -> int:
