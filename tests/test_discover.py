@@ -263,13 +263,13 @@ def test_the_number_of_states_is_limited_only_where_relations_tie_them() -> None
 def test_a_state_whose_rows_cannot_be_whitened_leaves_the_others_tested(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def fail_for_x(problem: RegressionRows, fit: choice.EquationFit) -> choice.EquationFit:
+    def fail_for_x(problem: RegressionRows, fit: choice.EquationFit) -> choice.LeftOver:
         if fit.equation == "x":
             raise np.linalg.LinAlgError("singular")
-        return reweight(problem, fit)
+        return left_of_terms(problem, fit)
 
-    reweight = choice.reweight
-    monkeypatch.setattr(choice, "reweight", fail_for_x)
+    left_of_terms = choice._left_of_terms
+    monkeypatch.setattr(choice, "_left_of_terms", fail_for_x)
     recipe = Regression(Differential(), BestSubset(), bootstraps=Bootstraps(n=0))
     found = discover(lotka_volterra().trajectory(noise=0.05, rng=0), None, recipe)
     assert list(found.noise_test.left) == ["y"]

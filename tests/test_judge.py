@@ -111,3 +111,17 @@ def test_even_steps_give_what_nearly_even_ones_give(ratio: float) -> None:
             route(even, values, ratio), route(nearly, values, ratio), strict=True
         ):
             np.testing.assert_allclose(found, plain, rtol=1e-6, atol=1e-7)
+
+
+def test_nearly_settled_steps_tell_the_same_residuals() -> None:
+    """Least squares at the coefficients, so their last digits do not show in chi-squared."""
+    run = ep.lorenz().trajectory(noise=0.1, rng=1).window(0, 1500)
+    library = ep.named_terms(run.state_names, ["x", "y", "x*z"])
+    form, rng = ep.Weak(split=ep.RandomSplit(0.0)), np.random.default_rng(0)
+    for problem in form.assemble([run], library, rng=rng):
+        (state,) = problem.equations
+        fit = choice.EquationFit(state, library.names, np.array([10.0, 28.0, -1.0]))
+        near, exact = choice._left_of_terms(problem, fit), choice.reweight(problem, fit).left
+        assert exact is not None
+        assert abs(near.chi_squared / exact.chi_squared - 1.0) < 1e-5
+        assert abs(near.autocorrelation - exact.autocorrelation) < 1e-5

@@ -25,7 +25,7 @@ from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.regression.whitening import NEARLY_SETTLED, SETTLED, whitened_rows
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.rule import (
     Decision,
@@ -235,8 +235,8 @@ def _left_of_weak_rows(
         with suppress(ValueError, np.linalg.LinAlgError):
             if state in choice.n_free:
                 left[state] = _left_of_fit(problem, fit, n_free=choice.n_free[state])
-            elif (tested := reweight(problem, fit).left) is not None:
-                left[state] = tested
+            else:
+                left[state] = _left_of_terms(problem, fit)
     return left
 
 
@@ -348,6 +348,13 @@ def reweight(
     )
 
 
+def _left_of_terms(problem: RegressionRows, fit: EquationFit) -> LeftOver:
+    """Residuals of a fit's terms, fitted again with weights as by `reweight`."""
+    theta, target, _ = _whitened_terms(problem, fit, settled=NEARLY_SETTLED)
+    fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
+    return _compare_with_noise(target - theta @ fitted, n_free=len(fitted))
+
+
 def _left_of_fit(problem: RegressionRows, fit: EquationFit, *, n_free: int) -> LeftOver:
     """Residuals of a fit with its own coefficients, whitened about a free fit of its terms.
 
@@ -355,13 +362,17 @@ def _left_of_fit(problem: RegressionRows, fit: EquationFit, *, n_free: int) -> L
     not by coefficients that the data may contradict. n_free: number of free coefficients.
     """
     free = fit_support(problem, fit.equation, fit.terms)
-    theta, target, scale = _whitened_terms(problem, free, n_steps=8)
+    theta, target, scale = _whitened_terms(problem, free, settled=NEARLY_SETTLED)
     order = [fit.terms.index(name) for name in free.terms]
     return _compare_with_noise(target - theta @ (fit.coef[order] / scale), n_free=n_free)
 
 
 def _whitened_terms(
-    problem: RegressionRows, candidate: Candidate | EquationFit, *, n_steps: int
+    problem: RegressionRows,
+    candidate: Candidate | EquationFit,
+    *,
+    n_steps: int = 8,
+    settled: float = SETTLED,
 ) -> tuple[
     Float[np.ndarray, "rows terms"], Float[np.ndarray, " rows"], Float[np.ndarray, " terms"]
 ]:
@@ -371,7 +382,7 @@ def _whitened_terms(
     coef = np.zeros(len(terms))
     order = [problem.library.index(name) for name in candidate.terms]
     coef[order] = candidate.coef / scale[order]
-    rows = whitened_rows(problem, terms, coef, n_steps=n_steps)
+    rows = whitened_rows(problem, terms, coef, n_steps=n_steps, settled=settled)
     return rows.theta[:, order], rows.target, scale[order]
 
 

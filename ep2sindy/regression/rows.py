@@ -54,6 +54,15 @@ class NoisyRows:
     noise_std: Float[np.ndarray, "samples variables"]
 
     @cached_property
+    def target(self) -> Float[np.ndarray, " rows"]:
+        return self.slope @ self.values[:, self.state]
+
+    @cached_property
+    def transposed(self) -> tuple[csr_array, csr_array]:
+        """Both matrices transposed, (samples, rows)."""
+        return self.mean.T.tocsr(), self.slope.T.tocsr()
+
+    @cached_property
     def stretches(self) -> Stretches:
         """The windows of all rows as stretches of neighbouring samples."""
         first = np.minimum(*(_ends(matrix)[0] for matrix in (self.mean, self.slope)))

@@ -147,7 +147,7 @@ class Weak:
             ),
             test=test,
             trajectories=tuple(trajectories),
-            noisy=_noisy_rows(name, runs, mean[~test], slope[~test])
+            noisy=_noisy_rows(name, runs, _taken(mean, ~test), _taken(slope, ~test))
             if self.errors_in_variables
             else None,
         )
@@ -176,10 +176,10 @@ class _Sampled:
         first, last = windows.first, windows.last
         n_held_out = np.append(0, np.cumsum(self.held_out))
         share = (n_held_out[last + 1] - n_held_out[first]) / (last + 1 - first)
-        pure = np.flatnonzero((share == 0.0) | (share == 1.0))
+        pure = (share == 0.0) | (share == 1.0)
         return _Rows(
-            mean=windows.mean[pure],
-            slope=windows.slope[pure],
+            mean=_taken(windows.mean, pure),
+            slope=_taken(windows.slope, pure),
             segment=self.segment[(first + last) // 2][pure],
             test=share[pure] == 1.0,
         )
@@ -199,6 +199,11 @@ def _pieces(run: Trajectory) -> list[Trajectory]:
     """Stretches of a trajectory between its gaps; each one gets its own rows."""
     parts = stretches(run.t)
     return [run] if parts == [(0, run.n_samples)] else [run.window(*part) for part in parts]
+
+
+def _taken(matrix: csr_array, rows: Bool[np.ndarray, " rows"]) -> csr_array:
+    """Some rows of a sparse matrix; the matrix itself if that is all, which saves the copy."""
+    return matrix if rows.all() else matrix[rows]
 
 
 def _stack(blocks: Iterable[csr_array]) -> csr_array:

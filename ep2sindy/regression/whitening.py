@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dtbtrs
-from scipy.sparse import csr_array
 
 from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import column_norms
@@ -31,7 +30,9 @@ RISE = 10.0
 
 MAX_HALVED = 6
 
-SETTLED = 1e-8  # change of the scaled coefficients, as a share of them, that ends the steps
+# Change of the scaled coefficients, as a share of them, that ends the steps. For residuals alone a
+# larger one serves: they are least there, so chi-squared changes by its square.
+SETTLED, NEARLY_SETTLED = 1e-8, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +56,7 @@ def whitened_rows(
     coef: Float[np.ndarray, " terms"],
     *,
     n_steps: int = 2,
+    settled: float = SETTLED,
 ) -> WhitenedRows:
     """Whiten the rows of one equation by their covariance under the model with these terms.
 
@@ -63,7 +65,8 @@ def whitened_rows(
     most likely coefficients and samples: fit the coefficients with weights, correct the samples by
     the most likely noise, linearise again. Without the correction, the noise in the terms would
     bias the coefficients. A step that raises the misfit too far is halved.
-    coef: (terms,), a first guess in scaled columns.
+    coef: (terms,), a first guess in scaled columns. settled: change of the coefficients, as a share
+    of them, that ends the steps.
     Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance;
     Britt & Luecke 1973, Technometrics 15, 233, for the steps.
     """
@@ -76,7 +79,7 @@ def whitened_rows(
         if following is None:
             break
         rows, least = following, min(least, following.misfit)
-        if np.linalg.norm(rows.coef - before) <= SETTLED * np.linalg.norm(rows.coef):
+        if np.linalg.norm(rows.coef - before) <= settled * np.linalg.norm(rows.coef):
             break
     return WhitenedRows(
         theta=rows.theta,
@@ -123,7 +126,7 @@ class _Linearised:
     target: Float[np.ndarray, " rows"]
     sensitivity: Float[np.ndarray, "samples variables"]
     factor: Float[np.ndarray, "band rows"]
-    slope: csr_array
+    target_scale: float
     source: NoisyRows
 
     @staticmethod
@@ -151,16 +154,15 @@ class _Linearised:
         sensitivity = np.zeros_like(rows.noise_std)
         sensitivity[:, :n_variables] = (slopes @ coef).T
         sensitivity *= rows.noise_std
-        slope = rows.slope / problem.target_scale[0]
-        factor = _banded_cholesky(_covariance(rows, sensitivity, problem.target_scale[0]))
-        theta = rows.mean @ terms
-        columns = np.column_stack(
-            [theta, theta + rows.mean @ change, slope @ rows.values[:, rows.state]]
-        )
-        white = _solve(factor, columns)
+        target_scale = float(problem.target_scale[0])
+        factor = _banded_cholesky(_covariance(rows, sensitivity, target_scale))
         n = len(library)
+        means = rows.mean @ np.concatenate([terms, change], axis=1)
+        means[:, n:] += means[:, :n]
+        columns = np.column_stack([means, rows.target / target_scale])
+        white = _solve(factor, columns)
         theta, drifted, target = white[:, :n], white[:, n:-1], white[:, -1]
-        return _Linearised(x, coef, theta, drifted, target, sensitivity, factor, slope, rows)
+        return _Linearised(x, coef, theta, drifted, target, sensitivity, factor, target_scale, rows)
 
     @property
     def misfit(self) -> float:
@@ -188,8 +190,10 @@ class _Linearised:
         """Samples minus their most likely noise."""
         weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
         rows = self.source
-        noise = (rows.mean.T @ weighted)[:, None] * self.sensitivity
-        noise[:, rows.state] -= (self.slope.T @ weighted) * rows.noise_std[:, rows.state]
+        by_mean, by_slope = rows.transposed
+        noise = (by_mean @ weighted)[:, None] * self.sensitivity
+        own = by_slope @ (weighted / self.target_scale)
+        noise[:, rows.state] -= own * rows.noise_std[:, rows.state]
         limited = np.clip(noise, -LARGEST_CORRECTION, LARGEST_CORRECTION)
         return rows.values - limited * rows.noise_std
 
