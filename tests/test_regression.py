@@ -5,7 +5,7 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.regression.ambiguity import ambiguities, few_rows, largest_support, usable_terms
+from ep2sindy.regression.ambiguity import ambiguities, few_rows, row_limit, usable_terms
 from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import Formulation, RegressionRows
@@ -172,7 +172,8 @@ def test_a_combination_of_many_terms_is_named_and_stays_in_the_search() -> None:
 def test_few_rows_hold_the_size_of_supports_down(n_rows: int, largest: int) -> None:
     theta = np.random.default_rng(0).normal(size=(n_rows, 6))
     problem = plain_rows(theta, theta[:, :1], list("abcdef"))
-    assert largest_support(problem) == largest
+    n_terms = int(usable_terms(problem).sum())
+    assert row_limit(n_terms, len(problem.train_rows)) == largest
     (supports,) = pooled_supports(
         problem, BestSubset(), Bootstraps(n=0), rng=np.random.default_rng(0)
     )

@@ -11,9 +11,6 @@ from ep2sindy.regression.gram_kernels import independent_terms, solve_masks
 from ep2sindy.regression.search_kernels import best_subsets
 from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
 
-# Correction of coefficients, as a share of them, after which another one would be rounding.
-SETTLED = 1e-9
-
 FAST = {"fastmath": {"reassoc", "contract"}, "error_model": "numpy", **SEPARATE_ARRAYS}
 
 
@@ -327,11 +324,12 @@ def _spread(row):
 
 
 @compiled(**FAST)
-def fit_best(best, gram, train_rows, test_rows, coef, squares, r2_train, r2_test):
+def fit_best(best, gram, train_rows, test_rows, refined, coef, squares, r2_train, r2_test):
     """Fit the best support of every size to the training rows, and score it on both.
 
     As in `pareto_front`, solutions of the Gram matrix are refined by the residuals of the rows.
-    best: (equations, sizes) of codes. coef: (equations, sizes, terms), of scaled columns. squares:
+    refined: correction, as a share of coefficients, that needs no other one. best: (equations,
+    sizes) of codes. coef: (equations, sizes, terms), of scaled columns. squares:
     of the training residuals. r2_test: NaN if no rows are held out.
     """
     n_equations, n_sizes, n_terms = coef.shape
@@ -356,7 +354,7 @@ def fit_best(best, gram, train_rows, test_rows, coef, squares, r2_train, r2_test
                     rhs[0, a] = _product(left, train_rows[a]) if mask[0, a] else 0.0
                 step = solve_masks(xx, rhs, mask)[0]
                 coef[e, size] += step
-                if np.abs(step).max() <= SETTLED * np.abs(coef[e, size]).max():
+                if np.abs(step).max() <= refined * np.abs(coef[e, size]).max():
                     break  # the next step would be as much smaller again
             squares[e, size] = _residual(train_rows, y, coef[e, size], left)
             r2_train[e, size] = 1.0 - squares[e, size] / total

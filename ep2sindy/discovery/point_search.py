@@ -39,7 +39,7 @@ from ep2sindy.discovery.point_kernels import (
 from ep2sindy.library.library import Library
 from ep2sindy.regression.ambiguity import SAME, row_limit, simplest_first
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.front import front_order
+from ep2sindy.regression.front import REFINED, front_order
 from ep2sindy.regression.searches import MOST_WORK, BestSubset
 from ep2sindy.runtime.values import check_kind, check_list
 from ep2sindy.selection.criteria import EBIC, AICc, Fits, Knee
@@ -240,7 +240,7 @@ class CompiledPoints:
         best = np.full(shape, -1)
         best_of_sizes(codes, rows.gram, rows.judge, best)
         fits = SizeFits(best, np.empty((*shape, n_sizes - 1)), *np.full((3, *shape), np.nan))
-        fit_best(best, rows.gram, rows.train, rows.test, *fits[1:])
+        fit_best(best, rows.gram, rows.train, rows.test, REFINED, *fits[1:])
         return fits
 
     def _select(self, fits: SizeFits, equation: int) -> int:

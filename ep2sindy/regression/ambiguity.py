@@ -53,19 +53,15 @@ def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
     return usable
 
 
-def largest_support(problem: RegressionRows) -> int:
-    """Largest number of terms in an equation: all usable ones, or fewer if there are few rows."""
-    return row_limit(int(usable_terms(problem).sum()), len(problem.train_rows))
-
-
 def row_limit(n_terms: int, n_rows: int) -> int:
-    """Largest number of terms in an equation for so many usable terms and training rows."""
+    """Largest number of terms in an equation: all usable ones, or fewer if there are few rows."""
     return n_terms if n_rows >= FEW * n_terms else max(1, n_rows // ROWS_PER_COEFFICIENT)
 
 
 def few_rows(problem: RegressionRows) -> tuple[Ambiguity, ...]:
-    """Message for the user if `largest_support` limits the equations; empty otherwise."""
-    largest, n_terms = largest_support(problem), int(usable_terms(problem).sum())
+    """Message for the user if `row_limit` limits the equations; empty otherwise."""
+    n_terms = int(usable_terms(problem).sum())
+    largest = row_limit(n_terms, len(problem.train_rows))
     if largest == n_terms:
         return ()
     message = (

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ep2sindy.regression.ambiguity import largest_support, usable_terms
+from ep2sindy.regression.ambiguity import row_limit, usable_terms
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
 from ep2sindy.regression.rows import Grams, RegressionRows
 from ep2sindy.regression.searches import Search
@@ -129,6 +129,8 @@ class Resamples:
         for draw in draws:
             found.append(search.supports(*draw))
             advance(1)
+        if self.largest >= self.kept.shape[1]:
+            return found
         return [masks[masks.sum(axis=1) <= self.largest] for masks in found]
 
     def fits(
@@ -162,7 +164,8 @@ def draw_resamples(
     """
     if bootstraps.n:
         problem.check_grams(bootstraps.n)  # before the work on terms, which may take minutes
-    grams, kept = bootstraps.draw(problem, usable_terms(problem), rng)
+    usable = usable_terms(problem)
+    grams, kept = bootstraps.draw(problem, usable, rng)
     # Resampling changes the norms, so columns are scaled to unit norm again; then the search does
     # not depend on units or draws. A culled term becomes a column of zeros.
     diagonal = np.diagonal(grams.xx, axis1=1, axis2=2)
@@ -177,7 +180,7 @@ def draw_resamples(
         scale=scale,
         kept=kept,
         counted=bootstraps.n > 0,
-        largest=largest_support(problem),
+        largest=row_limit(int(usable.sum()), len(problem.train_rows)),
     )
 
 

@@ -17,6 +17,9 @@ from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
 
+# Correction of coefficients, as a share of them, after which another one would be rounding.
+REFINED = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -309,7 +312,10 @@ def _fit(
     coef = fit_masks(xx, gram.xy[0, equation], masks)
     for _ in range(2):
         residual = target - coef @ theta.T
-        coef = coef + solve_masks(xx, residual @ theta, masks)
+        step = solve_masks(xx, residual @ theta, masks)
+        coef = coef + step
+        if not (np.abs(step) > REFINED * np.abs(coef).max(axis=1, keepdims=True)).any():
+            break  # the next step would be as much smaller again
     return coef
 
 
