@@ -9,10 +9,10 @@ the right-hand side.
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import compiled
+from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
 
 
-@compiled(fastmath={"reassoc", "contract"})
+@compiled(fastmath={"reassoc", "contract"}, **SEPARATE_ARRAYS)
 def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
     """Write R of a QR decomposition by Householder reflections.
 
@@ -20,29 +20,29 @@ def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
     """
     n_columns = len(columns)
     for i in range(min(n_columns, n_rows)):
-        pivot = columns[i]
+        pivot = columns[i, i:n_rows]  # counted from zero, the loops below fill the vector units
         square = 0.0
-        for r in range(i, n_rows):
+        for r in range(len(pivot)):
             square += pivot[r] * pivot[r]
         norm = np.sqrt(square)
         if norm != 0.0:  # NaN must spread
-            alpha = -norm if pivot[i] > 0.0 else norm
-            beta = 1.0 / (norm * (norm + abs(pivot[i])))
-            pivot[i] -= alpha
+            alpha = -norm if pivot[0] > 0.0 else norm
+            beta = 1.0 / (norm * (norm + abs(pivot[0])))
+            pivot[0] -= alpha
             for j in range(i + 1, n_columns):
-                other = columns[j]
+                other = columns[j, i:n_rows]
                 product = 0.0
-                for r in range(i, n_rows):
+                for r in range(len(pivot)):
                     product += pivot[r] * other[r]
                 product *= beta
-                for r in range(i, n_rows):
+                for r in range(len(pivot)):
                     other[r] -= product * pivot[r]
             out[i, i] = alpha
         for j in range(i + 1, n_columns):
             out[i, j] = columns[j, i]
 
 
-@compiled(fastmath={"reassoc", "contract"})
+@compiled(fastmath={"reassoc", "contract"}, **SEPARATE_ARRAYS)
 def _advance(
     maps: np.ndarray, nodes: np.ndarray, p: int, w: int, k: int, x: np.ndarray, new: np.ndarray
 ) -> None:
@@ -50,11 +50,11 @@ def _advance(
     n, n_columns = x.shape
     n_start = n_columns - 1 - (maps.shape[2] - 1 - n)
     for j in range(n):
-        for c in range(n_columns):
-            total = 0.0
-            for v in range(n):
-                total += maps[p, j, 1 + v, w, k] * x[v, c]
-            new[j, c] = total
+        new[j] = 0.0
+        for v in range(n):
+            slope = maps[p, j, 1 + v, w, k]  # read once for all columns, which then fill a vector
+            for c in range(n_columns):
+                new[j, c] += slope * x[v, c]
         for c in range(n_start, n_columns - 1):
             new[j, c] += maps[p, j, 1 + n + c - n_start, w, k]
         new[j, n_columns - 1] += maps[p, j, 0, w, k] - nodes[p, w, k + 1, j]

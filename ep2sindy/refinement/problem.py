@@ -267,6 +267,10 @@ class RefinementProblem:
     def data(self) -> Float[np.ndarray, "points windows samples n_states"]:
         return np.stack([batch.data for batch in self.batches])
 
+    @cached_property
+    def ranges(self) -> Float[np.ndarray, "points n_states"]:
+        return np.ptp(self.data, axis=(1, 2))
+
     @property
     def n_free(self) -> int:
         """Largest number of scalings of a model; other models ignore the excess ones."""

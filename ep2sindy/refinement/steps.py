@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -133,22 +134,29 @@ def _equations(
     table: np.ndarray, weights: Float[np.ndarray, "n_states columns products"]
 ) -> SumsOfProducts:
     """Weights of the products for rates and derivatives, as the kernel takes them."""
-    n = len(weights)
-    state, column, product = np.nonzero(weights)
+    there = weights != 0.0
+    product, target, *where = _order_of_sums(there.shape, there.tobytes())
+    return SumsOfProducts(table, product, target, weights[there], *where)
+
+
+@lru_cache(maxsize=256)  # the same weights stay zero through all iterations
+def _order_of_sums(shape: tuple[int, int, int], there: bytes) -> tuple[np.ndarray, ...]:
+    """Fields of `SumsOfProducts` after `table`, but for `weight`, for weights that are not zero.
+
+    There is a sum of products for every rate, then for every derivative that is not zero.
+    """
+    n, width = shape[:2]
+    state, column, product = np.nonzero(np.frombuffer(there, dtype=np.bool_).reshape(shape))
     by_state, by_scaling = (column > 0) & (column <= n), column > n
-    # A sum of products for every rate, then for every derivative that is not zero.
-    code = state * weights.shape[1] + column
+    code = state * width + column
     pairs, pair = np.unique(code[by_state], return_inverse=True)
     sources, source = np.unique(code[by_scaling], return_inverse=True)
     target = state.copy()
     target[by_state] = n + pair
     target[by_scaling] = n + len(pairs) + source
-    width = weights.shape[1]
     row, factor = pairs // width, pairs % width - 1
-    return SumsOfProducts(
-        table, product, target, weights[state, column, product], row, factor,
-        sources // width, sources % width - 1 - n, reach_of(n, row, factor),
-    )  # fmt: skip
+    reach = reach_of(n, row, factor)
+    return product, target, row, factor, sources // width, sources % width - 1 - n, reach
 
 
 @dataclass(frozen=True)

@@ -226,7 +226,8 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
 
     One Gauss-Newton step: the residual of the series is regressed on the change of slope.
     """
-    basis, triangle = np.linalg.qr(_columns(phase, order))
+    columns = _columns(phase, order)
+    basis, triangle = np.linalg.qr(columns)
     known = basis.T @ scaled
     series = np.linalg.solve(triangle, known)
     orders = np.arange(1, order + 1)
@@ -234,7 +235,7 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
     slope[1::2] = orders[:, None] * series[2::2]
     slope[2::2] = -orders[:, None] * series[1::2]
     since = (t - t.mean()) / (t[-1] - t[0])
-    direction = (_columns(phase, order) @ slope) * since[:, None]
+    direction = (columns @ slope) * since[:, None]
     direction -= basis @ (basis.T @ direction)
     size = float(np.square(direction).sum())
     change = float((direction * (scaled - basis @ known)).sum()) / size if size > 0.0 else 0.0

@@ -14,6 +14,7 @@ from ep2sindy.refinement.problem import (
     LawMap,
     RefinementFit,
     RefinementProblem,
+    ignore,
     residual_weights,
 )
 from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
@@ -223,7 +224,7 @@ class _Walk:
         unknowns, change, moved = newton_step(
             problem, state, maps, active, None if hold else damping
         )
-        share = step_share(moved, problem.data[active]) / (1.0 + damping)
+        share = step_share(moved, problem.ranges[active]) / (1.0 + damping)
         share = problem.agree(np.nan_to_num(share), np.min)
         change = share[:, None] * change
         scaling, nodes = state.scaling.copy(), state.nodes.copy()
@@ -326,7 +327,9 @@ def tell(
     relative: np.ndarray,
     defect: np.ndarray,
 ) -> None:
-    """Report an iteration to the observer, point by point."""
+    """Report an iteration to the observer, if there is one, point by point."""
+    if problem.observe is ignore:
+        return
     for i, point in enumerate(points):
         problem.observe(
             Iteration(
@@ -444,7 +447,7 @@ def norm(gaps: np.ndarray) -> np.ndarray:
         return np.sqrt(np.square(gaps).sum(axis=(1, 2, 3)))
 
 
-def step_share(moved: np.ndarray, data: np.ndarray) -> np.ndarray:
+def step_share(moved: np.ndarray, ranges: np.ndarray) -> np.ndarray:
     """Largest fraction of a step that moves no node by more than the data's range, (points,)."""
-    by_node = (np.abs(moved).max(axis=(1, 2)) / np.ptp(data, axis=(1, 2))).max(axis=1)
+    by_node = (np.abs(moved).max(axis=(1, 2)) / ranges).max(axis=1)
     return 1.0 / np.maximum(1.0, by_node)
