@@ -3,8 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.regression import differential, rows
 from ep2sindy.regression.ambiguity import ambiguities, few_rows, row_limit, usable_terms
 from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.differential import Differential
@@ -13,7 +16,7 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.splits import BlockSplit, RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay
-from ep2sindy.systems.systems import lotka_volterra
+from ep2sindy.systems.systems import lorenz, lotka_volterra
 from tests.models import plain_rows
 
 
@@ -184,3 +187,19 @@ def test_few_rows_hold_the_size_of_supports_down(n_rows: int, largest: int) -> N
 def test_a_healthy_library_has_no_ambiguities() -> None:
     theta = np.random.default_rng(0).normal(size=(50, 3))
     assert ambiguities(plain_rows(theta, theta[:, :1], ["a", "b", "c"])) == ()
+
+
+def test_a_long_record_in_blocks_gives_the_same_regression(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = [lorenz().trajectory(noise=0.05, rng=k).window(0, 700) for k in range(2)]
+    library = lorenz().model.library
+    method = Regression(Differential(), BestSubset(), bootstraps=Bootstraps(n=4))
+    whole = method.search_equations(Task(runs, library), rng=0)
+    for module in (rows, differential):
+        monkeypatch.setattr(module, "MOST_ROWS", 300)
+    for one, other in zip(whole, method.search_equations(Task(runs, library), rng=0), strict=True):
+        assert "train_rows" not in vars(other.front.rows)  # no scaled copy of all rows was made
+        assert one.supports.masks.tolist() == other.supports.masks.tolist()
+        for a, b in zip(one.front.candidates, other.front.candidates, strict=True):
+            assert a.terms == b.terms
+            np.testing.assert_allclose(a.coef, b.coef, rtol=1e-10)
+            np.testing.assert_allclose([a.r2_train, a.r2_test], [b.r2_train, b.r2_test], atol=1e-13)

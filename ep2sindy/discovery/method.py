@@ -217,7 +217,7 @@ def _ambiguities_of_samples(task: Task) -> tuple[Ambiguity, ...]:
     library = task.library
     theta = library.evaluate(np.concatenate([r.columns(library.variables) for r in task.runs]))
     theta = theta / column_norms(theta)
-    return find_ambiguities(library, theta, theta.T @ theta)
+    return find_ambiguities(library, lambda: theta, theta.T @ theta)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +49,7 @@ def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
     """
     xx = problem.train_gram.xx[0]
     usable = _distinct(problem.library, xx)
-    for j, parts in _combinations(problem.library, problem.train_theta, xx):
+    for j, parts in _combinations(problem.library, lambda: problem.train_theta, xx):
         usable[j] = len(parts) > MAX_PARTS
     return usable
 
@@ -61,11 +62,11 @@ def row_limit(n_terms: int, n_rows: int) -> int:
 def few_rows(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     """Message for the user if `row_limit` limits the equations; empty otherwise."""
     n_terms = int(usable_terms(problem).sum())
-    largest = row_limit(n_terms, len(problem.train_rows))
+    largest = row_limit(n_terms, problem.n_train)
     if largest == n_terms:
         return ()
     message = (
-        f"{len(problem.train_rows)} rows are few for {n_terms} terms: equations of "
+        f"{problem.n_train} rows are few for {n_terms} terms: equations of "
         f"{', '.join(problem.equations)} were searched with at most {largest}"
     )
     return (Ambiguity((), message, True),)
@@ -88,17 +89,18 @@ def _distinct(library: Library, xx: Float[np.ndarray, "terms terms"]) -> Bool[np
 
 def ambiguities(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     """All ambiguities between terms on the training rows."""
-    return find_ambiguities(problem.library, problem.train_theta, problem.train_gram.xx[0])
+    return find_ambiguities(problem.library, lambda: problem.train_theta, problem.train_gram.xx[0])
 
 
 def find_ambiguities(
     library: Library,
-    theta: Float[np.ndarray, "rows terms"],
+    theta: Callable[[], Float[np.ndarray, "rows terms"]],
     xx: Float[np.ndarray, "terms terms"],
 ) -> tuple[Ambiguity, ...]:
     """All ambiguities between terms of a library.
 
-    theta: columns of the library's terms, of unit norm or zero. xx: Gram matrix of theta.
+    theta: returns the columns of the library's terms, of unit norm or zero; it is called only where
+    the Gram matrix xx does not tell.
     """
     return (*_zero(library, xx), *_alike(library, xx), *_dependent(library, theta, xx))
 
@@ -135,7 +137,7 @@ def _alike(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambig
 
 def _dependent(
     library: Library,
-    theta: Float[np.ndarray, "rows terms"],
+    theta: Callable[[], Float[np.ndarray, "rows terms"]],
     xx: Float[np.ndarray, "terms terms"],
 ) -> list[Ambiguity]:
     """Terms that are linear combinations of simpler ones, with the terms they consist of."""
@@ -151,7 +153,7 @@ def _dependent(
 
 def _combinations(
     library: Library,
-    theta: Float[np.ndarray, "rows terms"],
+    theta: Callable[[], Float[np.ndarray, "rows terms"]],
     xx: Float[np.ndarray, "terms terms"],
 ) -> list[tuple[int, list[int]]]:
     """Distinct terms that depend on simpler ones, each with the indices of those terms."""
@@ -164,6 +166,7 @@ def _combinations(
         weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, columns[rank]])
         if (np.abs(weights) > 1e-6).sum() > MAX_PARTS:
             # The Gram matrix has lost half the digits; a fit on the rows may need fewer parts.
-            weights = np.linalg.lstsq(theta[:, basis], theta[:, columns[rank]], rcond=None)[0]
+            values = theta()
+            weights = np.linalg.lstsq(values[:, basis], values[:, columns[rank]], rcond=None)[0]
         found.append((int(columns[rank]), basis[np.abs(weights) > 1e-6].tolist()))
     return found

@@ -180,7 +180,7 @@ def draw_resamples(
         scale=scale,
         kept=kept,
         counted=bootstraps.n > 0,
-        largest=row_limit(int(usable.sum()), len(problem.train_rows)),
+        largest=row_limit(int(usable.sum()), problem.n_train),
     )
 
 

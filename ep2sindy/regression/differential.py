@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float
 
 from ep2sindy.data.coerce import check_domain, keep_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
-from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.rows import MOST_ROWS, RegressionRows
 from ep2sindy.regression.splits import RandomSplit, Split
-from ep2sindy.runtime.values import check_kind
+from ep2sindy.runtime.values import check_kind, locked
 from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
 
@@ -47,23 +48,37 @@ class Differential:
         """
         check_agreement(trajectories, library.variables)
         check_domain(trajectories, library)
-        parts = [self._rows(run, library) for run in trajectories]
-        test = [self.split.held_out(run.n_samples, rng) for run in trajectories]
-        n_rows = sum(run.n_samples for run in trajectories)
+        n_samples = [run.n_samples for run in trajectories]
+        theta = np.empty((sum(n_samples), len(library)))
+        target = np.empty((len(theta), len(trajectories[0].state_names)))
+        ends = np.cumsum(n_samples)
+        for run, end in zip(trajectories, ends.tolist(), strict=True):
+            rows = slice(end - run.n_samples, end)
+            self._fill(run, library, theta[rows], target[rows])
         problem = RegressionRows(
-            theta=np.concatenate([theta for theta, _ in parts]),
-            target=np.concatenate([target for _, target in parts]),
+            theta=locked(theta),
+            target=locked(target),
             library=library,
             equations=trajectories[0].state_names,
-            groups=np.arange(n_rows),
-            test=np.concatenate(test),
+            groups=np.arange(len(theta)),
+            test=np.concatenate([self.split.held_out(n, rng) for n in n_samples]),
             trajectories=tuple(trajectories),
         )
         return (problem,)
 
-    def _rows(self, run: Trajectory, library: Library) -> tuple[np.ndarray, np.ndarray]:
+    def _fill(
+        self,
+        run: Trajectory,
+        library: Library,
+        theta: Float[np.ndarray, "samples terms"],
+        target: Float[np.ndarray, "samples n_states"],
+    ) -> None:
+        """Write the terms and the derivatives of one trajectory at its samples."""
         values = run.columns(library.variables)
         if self.smooth_library:
             values = keep_inside(library, self.smoother.smooth(run.t, values), values)
         with np.errstate(over="ignore"):  # RegressionRows names a term that is not finite
-            return library.evaluate(values), self.smoother.derivative(run.t, run.states)
+            for start in range(0, len(values), MOST_ROWS):  # evaluation holds several copies
+                rows = slice(start, start + MOST_ROWS)
+                theta[rows] = library.evaluate(values[rows])
+        target[:] = self.smoother.derivative(run.t, run.states)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.equations import equation_html, equation_text
-from ep2sindy.model.scores import r2
+from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, solve_masks
 from ep2sindy.regression.rows import RegressionRows
@@ -241,8 +241,7 @@ def _candidates(problem: RegressionRows, supports: Supports) -> list[Candidate]:
     equation = problem.equations.index(supports.equation)
     coef = _fit(problem, equation, supports.masks)
     coef_SI = problem.coef_SI(coef, equation)
-    r2_train = _r2(problem.train_theta, problem.train_target(equation), coef)
-    r2_test = _r2(problem.test_theta, problem.test_target(equation), coef)
+    r2_train, r2_test = (_r2(problem, equation, coef, test=test) for test in (False, True))
     return [
         Candidate(
             equation=supports.equation,
@@ -308,11 +307,12 @@ def _fit(
     """
     gram = problem.train_gram
     xx = gram.xx[0]
-    theta, target = problem.train_theta, problem.train_target(equation)
     coef = fit_masks(xx, gram.xy[0, equation], masks)
     for _ in range(2):
-        residual = target - coef @ theta.T
-        step = solve_masks(xx, residual @ theta, masks)
+        left = np.zeros_like(coef)
+        for theta, residual in _residuals(problem, equation, coef, test=False):
+            left += residual @ theta
+        step = solve_masks(xx, left, masks)
         coef = coef + step
         if not (np.abs(step) > REFINED * np.abs(coef).max(axis=1, keepdims=True)).any():
             break  # the next step would be as much smaller again
@@ -320,11 +320,31 @@ def _fit(
 
 
 def _r2(
-    theta: Float[np.ndarray, "rows terms"],
-    target: Float[np.ndarray, " rows"],
+    problem: RegressionRows,
+    equation: int,
     coef: Float[np.ndarray, "supports terms"],
+    *,
+    test: bool,
 ) -> Float[np.ndarray, " supports"]:
-    """R2 of every support on the given rows; NaN if there are none."""
+    """R2 of every support on training or held-out rows; NaN if there are none."""
+    target = problem.test_target(equation) if test else problem.train_target(equation)
     if not len(target):
         return np.full(len(coef), np.nan)
-    return r2(truth=target, prediction=coef @ theta.T)
+    squares = np.zeros(len(coef))
+    for _, residual in _residuals(problem, equation, coef, test=test):
+        squares += np.square(residual).sum(axis=1)
+    return r2_of(squares, truth=target)
+
+
+def _residuals(
+    problem: RegressionRows,
+    equation: int,
+    coef: Float[np.ndarray, "supports terms"],
+    *,
+    test: bool,
+) -> Iterator[tuple[Float[np.ndarray, "_ terms"], Float[np.ndarray, "supports _"]]]:
+    """Scaled terms, and the residuals of every support, on one block of rows after another."""
+    n_terms = len(problem.library)
+    for rows in problem.blocks(test=test):
+        theta, target = rows[:, :n_terms], rows[:, n_terms + equation]
+        yield theta, target - coef @ theta.T

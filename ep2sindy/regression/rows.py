@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -18,6 +18,9 @@ from ep2sindy.regression.window_kernels import band_width
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.trust.memory import check_memory
+
+# Rows of a regression, training and held-out, beyond which scaled copies are made block by block.
+MOST_ROWS = 262_144
 
 ROW_BLOCK = 512  # rows whose pair products are held at once, few enough to fit in the cache
 
@@ -158,6 +161,22 @@ class RegressionRows:
         return self._scaled(self.test)
 
     @property
+    def n_train(self) -> int:
+        return int((~self.test).sum())
+
+    def blocks(self, *, test: bool) -> Iterator[Float[np.ndarray, "_ columns"]]:
+        """Scaled rows, training or held out, in order: all at once, or those of a long record in
+        blocks, of which none is kept.
+        """
+        if len(self.test) <= MOST_ROWS:
+            yield self.test_rows if test else self.train_rows
+            return
+        for start in range(0, len(self.test), MOST_ROWS):
+            here = np.zeros_like(self.test)
+            here[start : start + MOST_ROWS] = self.test[start : start + MOST_ROWS] == test
+            yield self._scaled(here)
+
+    @property
     def train_theta(self) -> Float[np.ndarray, "train terms"]:
         return self.train_rows[:, : len(self.library)]
 
@@ -166,10 +185,10 @@ class RegressionRows:
         return self.test_rows[:, : len(self.library)]
 
     def train_target(self, equation: int) -> Float[np.ndarray, " train"]:
-        return self.train_rows[:, len(self.library) + equation]
+        return self._scaled_target(equation, ~self.test)
 
     def test_target(self, equation: int) -> Float[np.ndarray, " test"]:
-        return self.test_rows[:, len(self.library) + equation]
+        return self._scaled_target(equation, self.test)
 
     def coef_scale(self, equation: int) -> Float[np.ndarray, " terms"]:
         """Factors that convert coefficients of scaled columns to SI."""
@@ -183,17 +202,17 @@ class RegressionRows:
 
     @cached_property
     def train_gram(self) -> Grams:
-        return self._grams((self.train_rows.T @ self.train_rows)[None])
+        return self._gram(test=False)
 
     @cached_property
     def test_gram(self) -> Grams:
-        return self._grams((self.test_rows.T @ self.test_rows)[None])
+        return self._gram(test=True)
 
     def check_grams(self, n_draws: int) -> None:
         """Raise ValueError if the Gram matrices of `n_draws` draws exceed the memory."""
-        n_columns = self.train_rows.shape[1]
+        n_columns = len(self.library) + len(self.equations)
         each = 8.0 * 5.0 * n_columns**2  # the whole matrix and its scaled copies
-        products_of_rows = 3.0 * 4.0 * n_columns**2 * min(ROW_BLOCK, len(self.train_rows))
+        products_of_rows = 3.0 * 4.0 * n_columns**2 * min(ROW_BLOCK, self.n_train)
         check_memory(
             each * n_draws + products_of_rows,
             f"Gram matrices of {len(self.library)} terms in {n_draws} bootstraps",
@@ -208,18 +227,27 @@ class RegressionRows:
         product. Rows are processed in blocks to keep these products small.
         """
         self.check_grams(len(weights))
-        rows = self.train_rows
-        n_columns = rows.shape[1]
+        n_columns, begin = len(self.library) + len(self.equations), 0
         first, second = np.triu_indices(n_columns)
         sums = np.zeros((len(weights), len(first)))
-        for start in range(0, len(rows), ROW_BLOCK):
-            columns = np.ascontiguousarray(rows[start : start + ROW_BLOCK].T)
-            products = columns[first] * columns[second]
-            sums += weights[:, start : start + ROW_BLOCK] @ products.T
-        whole = np.empty((len(weights), rows.shape[1], rows.shape[1]))
+        for rows in self.blocks(test=False):
+            for start in range(0, len(rows), ROW_BLOCK):
+                columns = np.ascontiguousarray(rows[start : start + ROW_BLOCK].T)
+                products = columns[first] * columns[second]
+                here = slice(begin + start, begin + start + columns.shape[1])
+                sums += weights[:, here] @ products.T
+            begin += len(rows)
+        whole = np.empty((len(weights), n_columns, n_columns))
         whole[:, first, second] = sums
         whole[:, second, first] = sums
         return self._grams(whole)
+
+    def _gram(self, *, test: bool) -> Grams:
+        parts = [rows.T @ rows for rows in self.blocks(test=test)]
+        return self._grams(sum(parts[1:], parts[0])[None])
+
+    def _scaled_target(self, equation: int, rows: np.ndarray) -> Float[np.ndarray, " _"]:
+        return self.target[rows, equation] / self.target_scale[equation]
 
     def _scaled(self, rows: np.ndarray) -> np.ndarray:
         index, n = np.flatnonzero(rows), len(self.library)

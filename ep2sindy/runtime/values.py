@@ -10,10 +10,23 @@ import numpy as np
 
 
 def read_only(values: np.ndarray) -> np.ndarray:
-    """Copy to float64 and lock, so that the data of an object cannot change from outside."""
+    """Copy to float64 and lock, so that the data of an object cannot change from outside.
+
+    An array that is locked already, and no view of another, is taken as it is; see `locked`.
+    """
+    if isinstance(values, np.ndarray) and values.dtype == np.float64:
+        flags = values.flags
+        if not flags.writeable and flags.owndata and flags.c_contiguous:
+            return values
     copy = np.array(values, dtype=np.float64, order="C")
     copy.flags.writeable = False
     return copy
+
+
+def locked(values: np.ndarray) -> np.ndarray:
+    """Lock an array that its maker hands over, so that no copy of it is made."""
+    values.flags.writeable = False
+    return values
 
 
 COUNTS = ("zero", "one", "two")
