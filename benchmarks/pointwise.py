@@ -6,6 +6,7 @@ bootstrap, `lstsq` for every support found), and PySINDy's `EnsembleOptimizer` (
 thresholds; both are given rows that are ready, and only a few points of the same grid.
 
     python -m benchmarks.pointwise [--folder where 1 GB fits]
+    python -m benchmarks.pointwise --cluster   # 100,000 points: a dask cluster of two workers
 """
 
 import argparse
@@ -36,7 +37,7 @@ from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.runtime.parallel import Serial
+from ep2sindy.runtime.parallel import ONE_BY_ONE, Dask, Workers
 from ep2sindy.selection.criteria import Knee
 
 N_Z, N_R, N_SAMPLES, DT_S = 41, 49, 12001, 1.5e-6
@@ -56,10 +57,16 @@ SEARCH = PointSearch(
 )
 
 
-def write_grid(path: Path, rng: np.random.Generator) -> None:
+def write_grid(
+    path: Path,
+    rng: np.random.Generator,
+    n_z: int = N_Z,
+    n_r: int = N_R,
+    n_samples: int = N_SAMPLES,
+) -> None:
     """Oscillations of 14 kHz and its harmonic with 2 % noise, different at every point."""
-    t = np.arange(N_SAMPLES) * DT_S
-    axes = {"time": t, "z": np.linspace(0.0, 0.05, N_Z), "r": np.linspace(0.028, 0.057, N_R)}
+    t = np.arange(n_samples) * DT_S
+    axes = {"time": t, "z": np.linspace(0.0, 0.05, n_z), "r": np.linspace(0.028, 0.057, n_r)}
     with netCDF4.Dataset(path, "w") as file:
         for axis, points in axes.items():
             file.createDimension(axis, len(points))
@@ -69,8 +76,8 @@ def write_grid(path: Path, rng: np.random.Generator) -> None:
         for name, unit in UNITS.items():
             variable = file.createVariable(name, "f8", tuple(axes), contiguous=True)
             variable.units = unit
-            phase, strength = rng.uniform(0.0, 2 * np.pi, (2, N_Z, N_R)), rng.uniform(0.2, 0.6, 2)
-            for start in range(0, N_SAMPLES, 1000):
+            phase, strength = rng.uniform(0.0, 2 * np.pi, (2, n_z, n_r)), rng.uniform(0.2, 0.6, 2)
+            for start in range(0, n_samples, 1000):
                 turn = 2 * np.pi * 14e3 * t[start : start + 1000, None, None]
                 wave = sum(
                     a * np.sin(k * turn + p)
@@ -80,8 +87,8 @@ def write_grid(path: Path, rng: np.random.Generator) -> None:
                 variable[start : start + 1000] = LEVELS[name] * (1.0 + wave + noise)
 
 
-def study(field: xr.Dataset) -> xr.Dataset:
-    return pointwise(field, SEARCH, workers=Serial(), block_points=BLOCK_POINTS)
+def study(field: xr.Dataset, workers: Workers = ONE_BY_ONE) -> xr.Dataset:
+    return pointwise(field, SEARCH, workers=workers, block_points=BLOCK_POINTS)
 
 
 def read_all(field: xr.Dataset) -> None:
@@ -168,14 +175,34 @@ def compare(path: Path) -> None:
         print(f"  {name:<25} {1e3 * each:8.0f} ms per point, {each / ours:.0f} times")
 
 
+def cluster(path: Path) -> None:
+    """Wall time of a large grid: serial, and on a local dask cluster of two workers."""
+    from distributed import LocalCluster
+
+    field = read_field(path)
+    n_points, n_samples = field.sizes["z"] * field.sizes["r"], field.sizes["time"]
+    print(f"{n_points} points x {n_samples} samples, {path.stat().st_size / 1e9:.2f} GB on disk")
+    begin = time.perf_counter()
+    alone = study(field)
+    print(f"  serial                    {time.perf_counter() - begin:8.1f} s")
+    begin = time.perf_counter()
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as two:
+        start_s = time.perf_counter() - begin
+        shared = study(field, Dask(two.scheduler_address))
+    print(f"  two workers               {time.perf_counter() - begin:8.1f} s", end=" ")
+    print(f"(of it {start_s:.1f} s for their start); the same: {alone.identical(shared)}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="the pointwise study at full size, on one core")
     parser.add_argument("--folder", type=Path, default=None, help="where 1 GB fits")
-    folder = parser.parse_args().folder
-    with tempfile.TemporaryDirectory(dir=folder) as made, threadpool_limits(limits=1):
+    parser.add_argument("--cluster", action="store_true", help="100,000 points on dask")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=given.folder) as made, threadpool_limits(limits=1):
         path = Path(made) / "grid.nc"
-        write_grid(path, np.random.default_rng(0))
-        compare(path)
+        size = (316, 317, 501) if given.cluster else (N_Z, N_R, N_SAMPLES)
+        write_grid(path, np.random.default_rng(0), *size)
+        cluster(path) if given.cluster else compare(path)
 
 
 if __name__ == "__main__":

@@ -10,9 +10,13 @@ Then the calls that a user makes: `ep.discover` by the thesis's recipe, by one t
 by default, each with its test whether the model leaves more than noise; and of 100,000 samples.
 
     python -m benchmarks.search
+    python -m benchmarks.search long   # one regression on 10,000,000 samples: time and memory
 """
 
+import resource
+import sys
 import warnings
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -132,6 +136,29 @@ def calls() -> None:
         print(f"discover, {f'thesis, {long.n_samples} samples':<34}{cpu_s(call, n_runs=3):8.2f} s")
 
 
+def long_record(n_samples: int = 10_000_000) -> None:
+    """CPU time and peak memory of one regression with ten terms, and of the record alone."""
+    walks = np.cumsum(np.random.default_rng(0).normal(scale=0.01, size=(n_samples, 3)), axis=0)
+    np.sin(walks + np.arange(3), out=walks)
+    run = ep.Trajectory(0.01 * np.arange(n_samples), walks, ["x", "y", "z"])
+    del walks
+    before_GiB = peak_GiB()
+    method = replace(METHODS["thesis"], search=ep.BestSubset(), bootstraps=Bootstraps(n=0))
+    call = partial(
+        ep.discover, run, ep.polynomial(run.state_names, degree=2), method=method, seed=0
+    )
+    with threadpool_limits(limits=1), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        total_s = cpu_s(call, n_runs=1)
+    print(f"{n_samples} samples: {total_s:.0f} CPU-s, {peak_GiB():.2f} GiB at most", end=" ")
+    print(f"(before the call {before_GiB:.2f})")
+
+
+def peak_GiB() -> float:
+    """Largest memory of this process so far; kilobytes on Linux, bytes on macOS."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
 def continued(system: System, n_samples: int) -> ep.Trajectory:
     """A record of many samples at the step of the system's own, with 5 % noise."""
     start = system.trajectory()
@@ -147,4 +174,4 @@ def continued(system: System, n_samples: int) -> ep.Trajectory:
 
 
 if __name__ == "__main__":
-    main()
+    long_record() if sys.argv[1:] == ["long"] else main()
