@@ -23,7 +23,7 @@ from ep2sindy.thruster.plane.simulate import (
     initial_state,
     state_of,
 )
-from ep2sindy.thruster.plane.state_kernels import PlaneModel, PlaneState
+from ep2sindy.thruster.plane.state_kernels import PlaneModel, PlaneState, new_work
 
 SAMPLE_S = 1.5e-6
 WARM_UP_S, DURATION_S = 3e-3, 10e-3  # half milliseconds differ by 7 % in amplitude
@@ -62,14 +62,14 @@ def cycle(n_z: int, n_r: int, *, cold: bool = False, warm_up_s: float = WARM_UP_
     grid = MaskedGrid(THRUSTER_2D, n_z, n_r)
     model = build_model(THRUSTER_2D, OPERATING_POINT_2D, grid)
     state = (cold_state if cold else initial_state)(grid, model)
-    one = Rows.room(1, grid)
+    one, work = Rows.room(1, grid), new_work(n_z, n_r)
     sample = (*one.planes, one.profiles, one.series)
-    advance(state, model, 1e-9, True, *sample)  # compiled
+    advance(state, model, work, 1e-9, True, *sample)  # compiled
     n_warm_up, n_rows = round(warm_up_s / SAMPLE_S), round(DURATION_S / SAMPLE_S)
     series = np.empty((n_warm_up + n_rows, one.series.shape[1]))
     n_steps, began = 0, time.process_time()
     for k in range(len(series)):
-        done, steps = advance(state, model, SAMPLE_S, True, *sample)
+        done, steps = advance(state, model, work, SAMPLE_S, True, *sample)
         series[k] = one.series[0]
         n_steps += steps
         if not done:

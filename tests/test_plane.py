@@ -2,6 +2,7 @@
 
 import json
 
+import numba
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,6 +14,7 @@ from ep2sindy.data.fields import check_field
 from ep2sindy.studies import pointwise
 from ep2sindy.studies.source import open_prepared
 from ep2sindy.thruster.axial.settings import to_json
+from ep2sindy.thruster.axial.state_kernels import ENTRY
 from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.thruster.plane import electron_kernels as electrons
 from ep2sindy.thruster.plane import heavy_kernels as heavy
@@ -28,6 +30,7 @@ from ep2sindy.thruster.plane.simulate import (
     initial_state,
     simulate_2d,
 )
+from ep2sindy.thruster.plane.state_kernels import new_work
 from ep2sindy.thruster.transport import AnomalousTransport
 from tests import programs
 
@@ -42,10 +45,10 @@ def set_up(*, plane=False, **changes):
     model = build_model(THRUSTER_2D, OPERATING_POINT_2D, grid)
     state = initial_state(grid, model)
     model = model._replace(**changes)
-    work, columns = kernels.scratch(N_Z, N_R)
+    work = new_work(N_Z, N_R)
     heavy.velocities(state.gas, model)
-    assert electrons.electron_step(state, model, 0.0, columns)
-    return grid, model, state, work, columns
+    assert electrons.electron_step(state, model, 0.0, work.columns)
+    return grid, model, state, work
 
 
 def rows_of(n_rows, grid):
@@ -82,19 +85,19 @@ def test_a_plane_grid_has_the_same_cross_section():
 
 
 def test_what_enters_leaves_or_stays_in_every_step():
-    _, model, state, work, columns = set_up()
+    _, model, state, work = set_up()
     inflow = model.neutral_inflow * THRUSTER_2D.area * DT_S
     for _ in range(20):
         before, left = kernels.count_heavy(state, model), state.left[0]
         heavy.heavy_step(state, model, DT_S, work)
-        assert electrons.electron_step(state, model, DT_S, columns)
+        assert electrons.electron_step(state, model, DT_S, work.columns)
         gained = kernels.count_heavy(state, model) - before
         # rounding of the sum over all atoms, of which a step's inflow is a thousandth
         assert gained + state.left[0] - left == pytest.approx(inflow, rel=1e-9)
 
 
 def test_ions_that_reach_a_wall_return_there_as_neutrals():
-    grid, model, state, work, _ = set_up(neutral_speed=0.0, neutral_diffusion=0.0)
+    grid, model, state, work = set_up(neutral_speed=0.0, neutral_diffusion=0.0)
     state.ionization[:] = 0.0
     state.gas.flux_z[:] = np.maximum(state.gas.flux_z, 0.0)  # none to the anode
     heavy.velocities(state.gas, model)
@@ -107,20 +110,24 @@ def test_ions_that_reach_a_wall_return_there_as_neutrals():
 
 
 def test_ions_at_rest_reach_a_wall_by_the_rarefaction_into_vacuum():
-    grid, model, state, work, _ = set_up()
+    grid, model, state, work = set_up()
     state.gas.flux_r[:] = 0.0
     heavy.velocities(state.gas, model)
-    state.wall[:] = 0.0
-    heavy.wall_fluxes(state.gas, model, state.T_e_eV, work.radial, state.wall)
     c = np.sqrt(model.electron_sound_squared * state.T_e_eV + model.ion_sound_squared)
+
+    @numba.njit(**ENTRY)
+    def filled(i, gas, model, c, fluxes):
+        heavy.wall_fluxes(heavy.column(gas, i), model, i, c, fluxes)
+
     face = grid.n_side
-    expected = -grid.perimeter[face] * state.gas.n[:, face] * np.exp(-1.0) * c
-    channel = slice(0, grid.exit_column)
-    np.testing.assert_allclose(work.radial.n[channel, face], expected[channel], rtol=1e-14)
+    for i in range(grid.exit_column):
+        filled(i, state.gas, model, c[i], work.radial)
+        expected = -grid.perimeter[face] * state.gas.n[i, face] * np.exp(-1.0) * c[i]
+        assert work.radial.n[face] == pytest.approx(expected, rel=1e-14)
 
 
 def test_a_uniform_stream_stays_uniform_away_from_the_walls():
-    grid, model, state, work, _ = set_up()
+    grid, model, state, work = set_up()
     state.ionization[:], state.E[:], state.T_e_eV[:] = 0.0, 0.0, 10.0
     state.gas.n[:], state.gas.flux_z[:], state.gas.flux_r[:] = 3e17, 3e17 * 9e3, 0.0
     heavy.velocities(state.gas, model)
@@ -132,9 +139,9 @@ def test_a_uniform_stream_stays_uniform_away_from_the_walls():
 
 
 def test_a_plane_discharge_is_symmetric_about_mid_radius():
-    grid, model, state, _, _ = set_up(plane=True)
+    grid, model, state, work = set_up(plane=True)
     rows = rows_of(20, grid)
-    assert kernels.advance(state, model, 1e-7, False, *rows)[0] == 20
+    assert kernels.advance(state, model, work, 1e-7, False, *rows)[0] == 20
     inside = grid.plasma
     for values, sign in ((state.gas.n, 1), (state.gas.u_z, 1), (state.gas.u_r, -1)):
         values = np.where(inside, values, 0.0)
@@ -144,20 +151,20 @@ def test_a_plane_discharge_is_symmetric_about_mid_radius():
 
 
 def test_a_round_discharge_is_not():
-    grid, model, state, _, _ = set_up()
-    kernels.advance(state, model, 1e-7, False, *rows_of(20, grid))
+    grid, model, state, work = set_up()
+    kernels.advance(state, model, work, 1e-7, False, *rows_of(20, grid))
     assert np.abs(state.gas.n - state.gas.n[:, ::-1]).max() > 1e-3 * state.gas.n.max()
 
 
 def test_averages_are_means_of_the_states_in_between():
-    grid, model, state, work, _ = set_up()
+    grid, model, state, work = set_up()
     n, step_s = 10, 2e-9
     # 0.95 of a step fits into step_s: the same ten steps whichever way they are sampled
-    model = model._replace(cfl=step_s / 0.95 * kernels.fastest_rate(state, model, work.born))
+    model = model._replace(cfl=step_s / 0.95 * kernels.fastest_rate(state, model))
     single, mean = rows_of(n, grid), rows_of(1, grid)
-    assert kernels.advance(state, model, step_s, False, *single) == (n, n)
-    _, _, again, _, _ = set_up()
-    assert kernels.advance(again, model, n * step_s, True, *mean) == (1, n)
+    assert kernels.advance(state, model, work, step_s, False, *single) == (n, n)
+    _, _, again, _ = set_up()
+    assert kernels.advance(again, model, work, n * step_s, True, *mean) == (1, n)
     for one, many in zip(mean[:5], single[:5], strict=True):
         scale = np.nanmax(np.abs(many))  # float32 rounds at 6e-8
         np.testing.assert_allclose(one[0], many.mean(axis=0, dtype=float), atol=3e-7 * scale)
@@ -166,18 +173,18 @@ def test_averages_are_means_of_the_states_in_between():
 
 
 def test_field_and_resistor_share_the_voltage():
-    _, model, state, _, columns = set_up()
-    electrons.ohm(state, model, columns)
+    _, model, state, work = set_up()
+    electrons.ohm(state, model, work.columns)
     drop = -model.dz * state.reference_field.sum() - model.resistance * state.current[0]
     assert drop == pytest.approx(-model.voltage, rel=1e-12)
 
 
 def test_the_mean_field_is_that_of_the_reference_density():
     """<n ln(n/n_ref)> = 0: summed over r, n E misses the pressure's part alone."""
-    grid, model, state, _, columns = set_up()
+    grid, model, state, work = set_up()
     weight = np.where(grid.plasma, state.gas.n * grid.area, 0.0)
-    electrons.sum_columns(state, model, columns)
-    excess = weight * (state.log_n - columns.log_ref[:, None])
+    electrons.sum_columns(state, model, work.columns)
+    excess = weight * (state.log_n - work.columns.log_ref[:, None])
     np.testing.assert_allclose(excess.sum(axis=1), 0.0, atol=1e-12 * np.abs(excess).sum())
 
 

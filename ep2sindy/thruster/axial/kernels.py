@@ -16,6 +16,7 @@ from ep2sindy.thruster.axial.state_kernels import (
     LOOP,
     N_I,
     N_N,
+    NO_NAN,
     PER_CHARGE,
     R_ION,
     SHORTEST_STEP,
@@ -24,8 +25,6 @@ from ep2sindy.thruster.axial.state_kernels import (
     U_IZ,
     inside,
 )
-
-NO_NAN = {**FAST, "fastmath": {*FAST["fastmath"], "nnan"}}  # needed to vectorise a maximum
 
 
 @compiled(**NO_NAN)

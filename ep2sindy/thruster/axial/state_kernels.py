@@ -32,6 +32,7 @@ FAST: dict[str, Any] = {
 # For functions whose array arguments are separate ones: the compiler need not look whether a value
 # written is read by the next. Never pass one array twice, nor a row beside the matrix that has it.
 LOOP: dict[str, Any] = {**FAST, **SEPARATE_ARRAYS}
+NO_NAN: dict[str, Any] = {**LOOP, "fastmath": {*FAST["fastmath"], "nnan"}}  # for a maximum
 
 SHORTEST_STEP = 1e-5  # of a sample: a run that needs shorter steps has diverged
 

@@ -3,12 +3,12 @@
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
+from ep2sindy.thruster.axial.state_kernels import ENTRY
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 from ep2sindy.thruster.plane.state_kernels import (
     COULOMB,
     COULOMB_LOG,
     EVENTS,
-    FAST,
     INELASTIC,
     IONIZATION,
     MOMENTUM,
@@ -36,7 +36,7 @@ def logarithm(x):
     return e * 0.6931471805599453 + 2.0 * f * series
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def sum_columns(state, model, columns):
     """Sums over r, and the logarithm of the density."""
     gas = state.gas
@@ -68,7 +68,7 @@ def lookup(table, row, share, column):
     return table[row, column] + share * (table[row + 1, column] - table[row, column])
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def collisions(state, model, columns):
     """Collision frequency, conductance and losses; returns False if a table ends."""
     table, per_eV, top = model.table, 1.0 / model.table_step_eV, model.table.shape[0] - 1.0
@@ -109,7 +109,7 @@ def ghost(T, boundary):
     return max(2.0 * boundary - T, 0.3 * boundary)
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def ohm(state, model, columns):
     """Discharge current, field along z, drift energy and heating; returns I_d/e.
 
@@ -140,7 +140,7 @@ def ohm(state, model, columns):
     return total
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def spread_field(state, model, columns):
     """E(z, r) = -dphi*/dz - d/dz [T ln(n/n_ref)].
 
@@ -172,7 +172,7 @@ def exponential_weights(conduction, convection):
     return conduction * (behind + p), conduction * behind
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def heat(state, model, dt, columns):
     """New electron temperature: implicit convection, conduction and losses, explicit heating."""
     T, n, last, edge = state.T_e_eV, columns.n, columns.n.size - 1, model.boundary_T_e_eV
@@ -206,7 +206,7 @@ def heat(state, model, dt, columns):
         state.energy[i] = 1.5 * n[i] * T[i]
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def electron_step(state, model, dt, columns):
     """Sums, collisions, current, field and new temperature; returns False if the run breaks."""
     sum_columns(state, model, columns)

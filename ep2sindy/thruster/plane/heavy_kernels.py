@@ -1,48 +1,76 @@
 """Ions and neutrals: one SSP-RK2 step in a frozen field, column by column.
 
-Inner loops run along r, write one array each and make no calls, so that they vectorise.
+Each stage goes over the columns once. In every column four loops along r do the work: fluxes along
+z, slopes along r, fluxes along r, and the update. A row holds some tens of cells, so that the start
+of a loop counts: loops do as much as the compiler can vectorise, and divide once where they can.
+They pass on rows of one column, which the nearest cache holds. Functions that hold one are `LOOP`.
 """
 
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
+from ep2sindy.thruster.axial.state_kernels import ENTRY, FAST, LOOP, ONE
 from ep2sindy.thruster.constants import E_CHARGE
-from ep2sindy.thruster.plane.state_kernels import FAST, ONE
+from ep2sindy.thruster.plane.state_kernels import Gas
 
 SIDE_SPEED = 0.5  # of the neutrals' speed: diffusive loss into vacuum (Marshak)
 
 
 @compiled(inline="always")
 def half_slope(left, centre, right):
-    """Half the van Leer slope: a*b/(a+b) of the two differences, 0 at an extremum."""
-    a = centre - left
-    b = right - centre
-    return a * b / (a + b) if a * b > 0.0 else 0.0
+    """Half the van Leer slope, a*b/(a + b) of the two differences, as numerator and denominator.
+
+    At an extremum it is 0 over 1.
+    """
+    a, b = centre - left, right - centre
+    product = a * b
+    return (product, a + b) if product > 0.0 else (0.0, 1.0)
 
 
 @compiled(inline="always")
-def mass_flux(n_l, u_l, n_r, u_r, c):
-    """Rusanov flux of density between two states; c: speed of sound."""
-    s = max(abs(u_l), abs(u_r)) + c
-    return 0.5 * (n_l * u_l + n_r * u_r - s * (n_r - n_l))
+def quotients(a, p, b, q, c, r, d, s):
+    """a/p, b/q, c/r and d/s by one division, which takes as long as sixteen products.
+
+    The product of all denominators must not overflow, nor vanish.
+    """
+    pq, rs = p * q, r * s
+    inverse = 1.0 / (pq * rs)
+    per_pq, per_rs = inverse * rs, inverse * pq
+    return a * q * per_pq, b * p * per_pq, c * s * per_rs, d * r * per_rs
 
 
 @compiled(inline="always")
-def momentum_flux(n_l, u_l, n_r, u_r, c):
-    """Rusanov flux of the momentum across the face, pressure included."""
-    s = max(abs(u_l), abs(u_r)) + c
+def rusanov(n_l, u_l, n_r, u_r, c):
+    """Rusanov fluxes of density and of the momentum across the face, pressure included.
+
+    c: speed of sound.
+    """
     g_l, g_r = n_l * u_l, n_r * u_r
-    return 0.5 * (g_l * u_l + g_r * u_r + c * c * (n_l + n_r) - s * (g_r - g_l))
+    s = max(abs(u_l), abs(u_r)) + c
+    mass = 0.5 * (g_l + g_r - s * (n_r - n_l))
+    return mass, 0.5 * (g_l * u_l + g_r * u_r + c * c * (n_l + n_r) - s * (g_r - g_l))
 
 
 @compiled(**FAST)
+def column(gas, i):
+    """Rows of one column; only for kernels that count no references to arrays, as this one."""
+    return Gas(gas.n[i], gas.flux_z[i], gas.flux_r[i], gas.neutrals[i], gas.u_z[i], gas.u_r[i])
+
+
+@compiled(**ENTRY)
 def velocities(gas, model):
-    """u = flux/n everywhere; masked cells beside the exit repeat the plume's u, for zero slopes."""
+    """u = flux/n everywhere."""
     for i in range(gas.n.shape[0]):
         for j in range(model.lower[i], model.upper[i]):
             per_n = 1.0 / gas.n[i, j]
             gas.u_z[i, j] = gas.flux_z[i, j] * per_n
             gas.u_r[i, j] = gas.flux_r[i, j] * per_n
+    repeat_exit(gas, model)
+
+
+@compiled(**FAST)
+def repeat_exit(gas, model):
+    """Masked cells beside the exit repeat the plume's, for zero slopes."""
     i = model.exit_column
     for j in range(model.lower[i], model.upper[i]):
         if j < model.lower[i - 1] or j >= model.upper[i - 1]:
@@ -52,244 +80,232 @@ def velocities(gas, model):
             gas.u_r[i - 1, j] = gas.u_r[i, j]
 
 
-@compiled(**FAST)
-def axial_slopes(q, slope, lower, upper):
-    """Half slopes along z; zero at the ends of the domain."""
-    last = q.shape[0] - 1
-    for i in range(last + 1):
-        before, after = max(i - 1, 0), min(i + 1, last)
-        for j in range(lower[i], upper[i]):
-            slope[i, j] = half_slope(q[before, j], q[i, j], q[after, j])
+@compiled(**LOOP)
+def axial_fluxes(here, behind, beyond, slopes, fluxes, start, stop, model):
+    """Fluxes between one column and the one behind it.
 
-
-@compiled(**FAST)
-def radial_slopes(q, slope, lower, upper):
-    """Half slopes along r; zero beside the walls."""
-    for i in range(q.shape[0]):
-        slope[i, lower[i]] = slope[i, upper[i] - ONE] = 0.0
-        for j in range(lower[i] + ONE, upper[i] - ONE):
-            slope[i, j] = half_slope(q[i, j - ONE], q[i, j], q[i, j + ONE])
-
-
-@compiled(**FAST)
-def axial_fluxes(gas, model, slopes, fluxes):
-    """Fluxes between columns i - 1 and i."""
-    n, u, v, nn = gas.n, gas.u_z, gas.u_r, gas.neutrals
-    s_n, s_u, s_v, s_nn = slopes.n, slopes.u_z, slopes.u_r, slopes.neutrals
-    f_n, f_z, f_r, f_nn = fluxes.n, fluxes.z, fluxes.r, fluxes.neutrals
+    slopes: those of this column; they become those of the one behind, for which the one beyond is
+    needed.
+    """
     c, speed = np.sqrt(model.ion_sound_squared), model.neutral_speed
-    for i in range(1, n.shape[0]):
-        h = i - 1
-        start = max(model.lower[h], model.lower[i])
-        stop = min(model.upper[h], model.upper[i])
-        for j in range(start, stop):
-            f_n[i, j] = mass_flux(
-                n[h, j] + s_n[h, j], u[h, j] + s_u[h, j],
-                n[i, j] - s_n[i, j], u[i, j] - s_u[i, j], c,
-            )  # fmt: skip
-        for j in range(start, stop):
-            f_z[i, j] = momentum_flux(
-                n[h, j] + s_n[h, j], u[h, j] + s_u[h, j],
-                n[i, j] - s_n[i, j], u[i, j] - s_u[i, j], c,
-            )  # fmt: skip
-        for j in range(start, stop):
-            before, after = v[h, j] + s_v[h, j], v[i, j] - s_v[i, j]
-            f_r[i, j] = f_n[i, j] * (before if f_n[i, j] > 0.0 else after)
-        for j in range(start, stop):
-            f_nn[i, j] = speed * (nn[h, j] + s_nn[h, j])
+    for j in range(start, stop):
+        a, p = half_slope(here.n[j], behind.n[j], beyond.n[j])
+        b, q = half_slope(here.u_z[j], behind.u_z[j], beyond.u_z[j])
+        d, r = half_slope(here.u_r[j], behind.u_r[j], beyond.u_r[j])
+        e, s = half_slope(here.neutrals[j], behind.neutrals[j], beyond.neutrals[j])
+        s_n, s_u, s_v, s_nn = quotients(a, p, b, q, d, r, e, s)
+        flux, fluxes.z[j] = rusanov(
+            here.n[j] + slopes.n[j], here.u_z[j] + slopes.u_z[j],
+            behind.n[j] - s_n, behind.u_z[j] - s_u, c,
+        )  # fmt: skip
+        fluxes.n[j] = flux
+        fluxes.r[j] = flux * (here.u_r[j] + slopes.u_r[j] if flux > 0.0 else behind.u_r[j] - s_v)
+        fluxes.neutrals[j] = speed * (here.neutrals[j] + slopes.neutrals[j])
+        slopes.n[j], slopes.u_z[j], slopes.u_r[j], slopes.neutrals[j] = s_n, s_u, s_v, s_nn
 
 
 @compiled(**FAST)
-def anode_fluxes(gas, model, fluxes):
+def anode_fluxes(here, model, fluxes):
     """Ions leave at the Bohm speed or faster and return as neutrals, also injected here."""
     c = np.sqrt(model.ion_sound_squared)
     bohm = np.sqrt(model.electron_sound_squared * model.boundary_T_e_eV)
     for j in range(model.lower[0], model.upper[0]):
-        n, u = gas.n[0, j], gas.u_z[0, j]
-        outside = min(u, -bohm)
-        flux = mass_flux(n, outside, n, u, c)
-        fluxes.n[0, j] = flux
-        fluxes.z[0, j] = momentum_flux(n, outside, n, u, c)
-        fluxes.r[0, j] = flux * gas.u_r[0, j]
-        fluxes.neutrals[0, j] = model.neutral_inflow - flux
+        n, u = here.n[j], here.u_z[j]
+        fluxes.n[j], fluxes.z[j] = rusanov(n, min(u, -bohm), n, u, c)
+        fluxes.r[j] = fluxes.n[j] * here.u_r[j]
+        fluxes.neutrals[j] = model.neutral_inflow - fluxes.n[j]
 
 
 @compiled(**FAST)
-def cathode_fluxes(gas, model, fluxes):
+def cathode_fluxes(here, model, fluxes):
     """Neutrals and ions leave freely, no ion enters; returns atoms and ions lost per second."""
-    total, end = 0.0, gas.n.shape[0]
-    for j in range(model.lower[end - 1], model.upper[end - 1]):
-        n, u = gas.n[end - 1, j], max(gas.u_z[end - 1, j], 0.0)
-        fluxes.n[end, j] = n * u
-        fluxes.z[end, j] = n * (u * u + model.ion_sound_squared)
-        fluxes.r[end, j] = n * u * gas.u_r[end - 1, j]
-        fluxes.neutrals[end, j] = model.neutral_speed * gas.neutrals[end - 1, j]
-        total += model.area[j] * (fluxes.n[end, j] + fluxes.neutrals[end, j])
+    total, last = 0.0, model.lower.size - 1
+    for j in range(model.lower[last], model.upper[last]):
+        n, u = here.n[j], max(here.u_z[j], 0.0)
+        fluxes.n[j] = n * u
+        fluxes.z[j] = n * (u * u + model.ion_sound_squared)
+        fluxes.r[j] = n * u * here.u_r[j]
+        fluxes.neutrals[j] = model.neutral_speed * here.neutrals[j]
+        total += model.area[j] * (fluxes.n[j] + fluxes.neutrals[j])
     return total
 
 
 @compiled(**FAST)
-def front_fluxes(gas, model, fluxes, wall):
-    """The thruster's front face beside the exit: ions that reach it return as neutrals."""
-    i = model.exit_column
+def front_fluxes(plume, model, fluxes):
+    """The thruster's front face beside the exit: ions that reach it return as neutrals.
+
+    plume: its first column. Returns ions lost per second.
+    """
+    i, lost = model.exit_column, 0.0
     for j in range(model.lower[i], model.upper[i]):
         if model.lower[i - 1] <= j < model.upper[i - 1]:
             continue
-        n, u = gas.n[i, j], min(gas.u_z[i, j], 0.0)
-        fluxes.n[i, j] = n * u
-        fluxes.z[i, j] = n * (u * u + model.ion_sound_squared)
-        fluxes.r[i, j] = n * u * gas.u_r[i, j]
-        fluxes.neutrals[i, j] = -n * u
-        wall[i] -= 0.5 * model.area[j] * n * u / model.dz
+        n, u = plume.n[j], min(plume.u_z[j], 0.0)
+        fluxes.n[j] = n * u
+        fluxes.z[j] = n * (u * u + model.ion_sound_squared)
+        fluxes.r[j] = n * u * plume.u_r[j]
+        fluxes.neutrals[j] = -n * u
+        lost -= model.area[j] * n * u
+    return lost
 
 
-@compiled(**FAST)
-def radial_fluxes(gas, model, T_e, slopes, fluxes):
+@compiled(**LOOP)
+def radial_slopes(here, slopes, start, stop):
+    """Half slopes along r of ions and their velocities; zero beside the walls."""
+    last = stop - ONE
+    slopes.n[start] = slopes.u_z[start] = slopes.u_r[start] = 0.0
+    slopes.n[last] = slopes.u_z[last] = slopes.u_r[last] = 0.0
+    for j in range(start + ONE, last):
+        k, m = j - ONE, j + ONE
+        a, p = half_slope(here.n[k], here.n[j], here.n[m])
+        b, q = half_slope(here.u_z[k], here.u_z[j], here.u_z[m])
+        c, r = half_slope(here.u_r[k], here.u_r[j], here.u_r[m])
+        slopes.n[j], slopes.u_z[j], slopes.u_r[j], _ = quotients(a, p, b, q, c, r, 0.0, 1.0)
+
+
+@compiled(**LOOP)
+def radial_fluxes(here, slopes, fluxes, start, stop, c, model):
     """Fluxes between rows j - 1 and j, times the perimeter."""
-    n, u, v, nn = gas.n, gas.u_r, gas.u_z, gas.neutrals
-    s_n, s_u, s_v = slopes.n, slopes.u_r, slopes.u_z
-    f_n, f_z, f_r, f_nn = fluxes.n, fluxes.z, fluxes.r, fluxes.neutrals
-    size, spread = model.perimeter, model.neutral_diffusion / model.dr
-    for i in range(n.shape[0]):
-        c = np.sqrt(model.electron_sound_squared * T_e[i] + model.ion_sound_squared)
-        start, stop = model.lower[i] + ONE, model.upper[i]
-        for j in range(start, stop):
-            k = j - ONE
-            f_n[i, j] = size[j] * mass_flux(
-                n[i, k] + s_n[i, k], u[i, k] + s_u[i, k],
-                n[i, j] - s_n[i, j], u[i, j] - s_u[i, j], c,
-            )  # fmt: skip
-        for j in range(start, stop):
-            k = j - ONE
-            f_r[i, j] = size[j] * momentum_flux(
-                n[i, k] + s_n[i, k], u[i, k] + s_u[i, k],
-                n[i, j] - s_n[i, j], u[i, j] - s_u[i, j], c,
-            )  # fmt: skip
-        for j in range(start, stop):
-            k = j - ONE
-            before, after = v[i, k] + s_v[i, k], v[i, j] - s_v[i, j]
-            f_z[i, j] = f_n[i, j] * (before if f_n[i, j] > 0.0 else after)
-        for j in range(start, stop):
-            k = j - ONE
-            f_nn[i, j] = size[j] * spread * (nn[i, k] - nn[i, j])
+    spread = model.neutral_diffusion / model.dr
+    for j in range(start + ONE, stop):
+        k, size = j - ONE, model.perimeter[j]
+        n, r = rusanov(
+            here.n[k] + slopes.n[k], here.u_r[k] + slopes.u_r[k],
+            here.n[j] - slopes.n[j], here.u_r[j] - slopes.u_r[j], c,
+        )  # fmt: skip
+        z = n * (here.u_z[k] + slopes.u_z[k] if n > 0.0 else here.u_z[j] - slopes.u_z[j])
+        fluxes.n[j], fluxes.z[j], fluxes.r[j] = size * n, size * z, size * r
+        fluxes.neutrals[j] = size * spread * (here.neutrals[k] - here.neutrals[j])
 
 
 @compiled(**FAST)
-def wall_fluxes(gas, model, T_e, fluxes, wall):
-    """Fluxes to the channel walls.
+def wall_fluxes(here, model, i, c, fluxes):
+    """Fluxes from a column of the channel to its walls; returns the ions lost per m and second.
 
     By the exact rarefaction into the wall, ions reach it at the speed of sound. They return as
     neutrals.
     """
-    for i in range(model.exit_column):
-        c = np.sqrt(model.electron_sound_squared * T_e[i] + model.ion_sound_squared)
-        for outward in (-1.0, 1.0):
-            face = model.upper[i] if outward > 0.0 else model.lower[i]
-            j = face - ONE if outward > 0.0 else face
-            n, u = gas.n[i, j], outward * gas.u_r[i, j]
-            if u < c:
-                n, u = n * np.exp(u / c - 1.0), c
-            flux = outward * model.perimeter[face] * n * u
-            fluxes.n[i, face] = flux
-            fluxes.r[i, face] = model.perimeter[face] * n * (u * u + c * c)
-            fluxes.z[i, face] = flux * gas.u_z[i, j]
-            fluxes.neutrals[i, face] = -flux
-            wall[i] += 0.5 * outward * flux
+    lost = 0.0
+    for outward in (-1.0, 1.0):
+        face = model.upper[i] if outward > 0.0 else model.lower[i]
+        j = face - ONE if outward > 0.0 else face
+        n, u = here.n[j], outward * here.u_r[j]
+        if u < c:
+            n, u = n * np.exp(u / c - 1.0), c
+        flux = outward * model.perimeter[face] * n * u
+        fluxes.n[face] = flux
+        fluxes.r[face] = model.perimeter[face] * n * (u * u + c * c)
+        fluxes.z[face] = flux * here.u_z[j]
+        fluxes.neutrals[face] = -flux
+        lost += outward * flux
+    return lost
 
 
 @compiled(**FAST)
-def side_fluxes(gas, model, T_e, fluxes, side):
-    """Fluxes through the sides of the plume: ions leave freely, neutrals diffuse into vacuum.
+def side_fluxes(here, model, i, c, fluxes):
+    """Fluxes from a column of the plume through its sides: ions leave freely, neutrals diffuse.
 
-    Returns the atoms lost per m and second, summed over the columns.
+    Returns the ions and the atoms lost per m and second.
     """
-    atoms = 0.0
-    for i in range(model.exit_column, gas.n.shape[0]):
-        c2 = model.electron_sound_squared * T_e[i] + model.ion_sound_squared
-        for outward in (-1.0, 1.0):
-            face = model.upper[i] if outward > 0.0 else model.lower[i]
-            j = face - ONE if outward > 0.0 else face
-            n, u = gas.n[i, j], max(outward * gas.u_r[i, j], 0.0)
-            flux = outward * model.perimeter[face] * n * u
-            diffused = model.perimeter[face] * SIDE_SPEED * model.neutral_speed * gas.neutrals[i, j]
-            fluxes.n[i, face] = flux
-            fluxes.r[i, face] = model.perimeter[face] * n * (u * u + c2)
-            fluxes.z[i, face] = flux * gas.u_z[i, j]
-            fluxes.neutrals[i, face] = outward * diffused
-            side[i] += 0.5 * outward * flux
-            atoms += diffused
-    return atoms
+    ions = atoms = 0.0
+    for outward in (-1.0, 1.0):
+        face = model.upper[i] if outward > 0.0 else model.lower[i]
+        j = face - ONE if outward > 0.0 else face
+        n, u = here.n[j], max(outward * here.u_r[j], 0.0)
+        flux = outward * model.perimeter[face] * n * u
+        diffused = model.perimeter[face] * SIDE_SPEED * model.neutral_speed * here.neutrals[j]
+        fluxes.n[face] = flux
+        fluxes.r[face] = model.perimeter[face] * n * (u * u + c * c)
+        fluxes.z[face] = flux * here.u_z[j]
+        fluxes.neutrals[face] = outward * diffused
+        ions += outward * flux
+        atoms += diffused
+    return ions, atoms
 
 
-@compiled(**FAST)
-def divergence(axial, radial, model, out):
-    """Net inflow per volume in both directions."""
-    per_dz, per_area = 1.0 / model.dz, model.per_area
-    for i in range(out.shape[0]):
-        for j in range(model.lower[i], model.upper[i]):
-            along = (axial[i, j] - axial[i + 1, j]) * per_dz
-            out[i, j] = along + (radial[i, j] - radial[i, j + ONE]) * per_area[j]
+@compiled(**LOOP)
+def update(here, new, E, before, behind, radial, start, stop, c2, rate, old, dt, model):
+    """new = old * new + (1 - old) * (here + dt * (net inflow + sources)), and its velocities.
 
-
-@compiled(**FAST)
-def update(gas, new, state, model, rates, born, old, dt):
-    """new = old * new + (1 - old) * (gas + dt * (rates + sources))."""
-    n, g_z, g_r, nn, E = gas.n, gas.flux_z, gas.flux_r, gas.neutrals, state.E
-    new_n, new_z, new_r, new_nn = new.n, new.flux_z, new.flux_r, new.neutrals
-    r_n, r_z, r_r, r_nn = rates.n, rates.z, rates.r, rates.neutrals
-    size, per_area, fresh = model.perimeter, model.per_area, 1.0 - old
+    before, behind: fluxes along z through the faces of this column.
+    """
+    per_dz, size, per_area, fresh = 1.0 / model.dz, model.perimeter, model.per_area, 1.0 - old
     charge, slow = E_CHARGE / model.ion_mass, model.neutral_speed
-    for i in range(n.shape[0]):
-        c2 = model.electron_sound_squared * state.T_e_eV[i] + model.ion_sound_squared
-        lower, upper, rate = model.lower[i], model.upper[i], state.ionization[i]
-        for j in range(lower, upper):
-            born[j] = rate * n[i, j] * nn[i, j]
-        for j in range(lower, upper):
-            new_n[i, j] = old * new_n[i, j] + fresh * (n[i, j] + dt * (r_n[i, j] + born[j]))
-        for j in range(lower, upper):
-            push = charge * n[i, j] * E[i, j] + born[j] * slow
-            new_z[i, j] = old * new_z[i, j] + fresh * (g_z[i, j] + dt * (r_z[i, j] + push))
-        for j in range(lower, upper):
-            push = c2 * n[i, j] * (size[j + ONE] - size[j]) * per_area[j]
-            new_r[i, j] = old * new_r[i, j] + fresh * (g_r[i, j] + dt * (r_r[i, j] + push))
-        for j in range(lower, upper):
-            new_nn[i, j] = old * new_nn[i, j] + fresh * (nn[i, j] + dt * (r_nn[i, j] - born[j]))
+    for j in range(start, stop):
+        m, n, per = j + ONE, here.n[j], per_area[j]
+        born = rate * n * here.neutrals[j]
+        push_z = charge * n * E[j] + born * slow
+        push_r = c2 * n * (size[m] - size[j]) + radial.r[j] - radial.r[m]
+        d_n = (before.n[j] - behind.n[j]) * per_dz + (radial.n[j] - radial.n[m]) * per + born
+        d_z = (before.z[j] - behind.z[j]) * per_dz + (radial.z[j] - radial.z[m]) * per + push_z
+        d_r = (before.r[j] - behind.r[j]) * per_dz + push_r * per
+        d_nn = (before.neutrals[j] - behind.neutrals[j]) * per_dz - born
+        d_nn += (radial.neutrals[j] - radial.neutrals[m]) * per
+        next_n = old * new.n[j] + fresh * (n + dt * d_n)
+        next_z = old * new.flux_z[j] + fresh * (here.flux_z[j] + dt * d_z)
+        next_r = old * new.flux_r[j] + fresh * (here.flux_r[j] + dt * d_r)
+        per_n = 1.0 / next_n
+        new.n[j], new.flux_z[j], new.flux_r[j] = next_n, next_z, next_r
+        new.u_z[j], new.u_r[j] = next_z * per_n, next_r * per_n
+        new.neutrals[j] = old * new.neutrals[j] + fresh * (here.neutrals[j] + dt * d_nn)
+
+
+@compiled(**FAST)
+def fluxes_behind(i, gas, state, model, slopes, fluxes):
+    """Fluxes from a column to the one behind it; returns atoms and ions that leave per second."""
+    here, last = column(gas, i), gas.n.shape[0] - 1
+    if i == last:
+        return cathode_fluxes(here, model, fluxes)
+    behind, beyond = column(gas, i + 1), column(gas, min(i + 2, last))  # read, perhaps the same
+    start, stop = model.lower[i + 1], model.upper[i + 1]
+    axial_fluxes(here, behind, beyond, slopes, fluxes, start, stop, model)
+    if i + 1 == model.exit_column:
+        state.wall[i + 1] += 0.5 * front_fluxes(behind, model, fluxes) / model.dz
+    return 0.0
+
+
+@compiled(**FAST)
+def outer_fluxes(i, here, state, model, c, fluxes):
+    """Fluxes to the walls or through the sides; returns atoms and ions that leave per second."""
+    if i < model.exit_column:
+        state.wall[i] += 0.5 * wall_fluxes(here, model, i, c, fluxes)
+        return 0.0
+    ions, atoms = side_fluxes(here, model, i, c, fluxes)
+    state.side[i] += 0.5 * ions
+    return model.dz * (ions + atoms)
 
 
 @compiled(**FAST)
 def heavy_stage(gas, new, state, model, work, old, dt):
     """One Euler step of `gas` over dt, mixed into `new` with weight 1 - old."""
-    lower, upper, slopes, T_e = model.lower, model.upper, work.slopes, state.T_e_eV
-    axial, radial, rates = work.axial, work.radial, work.rates
-    axial_slopes(gas.n, slopes.n, lower, upper)
-    axial_slopes(gas.u_z, slopes.u_z, lower, upper)
-    axial_slopes(gas.u_r, slopes.u_r, lower, upper)
-    axial_slopes(gas.neutrals, slopes.neutrals, lower, upper)
-    axial_fluxes(gas, model, slopes, axial)
-    anode_fluxes(gas, model, axial)
-    leaving = cathode_fluxes(gas, model, axial)
-    front_fluxes(gas, model, axial, state.wall)
-    radial_slopes(gas.n, slopes.n, lower, upper)
-    radial_slopes(gas.u_z, slopes.u_z, lower, upper)
-    radial_slopes(gas.u_r, slopes.u_r, lower, upper)
-    radial_fluxes(gas, model, T_e, slopes, radial)
-    wall_fluxes(gas, model, T_e, radial, state.wall)
-    atoms = side_fluxes(gas, model, T_e, radial, state.side)
-    state.left[0] += 0.5 * dt * (leaving + model.dz * atoms)
-    divergence(axial.n, radial.n, model, rates.n)
-    divergence(axial.z, radial.z, model, rates.z)
-    divergence(axial.r, radial.r, model, rates.r)
-    divergence(axial.neutrals, radial.neutrals, model, rates.neutrals)
-    update(gas, new, state, model, rates, work.born, old, dt)
+    before, behind, along, radial = work.before, work.behind, work.slopes_z, work.radial
+    for slope in along:  # zero at the ends of the domain
+        slope[:] = 0.0
+    anode_fluxes(column(gas, 0), model, before)
+    left = 0.0
+    for i in range(gas.n.shape[0]):
+        here, start, stop = column(gas, i), model.lower[i], model.upper[i]
+        c2 = model.electron_sound_squared * state.T_e_eV[i] + model.ion_sound_squared
+        c = np.sqrt(c2)
+        left += fluxes_behind(i, gas, state, model, along, behind)
+        radial_slopes(here, work.slopes_r, start, stop)
+        radial_fluxes(here, work.slopes_r, radial, start, stop, c, model)
+        left += outer_fluxes(i, here, state, model, c, radial)
+        update(
+            here, column(new, i), state.E[i], before, behind, radial, start, stop, c2,
+            state.ionization[i], old, dt, model,
+        )  # fmt: skip
+        before, behind = behind, before
+    repeat_exit(new, model)
+    state.left[0] += 0.5 * dt * left
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def heavy_step(state, model, dt, work):
     """One SSP-RK2 (Heun) step of ions and neutrals in a frozen field."""
     state.wall[:] = 0.0
     state.side[:] = 0.0
-    heavy_stage(state.gas, state.stage, state, model, work, 0.0, dt)
-    velocities(state.stage, model)
-    heavy_stage(state.stage, state.gas, state, model, work, 0.5, dt)
-    velocities(state.gas, model)
-    state.left[0] += dt * model.dz * state.side.sum()
+    gas, new, old = state.gas, state.stage, 0.0
+    for _ in range(2):  # one copy of the code for both stages
+        heavy_stage(gas, new, state, model, work, old, dt)
+        gas, new, old = new, gas, 0.5

@@ -3,51 +3,33 @@
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
+from ep2sindy.thruster.axial.state_kernels import ENTRY, LOOP, NO_NAN, ONE
 from ep2sindy.thruster.plane.electron_kernels import electron_step
-from ep2sindy.thruster.plane.heavy_kernels import heavy_step, velocities
-from ep2sindy.thruster.plane.state_kernels import FAST, ONE, Columns, Fluxes, Gas, Work
+from ep2sindy.thruster.plane.heavy_kernels import column, heavy_step, velocities
 
 
-@compiled
-def fluxes(n_z, n_r):
-    """Empty flux arrays of one direction."""
-    shape = (n_z, n_r)
-    return Fluxes(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape))
+@compiled(**NO_NAN)
+def fastest(u_z, u_r, start, stop, per_dz, per_dr):
+    """Largest |u_z|/dz + |u_r|/dr in a column."""
+    top = 0.0
+    for j in range(start, stop):
+        top = max(top, abs(u_z[j]) * per_dz + abs(u_r[j]) * per_dr)
+    return top
 
 
-@compiled
-def scratch(n_z, n_r):
-    """Working memory of the heavy step and the electron step."""
-    grid = (n_z, n_r)
-    slopes = Gas(
-        np.zeros(grid), np.zeros(grid), np.zeros(grid), np.zeros(grid), np.zeros(grid),
-        np.zeros(grid),
-    )  # fmt: skip
-    axial, radial = fluxes(n_z + 1, n_r), fluxes(n_z, n_r + 1)
-    work = Work(slopes, axial, radial, fluxes(n_z, n_r), np.zeros(n_r))
-    columns = Columns(
-        np.zeros(n_z), np.zeros(n_z), np.zeros(n_z), np.zeros(n_z), np.zeros(n_z), np.zeros(n_z),
-        np.zeros(n_z), np.zeros(n_z), np.zeros(n_z), np.zeros(n_z), np.zeros(n_z), np.zeros(n_z),
-        np.zeros(n_z),
-    )  # fmt: skip
-    return work, columns
-
-
-@compiled(**FAST)
-def fastest_rate(state, model, top):
+@compiled(**ENTRY)
+def fastest_rate(state, model):
     """Largest (|u_z| + c)/dz + (|u_r| + c)/dr of any cell, in 1/s; c: speed of sound."""
     gas, per_dz, per_dr = state.gas, 1.0 / model.dz, 1.0 / model.dr
-    top[:] = 0.0
+    top = 4.0 * model.neutral_diffusion * per_dr**2
     for i in range(gas.n.shape[0]):
         c = np.sqrt(model.electron_sound_squared * state.T_e_eV[i] + model.ion_sound_squared)
-        sound = c * (per_dz + per_dr)
-        for j in range(model.lower[i], model.upper[i]):
-            rate = abs(gas.u_z[i, j]) * per_dz + abs(gas.u_r[i, j]) * per_dr + sound
-            top[j] = max(top[j], rate)
-    return max(top.max(), 4.0 * model.neutral_diffusion * per_dr**2)
+        flow = fastest(gas.u_z[i], gas.u_r[i], model.lower[i], model.upper[i], per_dz, per_dr)
+        top = max(top, flow + c * (per_dz + per_dr))
+    return top
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def thrust(state, model):
     """Axial ion momentum that leaves through the cathode plane and the plume's sides, in N."""
     gas, last = state.gas, state.gas.n.shape[0] - 1
@@ -63,7 +45,7 @@ def thrust(state, model):
     return model.ion_mass * total
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def count_heavy(state, model):
     """Atoms and ions in the domain."""
     total = 0.0
@@ -73,22 +55,22 @@ def count_heavy(state, model):
     return model.dz * total
 
 
-@compiled(**FAST)
-def add_grid(values, total, model, share):
-    """Add share * values to total, in the cells with plasma."""
-    for i in range(values.shape[0]):
-        for j in range(model.lower[i], model.upper[i]):
-            total[i, j] += share * values[i, j]
+@compiled(**LOOP)
+def add_column(sum_n, sum_nn, sum_z, sum_r, here, start, stop, share):
+    for j in range(start, stop):
+        sum_n[j] += share * here.n[j]
+        sum_nn[j] += share * here.neutrals[j]
+        sum_z[j] += share * here.u_z[j]
+        sum_r[j] += share * here.u_r[j]
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def add(state, model, share, planes, profiles, numbers):
     """Add a share of the state to the sample: fields, profiles along z, current and thrust."""
-    add_grid(state.gas.n, planes[0], model, share)
-    add_grid(state.gas.neutrals, planes[1], model, share)
-    add_grid(state.gas.u_z, planes[2], model, share)
-    add_grid(state.gas.u_r, planes[3], model, share)
+    n, nn, u_z, u_r = planes[0], planes[1], planes[2], planes[3]
     for i in range(state.T_e_eV.size):
+        start, stop = model.lower[i], model.upper[i]
+        add_column(n[i], nn[i], u_z[i], u_r[i], column(state.gas, i), start, stop, share)
         profiles[0, i] += share * state.T_e_eV[i]
         profiles[1, i] += share * state.ionization[i]
         profiles[2, i] += share * state.reference_field[i]
@@ -96,7 +78,7 @@ def add(state, model, share, planes, profiles, numbers):
     numbers[1] += share * thrust(state, model)
 
 
-@compiled(**FAST)
+@compiled(**ENTRY)
 def store(sample, rows, row, model):
     """Write the plasma's cells of a sample into a row of the output."""
     for i in range(sample.shape[0]):
@@ -104,28 +86,26 @@ def store(sample, rows, row, model):
             rows[row, i, j] = sample[i, j]
 
 
-@compiled(**FAST)
-def advance(state, model, sample_s, averaged, n_i, n_n, u_iz, u_ir, profiles, series):
+@compiled(**ENTRY)
+def advance(state, model, work, sample_s, averaged, n_i, n_n, u_iz, u_ir, profiles, series):
     """Fill the rows of the outputs, one every `sample_s`; return (rows filled, steps).
 
     averaged: if True, rows are means over the steps of a sample, else the state at its end.
     n_i .. u_ir: (rows, n_z, n_r), written in the plasma only. profiles: (rows, 3, n_z) for T_e,
     ionization and field. series: (rows, 4) for current, thrust, mass out and mass held.
     """
-    n_z, n_r = state.gas.n.shape
-    work, columns = scratch(n_z, n_r)
-    planes, profile, numbers = np.zeros((4, n_z, n_r)), np.zeros((3, n_z)), np.zeros(2)
+    planes, profile, numbers = work.planes, work.profiles, work.numbers
     velocities(state.gas, model)
     steps = 0
-    if not electron_step(state, model, 0.0, columns):
+    if not electron_step(state, model, 0.0, work.columns):
         return 0, steps
     for row in range(series.shape[0]):
         planes[:], profile[:], numbers[:] = 0.0, 0.0, 0.0
         left = sample_s
         while left > 1e-9 * sample_s:
-            dt = left / np.ceil(left * fastest_rate(state, model, work.born) / model.cfl)
+            dt = left / np.ceil(left * fastest_rate(state, model) / model.cfl)
             heavy_step(state, model, dt, work)
-            if not electron_step(state, model, dt, columns):
+            if not electron_step(state, model, dt, work.columns):
                 return row, steps
             left -= dt
             steps += 1
@@ -137,7 +117,9 @@ def advance(state, model, sample_s, averaged, n_i, n_n, u_iz, u_ir, profiles, se
         store(planes[1], n_n, row, model)
         store(planes[2], u_iz, row, model)
         store(planes[3], u_ir, row, model)
-        profiles[row] = profile
+        for k in range(profile.shape[0]):
+            for i in range(profile.shape[1]):
+                profiles[row, k, i] = profile[k, i]
         series[row, 0], series[row, 1] = numbers
         series[row, 2] = model.ion_mass * state.left[0]
         series[row, 3] = model.ion_mass * count_heavy(state, model)

@@ -22,7 +22,7 @@ from ep2sindy.thruster.parameters import NeutralSpeed, OperatingPoint, Thruster
 from ep2sindy.thruster.plane import state_kernels as kernels
 from ep2sindy.thruster.plane.grid import MaskedGrid
 from ep2sindy.thruster.plane.kernels import advance
-from ep2sindy.thruster.plane.state_kernels import PlaneModel, PlaneState
+from ep2sindy.thruster.plane.state_kernels import PlaneModel, PlaneState, new_work
 from ep2sindy.thruster.propellants import XenonFits
 from ep2sindy.thruster.recording import (
     CHUNK_ROWS,
@@ -156,11 +156,12 @@ class Rows:
 
     def march(self, state: PlaneState, model: PlaneModel, sample_s: float, averaged: bool) -> March:
         """A function that records samples of a run into these rows."""
+        work = new_work(*state.E.shape)
 
         def march(rows: slice) -> int:
             planes = [plane[rows] for plane in self.planes]
             out = (*planes, self.profiles[rows], self.series[rows])
-            return advance(state, model, sample_s, averaged, *out)[0]
+            return advance(state, model, work, sample_s, averaged, *out)[0]
 
         return march
 

@@ -10,14 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# No "nnan" or "ninf": a diverged run is recognised by numbers that are not finite.
-FAST: dict[str, Any] = {
-    "error_model": "numpy",
-    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
-}
-
-ONE = np.uint64(1)
-
 # Columns of `Model.table`, one row per electron temperature; coefficients in SI, energies in eV.
 (
     IONIZATION,
@@ -89,25 +81,6 @@ class PlaneState(NamedTuple):
     left: np.ndarray  # (1,), atoms and ions that left since the start
 
 
-class Fluxes(NamedTuple):
-    """Fluxes of ion density, ion momentum along z and r, and neutrals; one more row than cells."""
-
-    n: np.ndarray
-    z: np.ndarray
-    r: np.ndarray
-    neutrals: np.ndarray
-
-
-class Work(NamedTuple):
-    """Scratch arrays of the heavy step."""
-
-    slopes: Gas
-    axial: Fluxes  # (n_z + 1, n_r)
-    radial: Fluxes  # (n_z, n_r + 1), times the perimeter
-    rates: Fluxes  # (n_z, n_r), net inflow per volume
-    born: np.ndarray  # (n_r,)
-
-
 class Columns(NamedTuple):
     """Sums over r of densities times row areas; (n_z,) each."""
 
@@ -124,3 +97,54 @@ class Columns(NamedTuple):
     electron_flux: np.ndarray  # 1/s
     upper: np.ndarray
     right: np.ndarray
+
+
+class Slopes(NamedTuple):
+    """Half slopes in the cells of one column, (n_r,) each."""
+
+    n: np.ndarray
+    u_z: np.ndarray
+    u_r: np.ndarray
+    neutrals: np.ndarray
+
+
+class Fluxes(NamedTuple):
+    """Of ion density, ion momentum along z and r, and neutrals, for one column."""
+
+    n: np.ndarray
+    z: np.ndarray
+    r: np.ndarray
+    neutrals: np.ndarray
+
+
+class Work(NamedTuple):
+    """Scratch arrays. The heavy step goes from column to column, and keeps rows of one alone."""
+
+    slopes_z: Slopes
+    slopes_r: Slopes
+    before: Fluxes  # (n_r,), through the faces before the column, and behind it
+    behind: Fluxes
+    radial: Fluxes  # (n_r + 1,), times the perimeter
+    columns: Columns
+    planes: np.ndarray  # (4, n_z, n_r), the sample: fields,
+    profiles: np.ndarray  # (3, n_z), profiles along z,
+    numbers: np.ndarray  # (2,), current and thrust
+
+
+def new_work(n_z: int, n_r: int) -> Work:
+    """Zeros for a grid of this shape."""
+
+    def zeros(kind: Any, size: int) -> Any:
+        return kind(*(np.zeros(size) for _ in kind._fields))
+
+    return Work(
+        slopes_z=zeros(Slopes, n_r),
+        slopes_r=zeros(Slopes, n_r),
+        before=zeros(Fluxes, n_r),
+        behind=zeros(Fluxes, n_r),
+        radial=zeros(Fluxes, n_r + 1),
+        columns=zeros(Columns, n_z),
+        planes=np.zeros((4, n_z, n_r)),
+        profiles=np.zeros((3, n_z)),
+        numbers=np.zeros(2),
+    )
