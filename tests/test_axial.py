@@ -94,10 +94,11 @@ def test_the_average_of_a_product_is_not_the_product_of_averages(run):
     assert data.units["<R_ion*n_i*n_n>"] == "m^-3 s^-1"
 
 
-@pytest.mark.parametrize("size", [12, 13])
-def test_the_solver_from_both_ends_solves(size):
+@pytest.mark.parametrize("size", [12, 13, 402])
+@pytest.mark.parametrize("scale", [1.0, 1e18])
+def test_the_solver_from_both_ends_solves(size, scale):
     rng = np.random.default_rng(0)
-    lower, upper, known = -rng.random(size), -rng.random(size), rng.normal(size=size)
+    lower, upper, known = -rng.random((3, size))
     diagonal = 2.5 + rng.random(size)
     inner = np.arange(1, size - 1)
     matrix = np.zeros((size, size))
@@ -113,7 +114,7 @@ def test_the_solver_from_both_ends_solves(size):
     def solved(lower, diagonal, upper, known, T):
         solve_from_both_ends(lower, diagonal, upper, known, T, np.zeros(T.size), np.zeros(T.size))
 
-    solved(lower, diagonal, upper, known, T)
+    solved(*(scale * each for each in (lower, diagonal, upper, known)), T)
     np.testing.assert_allclose(T, np.linalg.solve(matrix, known), rtol=1e-12)
 
 

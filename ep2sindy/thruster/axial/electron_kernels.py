@@ -26,6 +26,7 @@ from ep2sindy.thruster.axial.state_kernels import (
 )
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
+HUGE = 1e200  # of determinants, far from overflow
 COLDEST_EV = 1.0  # least T_e of the ghost cells: a steep end could turn them negative
 
 
@@ -37,16 +38,16 @@ def fill_ghosts(values):
 
 @compiled(**LOOP)
 def add_charge(n_e, flux_q, n, g, z):
+    """Add the ions of charge z; those of charge 1 come first, and replace what was there."""
+    keep = 1.0 if z > 1.0 else 0.0
     for i in range(n_e.size):
-        n_e[i] += z * n[i]
-        flux_q[i] += z * g[i]
+        n_e[i] = keep * n_e[i] + z * n[i]
+        flux_q[i] = keep * flux_q[i] + z * g[i]
 
 
 @compiled(**FAST)
 def sum_charges(state):
     """Electron density and charge flux of all ions, including the ghost cells."""
-    state.n_e[:] = 0.0
-    state.flux_q[:] = 0.0
     for k in range(state.n_i.shape[0]):
         fill_ghosts(state.n_i[k])
         fill_ghosts(state.flux_i[k])
@@ -54,11 +55,17 @@ def sum_charges(state):
 
 
 @compiled(**LOOP)
-def follow_log(n_e, log_n, before):
-    """Update ln n_e by its change in one step: 2 (r - 1)/(r + 1) is ln r to third order."""
+def follow_log(n_e, log_n, before, per_n):
+    """Update ln n_e by its change in one step: 2 (r - 1)/(r + 1) is ln r to third order.
+
+    The one division is also that of per_n = 1/n_e.
+    """
     for i in range(n_e.size):
-        log_n[i] += 2.0 * (n_e[i] - before[i]) / (n_e[i] + before[i])
-        before[i] = n_e[i]
+        n, both = n_e[i], n_e[i] + before[i]
+        inverse = 1.0 / (n * both)
+        log_n[i] += 2.0 * (n - before[i]) * (n * inverse)
+        per_n[i] = both * inverse
+        before[i] = n
 
 
 @compiled(**ENTRY)
@@ -123,96 +130,119 @@ def follow_circuit(state, model, dt, behind):
 
 
 @compiled(**LOOP)
-def drive_and_load(n, g, T, per_mobility, gradient, model):
+def drive_and_load(n, per_n, g, T, per_mobility, gradient, model):
     """Integrals over the plasma of Ohm's law; writes the pressure gradient in eV/m^4.
 
     The first, in V, drives the current beside the supply; the second is the resistance, times e and
     the channel's area.
     """
-    dz, per_span, spread, drive, load = model.dz, model.per_span, model.spread, 0.0, 0.0
+    dz, per_span, per_spread = model.dz, model.per_span, model.per_spread
+    drive = load = 0.0
     for i in inside(n):
         rise = n[i + ONE] * T[i + ONE] - n[i - ONE] * T[i - ONE]
         rise *= model.pressure_factor * per_span[i]
-        per_n = dz[i] / n[i]
         gradient[i] = rise
-        drive += per_n * (g[i] * per_mobility[i] + rise)
-        load += per_n * per_mobility[i] / spread[i]
+        length = dz[i] * per_n[i]
+        drive += length * (g[i] * per_mobility[i] + rise)
+        load += length * per_mobility[i] * per_spread[i]
     return drive, load
 
 
 @compiled(**LOOP)
-def field_of_current(total, n, g, per_nu, per_mobility, gradient, spread, weight, E, heating, K):
-    """Field in V/m, heating -n u_e E in eV/(m^3 s) and the drift's energy K in eV."""
-    for i in inside(n):
-        backwards = total / spread[i] - g[i]  # -n u_e
-        per_n = 1.0 / n[i]
-        field = (backwards * per_mobility[i] - gradient[i]) * per_n
+def field_of_current(total, per_n, g, per_nu, per_mobility, gradient, weight, E, heating, K, model):
+    """Field in V/m, heating -n u_e E in eV/(m^3 s) and the drift's energy K in eV.
+
+    Returns the field's integral over the plasma, and that of its work on the ions per channel area.
+    """
+    dz, spread, per_spread, drop, work = model.dz, model.spread, model.per_spread, 0.0, 0.0
+    for i in inside(g):
+        backwards = total * per_spread[i] - g[i]  # -n u_e
+        field = (backwards * per_mobility[i] - gradient[i]) * per_n[i]
         E[i] = field
         heating[i] = backwards * field  # 2 n K nu + u_e dp_e/dz
         # K = m_e (1 + (omega/nu)^2) u_e^2 / 2 = u_e^2 / (2 mu nu), in eV
-        K[i] = weight * (backwards * per_n) ** 2 * per_mobility[i] * per_nu[i]
+        K[i] = weight * (backwards * per_n[i]) ** 2 * per_mobility[i] * per_nu[i]
+        drop += dz[i] * field
+        work += dz[i] * spread[i] * g[i] * field
+    return drop, work
 
 
 @compiled(**FAST)
 def ohm(state, model, dt, drop, w):
     """Current, field, drift energy and heating; returns I_d over e and the channel's area.
 
-    drop: voltage of the anode's sheath in V, which adds to the voltage over the plasma.
+    drop: voltage of the anode's sheath in V, which adds to the voltage over the plasma. Records the
+    power of the current in the field, and that of the field's work on the ions.
     """
-    n, g, plasma = state.n_e, state.flux_q, E_CHARGE * model.area
-    drive, load = drive_and_load(n, g, state.T_e_eV, w.per_mobility, w.gradient, model)
+    g, per_n, plasma = state.flux_q, w.per_n, E_CHARGE * model.area
+    drive, load = drive_and_load(
+        state.n_e, per_n, g, state.T_e_eV, w.per_mobility, w.gradient, model
+    )
     state.instant[SUPPLY] = supply_voltage(state, model)
     source, resistance = thevenin(state, model, dt)
     current = (source + drop + drive) / (load / plasma + resistance)
     total = current / plasma
     counted = 0.5 if model.drift_weight > 0.0 else 0.0
-    field_of_current(
-        total, n, g, w.per_nu, w.per_mobility, w.gradient, model.spread, counted,
-        state.E, w.heating, state.drift_eV,
+    along, work = field_of_current(
+        total, per_n, g, w.per_nu, w.per_mobility, w.gradient, counted, state.E, w.heating,
+        state.drift_eV, model,
     )  # fmt: skip
     state.instant[CURRENT] = current
+    state.instant[POWER] = current * along
+    state.instant[P_IONS] = plasma * work
     follow_circuit(state, model, dt, source - resistance * current)
     return total
 
 
-@compiled(**FAST)
-def solve_from_both_ends(lower, diagonal, upper, known, T, c, d):
-    """Solve a tridiagonal system for T[1:-1]; T[0] and T[-1] are given.
+@compiled(inline="always")
+def pivot(diagonal, product, longer, shorter):
+    """Determinant of the rows up to the next, and over it that of one row less, `longer`.
 
-    Elimination runs from both ends to the middle, so that two chains of divisions overlap in time.
+    By ratios of determinants no row waits for the division of the one before. product: of the two
+    coefficients that couple both.
     """
-    size = diagonal.size
-    middle = (size - 1) // 2  # last row eliminated from the left
-    c[0], d[0], c[size - 1], d[size - 1] = 0.0, T[0], 0.0, T[size - 1]
-    j = size - 1
-    for i in range(1, middle + 1):
-        j -= 1
-        inverse = 1.0 / (diagonal[i] - lower[i] * c[i - 1])
-        c[i] = upper[i] * inverse
-        d[i] = (known[i] - lower[i] * d[i - 1]) * inverse
-        if j > middle:
-            other = 1.0 / (diagonal[j] - upper[j] * c[j + 1])
-            c[j] = lower[j] * other
-            d[j] = (known[j] - upper[j] * d[j + 1]) * other
-    T[middle] = (d[middle] - c[middle] * d[middle + 1]) / (1.0 - c[middle] * c[middle + 1])
-    T[middle + 1] = d[middle + 1] - c[middle + 1] * T[middle]
-    j = middle + 1
-    for i in range(middle - 1, 0, -1):
-        T[i] = d[i] - c[i] * T[i + 1]
-        j += 1
-        if j < size - 1:
-            T[j] = d[j] - c[j] * T[j - 1]
-    while j < size - 2:
-        j += 1
-        T[j] = d[j] - c[j] * T[j - 1]
+    determinant = diagonal * longer - product * shorter
+    return determinant, longer / determinant
 
 
 @compiled(**LOOP)
-def conductivities(n, T, mobility, coulomb, per_nu, model, kappa):
-    """Heat conductivity of the electrons in every cell, in 1/(m s)."""
-    factor, shared = model.conduction_factor, model.conduction_coulomb
-    for i in range(n.size):
-        kappa[i] = factor * mobility[i] * n[i] * T[i] / (1.0 + shared * coulomb[i] * per_nu[i])
+def solve_from_both_ends(lower, diagonal, upper, known, T, c, d):
+    """Solve a tridiagonal system for T[1:-1]; T[0] and T[-1] are given.
+
+    Elimination runs from both ends to the middle, so that two chains overlap in time. What the next
+    row needs stays in variables: to read back what was just written takes as long as a product.
+    """
+    size = np.uint64(diagonal.size)
+    middle = (size - ONE) // np.uint64(2)  # last row eliminated from the left
+    left, shorter_left, d_left = 1.0, 0.0, T[0]
+    right, shorter_right, d_right = 1.0, 0.0, T[-1]
+    for i in range(ONE, middle + ONE):
+        product = lower[i] * upper[i - ONE]
+        longer, inverse = pivot(diagonal[i], product, left, shorter_left)
+        shorter_left, left = left, longer
+        d_left = known[i] * inverse - lower[i] * inverse * d_left
+        c[i], d[i] = upper[i] * inverse, d_left
+        j = size - ONE - i
+        if j > middle:
+            product = upper[j] * lower[j + ONE]
+            longer, inverse = pivot(diagonal[j], product, right, shorter_right)
+            shorter_right, right = right, longer
+            d_right = known[j] * inverse - upper[j] * inverse * d_right
+            c[j], d[j] = lower[j] * inverse, d_right
+        if left > HUGE or right > HUGE:  # only ratios count
+            shorter_left, left = shorter_left / left, 1.0
+            shorter_right, right = shorter_right / right, 1.0
+    after = middle + ONE
+    low = (d[middle] - c[middle] * d[after]) / (1.0 - c[middle] * c[after])
+    high = d[after] - c[after] * low
+    T[middle], T[after] = low, high
+    for k in range(ONE, middle):
+        i, j = middle - k, after + k
+        low = d[i] - c[i] * low
+        T[i] = low
+        if j < size - ONE:
+            high = d[j] - c[j] * high
+            T[j] = high
 
 
 @compiled(**LOOP)
@@ -223,9 +253,10 @@ def heat_through_faces(g, total, kappa, model, down, up):
     central where conduction dominates, upwind where convection does (Patankar, Numerical Heat
     Transfer and Fluid Flow, 1980, section 5.2-6). Without slopes, upwind everywhere.
     """
-    per_between, spread, steep = model.per_between, model.spread_at, 0.1 * model.slope_weight
+    per_between, per_spread = model.per_between, model.per_spread_at
+    steep = 0.1 * model.slope_weight
     for i in faces(g):
-        flux = 2.5 * (0.5 * (g[i] + g[i + ONE]) - total / spread[i])
+        flux = 2.5 * (0.5 * (g[i] + g[i + ONE]) - total * per_spread[i])
         conducting = 0.5 * (kappa[i] + kappa[i + ONE]) * per_between[i]
         conducting *= max(1.0 - steep * abs(flux) / conducting, 0.0) ** 5
         down[i] = max(flux, 0.0) + conducting
@@ -233,76 +264,59 @@ def heat_through_faces(g, total, kappa, model, down, up):
 
 
 @compiled(**LOOP)
-def transport_of_heat(dt, n, down, up, per_before, per_behind, lower, diagonal, upper):
-    """Equations of the next T_e: what is stored, and what passes through the faces."""
+def equations_of_heat(
+    dt, n, T, energy, down, up, per_before, per_behind, heating, inelastic, inelastic_slope, wall,
+    wall_slope, lower, diagonal, upper, known, T_before,
+):  # fmt: skip
+    """Equations of the next T_e: what is stored, what passes through the faces, and sources.
+
+    Losses are implicit by their slopes. The present T_e is kept.
+    """
     for i in inside(n):
         before, behind = dt * per_before[i], dt * per_behind[i]
+        slope = dt * (inelastic_slope[i] + wall_slope[i])
         lower[i] = -before * down[i - ONE]
         upper[i] = behind * up[i]
-        diagonal[i] = 1.5 * n[i] + (behind * down[i] - before * up[i - ONE])
-
-
-@compiled(**LOOP)
-def sources_of_heat(
-    dt, energy, T, heating, inelastic, inelastic_slope, wall, wall_slope, diagonal, known, before
-):
-    """Add heating and losses, implicit by the losses' slopes, and keep the present T_e."""
-    for i in inside(T):
-        slope = dt * (inelastic_slope[i] + wall_slope[i])
-        before[i] = T[i]
+        diagonal[i] = 1.5 * n[i] + (behind * down[i] - before * up[i - ONE]) + slope
         known[i] = energy[i] + slope * T[i] + dt * (heating[i] - inelastic[i] - wall[i])
-        diagonal[i] += slope
+        T_before[i] = T[i]
 
 
 @compiled(**LOOP)
-def settle(n, T, before, coldest, inelastic_slope, wall_slope, energy, inelastic, wall):
-    """Energy at the new temperature, and the losses that it paid."""
+def settle(n, T, before, coldest, inelastic, inelastic_slope, wall, wall_slope, energy, model):
+    """Energy at the new temperature; returns both losses that it paid, per channel area."""
+    dz, spread, lost, to_wall = model.dz, model.spread, 0.0, 0.0
     for i in inside(n):
-        T[i] = max(T[i], coldest)
-        rise = T[i] - before[i]
-        energy[i] = 1.5 * n[i] * T[i]
-        inelastic[i] += inelastic_slope[i] * rise
-        wall[i] += wall_slope[i] * rise
+        new, volume = max(T[i], coldest), dz[i] * spread[i]
+        rise = new - before[i]
+        T[i], energy[i] = new, 1.5 * n[i] * new
+        lost += volume * (inelastic[i] + inelastic_slope[i] * rise)
+        to_wall += volume * (wall[i] + wall_slope[i] * rise)
+    return lost, to_wall
 
 
 @compiled(**FAST)
 def heat(state, model, dt, total, drop, w):
     """New electron temperature: implicit convection, conduction and linearised losses.
 
-    The losses in w become those at the new temperature.
+    Returns inelastic losses and losses to the walls per channel area.
     """
     n, T, down, up = state.n_e, state.T_e_eV, w.down, w.up
-    conductivities(n, T, w.mobility, w.coulomb, w.per_nu, model, w.kappa)
     heat_through_faces(state.flux_q, total, w.kappa, model, down, up)
     if model.sheath:  # no gradient of T; each electron takes 2 T and climbs the sheath
         flux = state.flux_q[1] - total
         down[0] = 2.5 * max(flux, 0.0)
         up[0] = min(flux, 0.0) * (2.0 + model.sheath_weight * drop / T[1])
-    transport_of_heat(
-        dt, n, down, up, model.per_before, model.per_behind, w.lower, w.diagonal, w.upper
-    )
-    sources_of_heat(
-        dt, state.energy, T, w.heating, w.inelastic, w.inelastic_slope, w.wall, w.wall_slope,
-        w.diagonal, w.known, w.before,
+    equations_of_heat(
+        dt, n, T, state.energy, down, up, model.per_before, model.per_behind, w.heating,
+        w.inelastic, w.inelastic_slope, w.wall, w.wall_slope, w.lower, w.diagonal, w.upper,
+        w.known, w.before,
     )  # fmt: skip
     solve_from_both_ends(w.lower, w.diagonal, w.upper, w.known, T, w.c, w.d)
-    settle(
-        n, T, w.before, model.coldest_eV, w.inelastic_slope, w.wall_slope, state.energy,
-        w.inelastic, w.wall,
+    return settle(
+        n, T, w.before, model.coldest_eV, w.inelastic, w.inelastic_slope, w.wall, w.wall_slope,
+        state.energy, model,
     )  # fmt: skip
-
-
-@compiled(**LOOP)
-def integrals(g, E, inelastic, wall, dz, spread):
-    """Of the ions' work, the field and the two losses over the plasma, per channel area."""
-    work = drop = lost = to_wall = 0.0
-    for i in inside(g):
-        volume = dz[i] * spread[i]
-        work += volume * g[i] * E[i]
-        drop += dz[i] * E[i]
-        lost += volume * inelastic[i]
-        to_wall += volume * wall[i]
-    return work, drop, lost, to_wall
 
 
 @compiled(**LOOP)
@@ -315,10 +329,9 @@ def drained(n, loss, dz, spread):
 
 
 @compiled(**FAST)
-def record_powers(state, model, total, w):
-    """Record currents, thrust and power terms, as named in `SERIES_SUMS`."""
+def record_powers(state, model, lost, to_wall, w):
+    """Record currents, thrust and power terms, as named in `SERIES_SUMS`; those of `ohm` are."""
     instant, dz, spread, T = state.instant, model.dz, model.spread, state.T_e_eV
-    work, drop, lost, to_wall = integrals(state.flux_q, state.E, w.inelastic, w.wall, dz, spread)
     on_wall = thrust = 0.0
     for k in range(state.n_i.shape[0]):
         z, n, flux = k + 1.0, state.n_i[k], state.flux_i[k]
@@ -327,8 +340,6 @@ def record_powers(state, model, total, w):
     watts, end = E_CHARGE * model.area, model.spread_at[-1]
     instant[THRUST] = model.ion_mass * model.area * end * thrust
     instant[WALL_CURRENT] = watts * on_wall
-    instant[POWER] = instant[CURRENT] * drop
-    instant[P_IONS] = watts * work
     instant[P_INELASTIC] = watts * lost
     instant[P_WALL] = watts * to_wall
     instant[P_ANODE] = -watts * (w.down[0] * T[0] + w.up[0] * T[1])
@@ -341,7 +352,7 @@ def follow_electrons(state, model, dt, w):
     T = state.T_e_eV
     state.clock[0] += dt
     sum_charges(state)
-    follow_log(state.n_e, state.log_n[0], state.log_n[1])
+    follow_log(state.n_e, state.log_n[0], state.log_n[1], w.per_n)
     fill_ghosts(state.n_n)
     # The ends of the domain, half a cell outside the last centres, are held at their temperature.
     T[0] = max(2.0 * model.anode_T_e_eV - T[1], COLDEST_EV)
@@ -354,8 +365,8 @@ def follow_electrons(state, model, dt, w):
     total = ohm(state, model, dt, drop, w)
     if not np.isfinite(total):
         return False
-    heat(state, model, dt, total, drop, w)
-    record_powers(state, model, total, w)
+    lost, to_wall = heat(state, model, dt, total, drop, w)
+    record_powers(state, model, lost, to_wall, w)
     return True
 
 

@@ -27,24 +27,52 @@ TINY = 1e-60  # avoids 0/0
 RAREST = 1e-12  # least density of a higher charge, of the first: near the anode nothing makes them
 
 
-@compiled(**LOOP)
-def half_slopes(values, to_left, to_right, weight, s):
-    """Half of van Leer's slope in every cell: a*b/(a + b) of the differences to both sides.
+@compiled(inline="always")
+def half_slope(q, i, to_left, to_right):
+    """Half of van Leer's slope, a*b/(a + b) of the differences, as numerator and denominator.
 
-    The slope is 0 at an extremum, and in the two outermost cells.
+    It is 0 at an extremum.
     """
-    for i in inside(values):
-        a = (values[i] - values[i - ONE]) * to_left[i]
-        b = (values[i + ONE] - values[i]) * to_right[i]
-        limited = max(a * b, 0.0) * (a + b) / ((a + b) ** 2 + TINY)  # a branch is not vectorised
-        s[i] = weight * limited
-    s[1] = s[-2] = 0.0
+    a = (q[i] - q[i - ONE]) * to_left[i]
+    b = (q[i + ONE] - q[i]) * to_right[i]
+    return max(a * b, 0.0) * (a + b), (a + b) ** 2 + TINY  # a branch is not vectorised
+
+
+@compiled(inline="always")
+def quotients(a, p, b, q, c, r, d, s):
+    """a/p, b/q, c/r and d/s by one division, which takes as long as sixteen products.
+
+    The product of all denominators must not overflow, nor vanish.
+    """
+    pq, rs = p * q, r * s
+    inverse = 1.0 / (pq * rs)
+    per_pq, per_rs = inverse * rs, inverse * pq
+    return a * q * per_pq, b * p * per_pq, c * s * per_rs, d * r * per_rs
+
+
+@compiled(**LOOP)
+def half_slopes(n, u, nn, to_left, to_right, weight, s_n, s_u, s_nn):
+    """Half slopes of ions, their speed and the neutrals, 0 in the two outermost cells."""
+    for i in inside(n):
+        a, p = half_slope(n, i, to_left, to_right)
+        b, q = half_slope(u, i, to_left, to_right)
+        c, r = half_slope(nn, i, to_left, to_right)
+        a, b, c, _ = quotients(a, p, b, q, c, r, 0.0, 1.0)
+        s_n[i], s_u[i], s_nn[i] = weight * a, weight * b, weight * c
+    s_n[1] = s_n[-2] = s_u[1] = s_u[-2] = s_nn[1] = s_nn[-2] = 0.0
 
 
 @compiled(**LOOP)
 def ratios(g, n, u):
     for i in inside(n):
         u[i] = g[i] / n[i]
+
+
+@compiled(**FAST)
+def start_speeds(state, w):
+    """Speeds of the ions; every step ends with those of the next."""
+    for k in range(state.n_i.shape[0]):
+        ratios(state.flux_i[k], state.n_i[k], w.u[k])
 
 
 @compiled(inline="always")
@@ -82,8 +110,8 @@ def birth(rate, n_e, source, speed, consumed, gain, push, first):
     for i in inside(source):
         born = rate[i] * n_e[i] * source[i]
         consumed[i] = keep * consumed[i] + born
-        gain[i] += born
-        push[i] += born * speed[i]
+        gain[i] = keep * gain[i] + born
+        push[i] = keep * push[i] + born * speed[i]
 
 
 @compiled(**LOOP)
@@ -100,14 +128,13 @@ def further_birth(rate, n_e, source, g, loss, drag, gain, push):
 @compiled(**FAST)
 def births(n, g, nn, state, model, w):
     """Gains of ions of every charge, of their flux, and the neutrals consumed."""
-    n_e, charges = w.n_e, n.shape[0]
-    for i in inside(nn):
-        n_e[i] = n[0, i]
-    for k in range(1, charges):
+    n_e = n[0]
+    for k in range(1, n.shape[0]):
+        w.gain[k] = 0.0
+        w.push[k] = 0.0
         for i in inside(nn):
-            n_e[i] += (k + 1.0) * n[k, i]
-    w.gain[:] = 0.0
-    w.push[:] = 0.0
+            w.n_e[i] = n_e[i] + (k + 1.0) * n[k, i]
+        n_e = w.n_e
     rates, speed = state.rates, model.birth_speed
     birth(rates[0], n_e, nn, speed, w.consumed, w.gain[0], w.push[0], True)
     for t in range(model.further.shape[0]):
@@ -137,11 +164,14 @@ def leaving_speed(charge, state, model):
 
 @compiled(**LOOP)
 def follow_ions(
-    new, new_g, n, g, flux, momentum_flux, gain, push, E, loss, per_before, per_behind,
-    neutralised, walled, through, keep, dt, weight, charge, to_wall, c2,
+    new, new_g, new_u, n, g, flux, momentum_flux, gain, push, E, loss, per_before, per_behind,
+    neutralised, walled, through, keep, dt, weight, charge, to_wall, c2, first,
 ):  # fmt: skip
-    """new = keep new + (1 - keep) (n + dt dn/dt), and the same of the ion flux; sums beside it."""
-    take = 1.0 - keep
+    """new = keep new + (1 - keep) (n + dt dn/dt), the same of the ion flux, their ratio, and sums.
+
+    If first, forget how many ions were neutralised before.
+    """
+    take, others = 1.0 - keep, 0.0 if first else 1.0
     for i in inside(n):
         lost, before, behind = to_wall * loss[i], per_before[i], per_behind[i]
         gone, inflow = lost * n[i], flux[i - ONE]
@@ -149,11 +179,12 @@ def follow_ions(
         widening = c2 * n[i] * (behind - before)  # pressure on the sides of a cell that widens
         d_g = momentum_flux[i - ONE] * before - momentum_flux[i] * behind + widening
         d_g += push[i] + charge * n[i] * E[i] - lost * g[i]
-        neutralised[i] += gone
+        neutralised[i] = others * neutralised[i] + gone
         walled[i] += weight * gone
         through[i] += weight * inflow
-        new[i] = keep * new[i] + take * (n[i] + dt * d_n)
-        new_g[i] = keep * new_g[i] + take * (g[i] + dt * d_g)
+        next_n = keep * new[i] + take * (n[i] + dt * d_n)
+        next_g = keep * new_g[i] + take * (g[i] + dt * d_g)
+        new[i], new_g[i], new_u[i] = next_n, next_g, next_g / next_n
 
 
 @compiled(**LOOP)
@@ -181,31 +212,31 @@ def follow_neutrals(
 
 
 @compiled(**LOOP)
-def hold_above_zero(n, g, n_1, g_1):
+def hold_above_zero(n, g, u, n_1, g_1, u_1):
     """Let rare ions of a higher charge move with the singly charged ones."""
     for i in inside(n):
         least = RAREST * n_1[i]
         rare = n[i] < least
         n[i] = least if rare else n[i]
         g[i] = RAREST * g_1[i] if rare else g[i]
+        u[i] = u_1[i] if rare else u[i]
 
 
 @compiled(**FAST)
-def stage_of_ions(k, new, new_g, n, g, keep, dt, state, model, sums, w):
+def stage_of_ions(k, new, new_g, n, g, nn, keep, dt, state, model, sums, w):
     """One stage of Heun's step for ions of charge k + 1; returns their flux into the anode."""
     flux, c2, z = w.flux, model.sound_speed_squared, k + 1.0
     charge, weight = z * E_CHARGE / model.ion_mass, 0.5 * dt
     to_left, to_right, limit = model.to_left, model.to_right, model.slope_weight
-    ratios(g, n, w.u)
-    half_slopes(n, to_left, to_right, limit, w.slope_n)
-    half_slopes(w.u, to_left, to_right, limit, w.slope_u)
-    fluxes_between(n, w.u, w.slope_n, w.slope_u, c2, flux, w.momentum_flux)
-    fluxes_at_ends(n, g, w.u, c2, leaving_speed(charge, state, model), flux, w.momentum_flux)
+    u = w.u[k]
+    half_slopes(n, u, nn, to_left, to_right, limit, w.slope_n, w.slope_u, w.slope_nn)
+    fluxes_between(n, u, w.slope_n, w.slope_u, c2, flux, w.momentum_flux)
+    fluxes_at_ends(n, g, u, c2, leaving_speed(charge, state, model), flux, w.momentum_flux)
     cells = sums.cells
     follow_ions(
-        new, new_g, n, g, flux, w.momentum_flux, w.gain[k], w.push[k], state.E, state.wall_loss,
+        new, new_g, u, n, g, flux, w.momentum_flux, w.gain[k], w.push[k], state.E, state.wall_loss,
         model.per_before, model.per_behind, w.neutralised, cells[WALL_LOSS],
-        cells[FACE_I + PER_CHARGE * k], keep, dt, weight, charge, np.sqrt(z), c2,
+        cells[FACE_I + PER_CHARGE * k], keep, dt, weight, charge, np.sqrt(z), c2, k == 0,
     )  # fmt: skip
     leaving = flux[-2] * model.spread_at[-1]
     sums.series[BEAM] += weight * z * leaving
@@ -218,13 +249,13 @@ def stage(new, new_g, new_nn, n, g, nn, keep, dt, state, model, sums, w):
     """One stage of Heun's step; adds half of dt times fluxes and sources to the sums."""
     flux, weight = w.flux, 0.5 * dt
     births(n, g, nn, state, model, w)
-    w.neutralised[:] = 0.0
     at_anode = 0.0
     for k in range(n.shape[0]):
-        at_anode += stage_of_ions(k, new[k], new_g[k], n[k], g[k], keep, dt, state, model, sums, w)
+        at_anode += stage_of_ions(
+            k, new[k], new_g[k], n[k], g[k], nn, keep, dt, state, model, sums, w
+        )
     for k in range(1, n.shape[0]):
-        hold_above_zero(new[k], new_g[k], new[0], new_g[0])
-    half_slopes(nn, model.to_left, model.to_right, model.slope_weight, w.slope_nn)
+        hold_above_zero(new[k], new_g[k], w.u[k], new[0], new_g[0], w.u[0])
     neutral_fluxes(nn, w.slope_nn, model.neutral_speed, model.neutral_wave, flux)
     flux[0] = model.neutral_inflow - at_anode
     follow_neutrals(
@@ -236,7 +267,7 @@ def stage(new, new_g, new_nn, n, g, nn, keep, dt, state, model, sums, w):
 
 @compiled(**FAST)
 def follow_heavy(state, model, dt, sums, w):
-    """One SSP-RK2 (Heun) step of ions and neutrals in a frozen field.
+    """One SSP-RK2 (Heun) step of ions and neutrals in a frozen field; w.u holds their speeds.
 
     The entries of `sums` match the changes of this step to rounding.
     """
@@ -250,6 +281,7 @@ def follow_heavy(state, model, dt, sums, w):
 @compiled(**ENTRY)
 def heavy_step(state, model, dt, sums, w):
     """`follow_heavy` by itself."""
+    start_speeds(state, w)
     follow_heavy(state, model, dt, sums, w)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.axial.electron_kernels import follow_electrons, start_density
-from ep2sindy.thruster.axial.heavy_kernels import add_scaled, follow_heavy
+from ep2sindy.thruster.axial.heavy_kernels import add_scaled, follow_heavy, start_speeds
 from ep2sindy.thruster.axial.state_kernels import (
     CHANGE_I,
     CHANGE_N,
@@ -28,21 +28,21 @@ from ep2sindy.thruster.axial.state_kernels import (
 
 
 @compiled(**NO_NAN)
-def fastest(n, g, inverse_dz, c):
+def fastest(u, inverse_dz, c):
     """Largest (|u| + c)/dz of a species, in 1/s."""
     top = 0.0
-    for i in inside(n):
-        top = max(top, (abs(g[i] / n[i]) + c) * inverse_dz[i])
+    for i in inside(u):
+        top = max(top, (abs(u[i]) + c) * inverse_dz[i])
     return top
 
 
 @compiled(**FAST)
-def time_step(state, model, left):
+def time_step(model, left, w):
     """Time step within the CFL number that divides the time left to the next sample equally."""
     c = np.sqrt(model.sound_speed_squared)
     top = 0.0
-    for k in range(state.n_i.shape[0]):
-        top = max(top, fastest(state.n_i[k], state.flux_i[k], model.inverse_dz, c))
+    for k in range(w.u.shape[0]):
+        top = max(top, fastest(w.u[k], model.inverse_dz, c))
     return left / np.ceil(left * top / model.cfl)
 
 
@@ -57,15 +57,15 @@ def add_fields(sum_n, sum_T, sum_rate, sum_E, sum_energy, n, T, rate, E, energy,
 
 
 @compiled(**LOOP)
-def add_ions(sum_n, sum_u, sum_g, n, g, weight):
+def add_ions(sum_n, sum_u, sum_g, n, u, g, weight):
     for i in range(n.size):
         sum_n[i] += weight * n[i]
-        sum_u[i] += weight * (g[i] / n[i])
+        sum_u[i] += weight * u[i]
         sum_g[i] += weight * g[i]
 
 
 @compiled(**FAST)
-def add_instant(sums, state, weight):
+def add_instant(sums, state, weight, w):
     """Add weight times the present fields to the sums, except those that the heavy step adds."""
     cells = sums.cells
     add_fields(
@@ -74,7 +74,7 @@ def add_instant(sums, state, weight):
     )  # fmt: skip
     for k in range(state.n_i.shape[0]):
         n, u, g = N_I + PER_CHARGE * k, U_IZ + PER_CHARGE * k, FLUX_I + PER_CHARGE * k
-        add_ions(cells[n], cells[u], cells[g], state.n_i[k], state.flux_i[k], weight)
+        add_ions(cells[n], cells[u], cells[g], state.n_i[k], w.u[k], state.flux_i[k], weight)
     add_scaled(sums.series, state.instant, weight)
 
 
@@ -96,12 +96,13 @@ def advance(state, model, sums, w, sample_s, averaged, fields, series):
     size = state.n_n.size
     for row in range(series.shape[0]):
         start_density(state)
+        start_speeds(state, w)
         sums.cells[:] = 0.0
         sums.series[:] = 0.0
         add_changes(sums, state, -1.0)
         left, weight = sample_s, sample_s
         while left > 1e-9 * sample_s:
-            dt = time_step(state, model, left)
+            dt = time_step(model, left, w)
             if not averaged:  # keep the last step only
                 sums.cells[:] = 0.0
                 sums.series[:] = 0.0
@@ -111,7 +112,7 @@ def advance(state, model, sums, w, sample_s, averaged, fields, series):
             follow_heavy(state, model, dt, sums, w)
             if not follow_electrons(state, model, dt, w):
                 return row
-            add_instant(sums, state, dt)
+            add_instant(sums, state, dt, w)
             left -= dt
         add_changes(sums, state, 1.0)
         add_scaled(sums.cells[SPREAD], model.spread, weight)

@@ -141,6 +141,8 @@ def _lengths(faces: Float[np.ndarray, " faces"]) -> dict[str, Any]:
         "inverse_dz": 1.0 / dz,
         "spread": np.ones(dz.size),
         "spread_at": np.ones(dz.size - 1),
+        "per_spread": np.ones(dz.size),
+        "per_spread_at": np.ones(dz.size - 1),
         "per_before": before,
         "per_behind": behind,
         "neutral_before": before,
@@ -242,6 +244,7 @@ class Spreading:
         model.spread_at[:] = area
         model.spread[1:-1] = 0.5 * (area[1:] + area[:-1])
         model.spread[[0, -1]] = area[[0, -1]]
+        model.per_spread[:], model.per_spread_at[:] = 1.0 / model.spread, 1.0 / area
         model.per_before[1:] = area / (model.spread[1:] * model.dz[1:])
         model.per_behind[:-1] = area / (model.spread[:-1] * model.dz[:-1])
         state.instant[TANGENT] = at_faces[-1]

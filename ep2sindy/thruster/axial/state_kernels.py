@@ -78,6 +78,8 @@ class AxialModel(NamedTuple):
     area: float  # m^2, of the channel
     spread: np.ndarray  # (n + 2,), area of the plasma over that of the channel
     spread_at: np.ndarray  # (n + 1,), the same at the faces
+    per_spread: np.ndarray  # (n + 2,), 1 over it
+    per_spread_at: np.ndarray  # (n + 1,)
     per_before: np.ndarray  # (n + 2,), 1/m: spread of the face before a cell over spread times dz
     per_behind: np.ndarray  # (n + 2,), 1/m: of the face behind it
     ion_mass: float  # kg
@@ -151,10 +153,10 @@ def new_sums(n_cell_sums: int, size: int) -> Sums:
 class Scratch(NamedTuple):
     """Arrays of the loop that no step needs from the one before."""
 
-    u: np.ndarray  # (n + 2,), as all that follow but where said
-    slope_n: np.ndarray  # half slopes: of ions, of their speed, of neutrals
-    slope_u: np.ndarray
-    slope_nn: np.ndarray
+    u: np.ndarray  # (charges, n + 2), speeds of the ions
+    slope_n: np.ndarray  # (n + 2,), as all that follow but where said; half slopes: of ions,
+    slope_u: np.ndarray  # of their speed,
+    slope_nn: np.ndarray  # of neutrals
     flux: np.ndarray  # through the face behind each cell
     momentum_flux: np.ndarray
     gain: np.ndarray  # (charges, n + 2): of ions by ionisation, and of their flux
@@ -165,8 +167,8 @@ class Scratch(NamedTuple):
     stage_n: np.ndarray  # (charges, n + 2): of Heun's first stage
     stage_flux: np.ndarray  # (charges, n + 2)
     stage_nn: np.ndarray
-    mobility: np.ndarray  # m^2/(V s)
-    per_mobility: np.ndarray
+    per_n: np.ndarray  # m^3, over the density of electrons
+    per_mobility: np.ndarray  # V s/m^2
     nu: np.ndarray  # 1/s: of collisions that T_e alone decides
     per_nu: np.ndarray  # s: over the frequency of all collisions
     coulomb: np.ndarray  # 1/s, electron-ion collisions
@@ -192,6 +194,6 @@ class Scratch(NamedTuple):
 
 def new_work(charges: int, size: int) -> Scratch:
     """Zeros for cells, with ghosts, of this number."""
-    per_charge = ("gain", "push", "stage_n", "stage_flux")
+    per_charge = ("u", "gain", "push", "stage_n", "stage_flux")
     shapes = {k: (charges, size) if k in per_charge else size for k in Scratch._fields}
     return Scratch(**{k: np.zeros(shape) for k, shape in shapes.items()})

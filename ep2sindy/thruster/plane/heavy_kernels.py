@@ -9,6 +9,7 @@ They pass on rows of one column, which the nearest cache holds. Functions that h
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
+from ep2sindy.thruster.axial.heavy_kernels import quotients, rusanov
 from ep2sindy.thruster.axial.state_kernels import ENTRY, FAST, LOOP, ONE
 from ep2sindy.thruster.constants import E_CHARGE
 from ep2sindy.thruster.plane.state_kernels import Gas
@@ -25,30 +26,6 @@ def half_slope(left, centre, right):
     a, b = centre - left, right - centre
     product = a * b
     return (product, a + b) if product > 0.0 else (0.0, 1.0)
-
-
-@compiled(inline="always")
-def quotients(a, p, b, q, c, r, d, s):
-    """a/p, b/q, c/r and d/s by one division, which takes as long as sixteen products.
-
-    The product of all denominators must not overflow, nor vanish.
-    """
-    pq, rs = p * q, r * s
-    inverse = 1.0 / (pq * rs)
-    per_pq, per_rs = inverse * rs, inverse * pq
-    return a * q * per_pq, b * p * per_pq, c * s * per_rs, d * r * per_rs
-
-
-@compiled(inline="always")
-def rusanov(n_l, u_l, n_r, u_r, c):
-    """Rusanov fluxes of density and of the momentum across the face, pressure included.
-
-    c: speed of sound.
-    """
-    g_l, g_r = n_l * u_l, n_r * u_r
-    s = max(abs(u_l), abs(u_r)) + c
-    mass = 0.5 * (g_l + g_r - s * (n_r - n_l))
-    return mass, 0.5 * (g_l * u_l + g_r * u_r + c * c * (n_l + n_r) - s * (g_r - g_l))
 
 
 @compiled(**FAST)
@@ -87,7 +64,8 @@ def axial_fluxes(here, behind, beyond, slopes, fluxes, start, stop, model):
     slopes: those of this column; they become those of the one behind, for which the one beyond is
     needed.
     """
-    c, speed = np.sqrt(model.ion_sound_squared), model.neutral_speed
+    c2, speed = model.ion_sound_squared, model.neutral_speed
+    c = np.sqrt(c2)
     for j in range(start, stop):
         a, p = half_slope(here.n[j], behind.n[j], beyond.n[j])
         b, q = half_slope(here.u_z[j], behind.u_z[j], beyond.u_z[j])
@@ -96,7 +74,7 @@ def axial_fluxes(here, behind, beyond, slopes, fluxes, start, stop, model):
         s_n, s_u, s_v, s_nn = quotients(a, p, b, q, d, r, e, s)
         flux, fluxes.z[j] = rusanov(
             here.n[j] + slopes.n[j], here.u_z[j] + slopes.u_z[j],
-            behind.n[j] - s_n, behind.u_z[j] - s_u, c,
+            behind.n[j] - s_n, behind.u_z[j] - s_u, c2, c,
         )  # fmt: skip
         fluxes.n[j] = flux
         fluxes.r[j] = flux * (here.u_r[j] + slopes.u_r[j] if flux > 0.0 else behind.u_r[j] - s_v)
@@ -107,11 +85,11 @@ def axial_fluxes(here, behind, beyond, slopes, fluxes, start, stop, model):
 @compiled(**FAST)
 def anode_fluxes(here, model, fluxes):
     """Ions leave at the Bohm speed or faster and return as neutrals, also injected here."""
-    c = np.sqrt(model.ion_sound_squared)
+    c2 = model.ion_sound_squared
     bohm = np.sqrt(model.electron_sound_squared * model.boundary_T_e_eV)
     for j in range(model.lower[0], model.upper[0]):
         n, u = here.n[j], here.u_z[j]
-        fluxes.n[j], fluxes.z[j] = rusanov(n, min(u, -bohm), n, u, c)
+        fluxes.n[j], fluxes.z[j] = rusanov(n, min(u, -bohm), n, u, c2, np.sqrt(c2))
         fluxes.r[j] = fluxes.n[j] * here.u_r[j]
         fluxes.neutrals[j] = model.neutral_inflow - fluxes.n[j]
 
@@ -171,7 +149,7 @@ def radial_fluxes(here, slopes, fluxes, start, stop, c, model):
         k, size = j - ONE, model.perimeter[j]
         n, r = rusanov(
             here.n[k] + slopes.n[k], here.u_r[k] + slopes.u_r[k],
-            here.n[j] - slopes.n[j], here.u_r[j] - slopes.u_r[j], c,
+            here.n[j] - slopes.n[j], here.u_r[j] - slopes.u_r[j], c * c, c,
         )  # fmt: skip
         z = n * (here.u_z[k] + slopes.u_z[k] if n > 0.0 else here.u_z[j] - slopes.u_z[j])
         fluxes.n[j], fluxes.z[j], fluxes.r[j] = size * n, size * z, size * r
