@@ -28,7 +28,7 @@ from ep2sindy.thruster.plane.state_kernels import PlaneModel, PlaneState, new_wo
 SAMPLE_S = 1.5e-6
 WARM_UP_S, DURATION_S = 3e-3, 10e-3  # half milliseconds differ by 7 % in amplitude
 GRIDS = ((41, 49), (62, 74), (82, 98))
-TARGET_CPU_S_PER_MS = {(41, 49): 8.0, (62, 74): 20.0}
+TARGET_CPU_S_PER_MS = {(41, 49): 4.0, (62, 74): 12.0}
 
 
 @dataclass(frozen=True)
