@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from ep2sindy.app.main import main
 from ep2sindy.app.runner import about, start_run, study_class
 from ep2sindy.app.schema import study_of
+from ep2sindy.report.document import Result
 from ep2sindy.report.page import page_html
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -67,10 +68,22 @@ def computed(config: DictConfig) -> Computed:
         study = study_of(study_class(config.study), config)
         outcome = study.compute(run)
         sections = outcome.sections()
+        result = outcome.in_short()
         run.screen.show(sections)
-        page = page_html(config.experiment, sections, {}, about(run, study))
+        page = page_html(config.experiment, sections, {}, about(run, study), result=result)
+        run.screen.conclude(result, run.folder.path)
         log = (run.folder.path / "run.log").read_text()
+    check_end(log, page, result, run.folder.path)
     return Computed(outcome, log, page, run.folder.path, run.warnings)
+
+
+def check_end(log: str, page: str, result: Result, folder: Path) -> None:
+    """The last lines say what was found, how to load it and what to open; the page begins so."""
+    last = "".join("".join(log.splitlines()[-14:]).split())  # long lines are broken
+    end = f"load: {result.load.format(folder)} open: {folder}/report.html"
+    assert last.endswith("".join(end.split()))
+    assert "".join(result.title.split()) in last
+    assert 0 < page.index('id="found"') < page.index("</section>") < page.index("<main>")
 
 
 def ended(*arguments: str) -> str:

@@ -151,6 +151,7 @@ def test_a_page_is_whole_and_readable_in_a_browser(breathing_run: Path, width_px
         "hovers": "document.querySelectorAll('figure svg title').length",
         "first": "document.querySelector('figure svg title').textContent",
         "equations": "document.querySelectorAll('math').length",
+        "ends": "document.querySelector('#found').getBoundingClientRect().bottom + scrollY",
         "flat": "[...document.querySelectorAll('math')].filter(m => !m.clientHeight && "
         "!m.getBoundingClientRect().height).length",
     }
@@ -163,6 +164,9 @@ def test_a_page_is_whole_and_readable_in_a_browser(breathing_run: Path, width_px
     assert found.answers["first"].startswith("n_i' of 0 terms: none\n1 - R2 = ")
     assert found.answers["equations"] > 20
     assert found.answers["flat"] == 0
+    assert found.answers["ends"] < (
+        900 if width_px > 700 else 2 * 900
+    )  # on the first screen or two
 
 
 def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) -> None:

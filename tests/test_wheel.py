@@ -62,7 +62,7 @@ def test_the_main_job_runs_from_an_empty_folder(program: Path, tmp_path: Path) -
     short = ["data.duration_s=0.3e-3", "data.warm_up_s=0.0", "data.n_cells=30"]
     result = run(program, "+exp=breathing", *short, "libraries.ionization.degree=2", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    folder = tmp_path / result.stdout.splitlines()[-1]
+    folder = tmp_path / Path(result.stdout.splitlines()[-1].removeprefix("open: ")).parent
     assert (folder / "summary.json").is_file()
     assert (folder / "report.html").is_file()
 

@@ -175,7 +175,6 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
             ended_early(error)
             return [str(error)]
         done(finished.folder, finished.headline)
-    say(str(finished.folder))
     return []
 
 

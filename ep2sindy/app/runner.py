@@ -28,7 +28,7 @@ from ep2sindy.report.folder import FORMATS, RunFolder
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import draw
 from ep2sindy.report.run import Run
-from ep2sindy.report.screen import Screen
+from ep2sindy.report.screen import PAGE, Screen
 from ep2sindy.report.tensorboard import Board
 from ep2sindy.runtime.progress import Bars, count_pieces
 from ep2sindy.studies.study import Experiment, Outcome
@@ -106,9 +106,14 @@ def list_studies() -> list[str]:
 
 
 def check_common(config: DictConfig) -> None:
-    """Raise ValueError for an invalid seed, name or folder."""
+    """Raise ValueError for an invalid seed, name or folder, or a verbose that is no truth value."""
     if not isinstance(config.seed, int) or isinstance(config.seed, bool) or config.seed < 0:
         raise ValueError(f"seed must be a whole number, zero or more: {config.seed!r} came")
+    if not isinstance(config.get("verbose", False), bool):
+        raise ValueError(
+            "verbose must be true, for all tables on the screen, or false, for what was found: "
+            f"{config.verbose!r} came"
+        )
     if not str(config.experiment).isidentifier():
         raise ValueError(
             f"experiment names a folder: letters, digits and _, not {config.experiment!r}"
@@ -196,7 +201,8 @@ def write(
     for name, table in outcome.tables().items():
         folder.write_table(name, table)
     sections, headline = outcome.sections(), dict(outcome.headline())
-    run.screen.show(sections)
+    result, verbose = outcome.in_short(), bool(run.settings.get("verbose"))
+    run.screen.show(sections, on_terminal=verbose)
     figures = {}
     for name, captioned in count_pieces(run.watch, outcome.figures().items(), "figure"):
         figure = captioned.draw()
@@ -205,10 +211,12 @@ def write(
         figures[name] = draw(figure, png, captioned.caption)
     run.board.equations({name: model.text() for name, model in models.items()})
     run.board.settings(hparams_of(run.settings, keys_of(type(study))), headline)
-    folder.write_text("report.html", page_html(run.title, sections, figures, about(run, study)))
+    page = page_html(run.title, sections, figures, about(run, study), result=result)
+    folder.write_text(PAGE, page)
     named = {"experiment": run.title, "seed": run.seed}
     named |= {"warnings": run.warnings} if run.warnings else {}
     folder.write_json("summary.json", named | outcome.summary() | {"headline": headline})
+    run.screen.conclude(result, folder.path)
     return headline
 
 

@@ -25,7 +25,7 @@ from ep2sindy.studies.source import Source, Step
 from ep2sindy.studies.study import Check, Deferred
 
 # Keys of conf/config.yaml that every run has.
-COMMON = ("experiment", "study", "seed", "output", "figures")
+COMMON = ("experiment", "study", "seed", "output", "figures", "verbose")
 # Fields of these types are made of the top-level groups listed with them: a method is five groups.
 # Recipe is the old name of AnyMethod, for one version more.
 GATHERED: Mapping[Any, Callable[..., Any]] = {

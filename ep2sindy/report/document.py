@@ -92,6 +92,21 @@ class Section:
     level: int = 2
 
 
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a run has found, in a few lines: the end of its screen, and the beginning of its page.
+
+    title: what was found, with the verdict on it. blocks: the model, law or map in short, and the
+    figures that say how good it is. load: Python expression that loads it, with `{}` for the run's
+    folder. picture: name of the figure that shows it; empty if none does.
+    """
+
+    title: str
+    blocks: Sequence[Block]
+    load: str = ""
+    picture: str = ""
+
+
 @dataclass(frozen=True)
 class Captioned:
     """A figure with its caption, drawn only when it is written."""

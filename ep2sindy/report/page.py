@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 from ep2sindy.library.equations import latex_name, sum_latex
 from ep2sindy.report.about import About
-from ep2sindy.report.document import Equation, Link, Section, Table, cell_text
+from ep2sindy.report.document import Equation, Link, Result, Section, Table, cell_text
 from ep2sindy.report.picture import Drawn
 
 if TYPE_CHECKING:
@@ -31,12 +31,13 @@ def page_html(
     figures: Mapping[str, Drawn],
     about: About | None = None,
     *,
+    result: Result | None = None,
     template: Path = TEMPLATES / "page.html",
 ) -> str:
     """HTML of all sections with their equations, tables and figures; the template escapes text.
 
-    template: a Jinja2 file that is given the title, the sections by part, the figures and `about`;
-    see the package's own.
+    result: what was found, which comes first. template: a Jinja2 file that is given the title, the
+    result, the sections by part, the figures and `about`; see the package's own.
     Raises ValueError for a template that is missing or invalid.
     """
     from jinja2 import TemplateError
@@ -51,7 +52,7 @@ def page_html(
         return (
             _environment(template)
             .get_template(template.name)
-            .render(title=title, parts=named, figures=figures, about=about)
+            .render(title=title, result=result, parts=named, figures=figures, about=about)
         )
     except TemplateError as error:
         raise ValueError(f"the template {template} cannot be filled: {error}") from error

@@ -13,9 +13,20 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, cell_text
+from ep2sindy.report.document import (
+    Block,
+    Equation,
+    Picture,
+    Result,
+    Section,
+    Table,
+    Text,
+    cell_text,
+)
 from ep2sindy.runtime.files import writing
 from ep2sindy.runtime.screen import on_screen, plain
+
+PAGE = "report.html"
 
 WIDTH = 120  # columns of run.log, and of output that goes to a file
 
@@ -45,26 +56,37 @@ class Screen:
         """Print text literally, without markup and emoji codes."""
         with on_screen(sys.stdout):
             _print(self._consoles[0], *renderables)
+        self._write(*renderables)
+
+    def _write(self, *renderables: RenderableType) -> None:
+        """Write to run.log only."""
         with writing(self._path):
             for console in self._consoles[1:]:
                 _print(console, *renderables)
             self._flush()
 
     def log(self, text: str) -> None:
-        """Write to run.log only."""
-        with writing(self._path):
-            for console in self._consoles[1:]:
-                _print(console, plain(text))
-            self._flush()
+        """Write text to run.log only."""
+        self._write(plain(text))
 
-    def show(self, sections: Sequence[Section]) -> None:
-        """Print every section that has content for the screen."""
+    def show(self, sections: Sequence[Section], *, on_terminal: bool = True) -> None:
+        """Print every section that has content for the screen; else into run.log alone."""
+        to = self.print if on_terminal else self._write
         for section in sections:
             shown = [each for block in section.blocks for each in renderables(block)]
             if shown:
-                self.print(_text(f"\n{section.title}", "bold"))
+                to(_text(f"\n{section.title}", "bold"))
                 for each in shown:
-                    self.print(each)
+                    to(each)
+
+    def conclude(self, result: Result, folder: Path) -> None:
+        """Print what was found, how to load it in Python, and the page to open."""
+        self.print(_text(f"\n{result.title}", "bold green"))
+        for block in result.blocks:
+            self.print(*renderables(block))
+        if result.load:
+            self.print(_text(f"load: {result.load.format(folder)}"))
+        self.print(_text(f"open: {folder / PAGE}"))
 
     def close(self) -> None:
         if self._log is not None:

@@ -36,6 +36,7 @@ from ep2sindy.report.document import (
     Block,
     Captioned,
     Picture,
+    Result,
     Section,
     Table,
     Text,
@@ -333,6 +334,22 @@ class Outcome:
                 draw = partial(attractor_figure, self.first.found, over_time=over_time)
                 found[name] = Captioned(draw, caption)
         return found
+
+    def in_short(self) -> Result:
+        """The variant that selects, or has on its front, the right equations most often."""
+        cells = self.cells
+        merit = "selected" if cells["selected"].notna().any() else "on_front"
+        counts = cells.dropna(subset=[merit]).groupby("variant", sort=False)[[merit, "n"]].sum()
+        share = counts[merit] / counts["n"]
+        words = {"selected": "selected exactly right", "on_front": "right on the front"}[merit]
+        lines = "; ".join(f"{name} {100 * value:.0f} %" for name, value in share.items())
+        return Result(
+            f"Found: {share.idxmax()}, {words} in {100 * share.max():.0f} % of "
+            f"{int(counts['n'].iloc[0])} realizations",
+            [Text(f"{words}: {lines}")],
+            load='pandas.read_csv("{}/tables/cells.csv")',
+            picture="benchmark",
+        )
 
     def sections(self) -> list[Section]:
         collected = (self.outcomes["group"] == COLLECTION).any()

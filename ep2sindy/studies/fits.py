@@ -28,7 +28,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import dominant_window
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Captioned, Section, Table, Text, pictures
+from ep2sindy.report.document import Captioned, Result, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.source import data_summary
@@ -38,6 +38,7 @@ from ep2sindy.studies.views import (
     PlotRange,
     coefficients,
     equation_sections,
+    found_model,
     intervals,
     model_summary,
     rollout_tables,
@@ -233,6 +234,19 @@ class Outcome:
         }
         more = run_figures(FIGURES, self.held, sample, self.shown)
         return {**runs, **more, **self.more_figures}
+
+    def in_short(self) -> Result:
+        """The model that runs nearest to the data over held-out time."""
+        errors = {n: each.from_sample.nrmse for n, each in self.judged.items()}
+        best = min(errors, key=lambda n: errors[n] if errors[n] == errors[n] else np.inf)
+        return found_model(
+            f"Found by {self.labels[best]}",
+            self.judged[best].from_sample,
+            file=best,
+            picture=next(iter(CAPTIONS)),
+            more=[Text(f"the nearest of {len(errors)} models that were fitted")],
+            where="held-out time",
+        )
 
     def sections(self) -> list[Section]:
         models = {label: each.model for label, each in self.labelled.items()}

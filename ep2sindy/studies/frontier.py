@@ -16,7 +16,7 @@ import pandas as pd
 
 from ep2sindy.figures.identified import frontier_figure
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
+from ep2sindy.report.document import Captioned, Picture, Result, Section, Table, Text
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.studies.benchmark import Variant, build_variants, merits
@@ -147,6 +147,16 @@ class Outcome:
 
     def figures(self) -> dict[str, Captioned]:
         return {"frontier": Captioned(partial(frontier_figure, self.points), FIGURE)}
+
+    def in_short(self) -> Result:
+        shares = self.points.groupby("variant", sort=False)["identified"].mean()
+        counts = "; ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items())
+        return Result(
+            f"Found: {shares.idxmax()} identifies {self.system.name} from the fewest samples",
+            [Text(f"identified, of all sampling rates and durations: {counts}")],
+            load='pandas.read_csv("{}/tables/points.csv")',
+            picture="frontier",
+        )
 
     def sections(self) -> list[Section]:
         too_few = self.points[self.points["reason"] != ""].groupby("variant", sort=False).size()

@@ -12,7 +12,7 @@ from scipy.special import ndtri
 from ep2sindy.figures.operating import frequency_scale
 from ep2sindy.forecasting.skill import AUTOREGRESSION, MODEL, ForecastSkill
 from ep2sindy.operating.choice import Branch, StructureTrial
-from ep2sindy.operating.fit import LeaveOneOut
+from ep2sindy.operating.fit import LeaveOneOut, error_statistics
 from ep2sindy.operating.map import Fate, MapPoint
 from ep2sindy.operating.records import OperatingRecord, point_label
 from ep2sindy.report.document import places
@@ -20,6 +20,7 @@ from ep2sindy.report.results import Metric, ResultTable, View, percent
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.studies.forecasts import skill_of
+from ep2sindy.studies.views import with_error
 
 Parameters = Mapping[str, float]
 
@@ -260,3 +261,54 @@ def agreement(
     quiet = [label for label, status in statuses.items() if status != Oscillation.OSCILLATING]
     right = [says[label] == (statuses[label] == Oscillation.OSCILLATING) for label in statuses]
     return sum(right), len(right), sum(not says[label] for label in quiet), len(quiet)
+
+
+def left_out_text(branch: Branch) -> str:
+    """How the law does at the points left out, in the median, and beside plain interpolation."""
+    found = error_statistics(branch.left_out)
+    smooth_f, smooth_amplitude = branch.smooth
+    text = percent(2)
+    most = f"nine in ten within {text(found['f_90'])}"
+    if not np.isfinite(found["f_90"]):
+        most = "more than one in ten do not oscillate"
+    return (
+        f"{found['n_lives']} of {found['n']} live, diverging: {found['diverging']}. Errors in the "
+        f"median: frequency {text(found['f_median'])} ({most}), the worst state's amplitude "
+        f"{text(found['amplitude_median'])} and waveform {places(found['waveform_median'], 3)}. "
+        "The records' own frequencies and amplitudes, interpolated by the same functions, miss by "
+        f"{text(float(np.median(smooth_f)))} and {text(float(np.median(smooth_amplitude)))} in the "
+        "median."
+    )
+
+
+def published_table(
+    thesis: Mapping[str, Sequence[Mapping[str, float]]], parameters: Sequence[str]
+) -> pd.DataFrame:
+    """One row per published value: parameters, fit, quantity, value.
+
+    thesis: fit -> points, each with its parameters and quantities.
+    Raises ValueError for a published point without all parameters, or with nothing else.
+    """
+    rows = []
+    for fit, points in thesis.items():
+        for point in points:
+            if not set(parameters) < set(point):
+                raise ValueError(
+                    f"thesis must give {list(parameters)} and quantities at every point, or be "
+                    f"null: {point} came"
+                )
+            at = {name: point[name] for name in parameters}
+            found = {name: value for name, value in point.items() if name not in at}
+            rows += [{**at, "fit": fit, "quantity": q, "value": v} for q, v in found.items()]
+    table = pd.DataFrame(rows, columns=[*parameters, "fit", "quantity", "value"])
+    return table.astype(dict.fromkeys(parameters, float))
+
+
+def number_text(value: float, reach: float) -> str:
+    """A number of a law with its error; one that is exact has none."""
+    return with_error(value, reach) if reach else f"{value:g}"
+
+
+def n_points(n: int) -> str:
+    """`1 point`, `3 points`."""
+    return f"{n} point" if n == 1 else f"{n} points"

@@ -19,18 +19,18 @@ from ep2sindy.figures.fronts import front_figure
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
+from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
-from ep2sindy.report.results import Metric, Metrics, ResultTable, View
+from ep2sindy.report.document import Block, Captioned, Result, Section, Table, Text, pictures
+from ep2sindy.report.results import ResultTable
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.smoothers import Smoother
-from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.balance import ModelBalance, inflows_of, model_balance
 from ep2sindy.studies.fits import split_in_time
 from ep2sindy.studies.forecasts import (
@@ -39,7 +39,7 @@ from ep2sindy.studies.forecasts import (
     forecast_section,
     skill_of,
 )
-from ep2sindy.studies.library_result import LibraryResult, refit, run_refitted
+from ep2sindy.studies.library_result import RECORDS, LibraryResult, frequencies, refit, run_refitted
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import Sampling, Source, balances_of, data_summary, zone_sizes_of
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
@@ -47,6 +47,7 @@ from ep2sindy.studies.views import (
     INTEGRATED,
     PlotRange,
     display_equation,
+    found_model,
     interval_table,
     rollout_tables,
     run_figures,
@@ -191,9 +192,6 @@ class Study:
             )
             for (name, library), rng in count_pieces(run.watch, pairs, "library")
         }
-        for name, result in results.items():
-            if result.discovery.misfit:
-                run.warn(f"{name}: {result.discovery.misfit}")
         files = [str(field.attrs.get("file", "")) for field in opened]
         estimated = [result.discovery.estimate for result in results.values()]
         with_hidden = [found.runs[0] for found in estimated if found and self.hidden]
@@ -400,8 +398,50 @@ class Outcome:
             drawn[f"forecast_{name}"] = forecast_picture(self.data, skill)
         return drawn
 
+    def in_short(self) -> Result:
+        """The living model, or the best of those that were run; and what its rows leave over."""
+        order = list(Verdict)
+        runs = {name: each.living.run for name, each in self.results.items() if each.living}
+        runs = runs or self.selected
+
+        def rank(name: str) -> tuple[int, float]:
+            nrmse = runs[name].nrmse
+            return order.index(runs[name].verdict), nrmse if nrmse == nrmse else np.inf
+
+        best = min(runs, key=rank)
+        is_living = best in self.living
+        drawn = self.figures()
+        shown = [f"free_run_{best}", "trajectories", *drawn]
+        return found_model(
+            f"Found with the library {best}",
+            runs[best],
+            file=f"{best}_living" if is_living else best,
+            picture=next((name for name in shown if name in drawn), ""),
+            more=[Text(text) for text in [self.left_over] if text],
+            where="held-out time" if is_living else "the record",
+        )
+
+    @property
+    def left_over(self) -> str:
+        """What the fits of derivatives or samples leave beyond noise, in all libraries."""
+        tests = [result.discovery.noise_test for result in self.results.values()]
+        ratios = [
+            left.chi_squared for t in tests for left in t.left.values() if not left.leaves_noise
+        ]
+        if not any(test.misfit for test in tests):
+            return ""
+        size = "more than noise"
+        if ratios:
+            ends = dict.fromkeys(f"{value:.3g}" for value in (min(ratios), max(ratios)))
+            size = f"{' to '.join(ends)} times the noise"
+        judge = "the free run above is what judges" if self.living else "judge them by free run"
+        return (
+            f"The equations fitted to derivatives leave {size}: a state or a term is missing "
+            f"there, so they have no intervals; {judge}."
+        )
+
     def sections(self) -> list[Section]:
-        found = [self._in_short()]
+        found = [self._of_all()]
         for name, result in self.results.items():
             found += result.sections(name, self.data)
         for name, result in self.results.items():
@@ -420,8 +460,8 @@ class Outcome:
             found.append(Section("Every record", [records]))
         return found
 
-    def _in_short(self) -> Section:
-        """The equations found and how they run, page only: the screen ends with them anyway."""
+    def _of_all(self) -> Section:
+        """The equations of all libraries and how they run, page only."""
         blocks: list[Block] = []
         for name, result in self.results.items():
             living, clock = result.living, self.data.clock
@@ -432,7 +472,7 @@ class Outcome:
                 blocks.append(display_equation(run.model, state, clock, on_screen=False))
             if living is None:
                 blocks += interval_table(run.model, clock=clock, page_only=True)
-        return Section("What was found", blocks)
+        return Section("All libraries", blocks)
 
     def summary(self) -> dict[str, Any]:
         models = {name: result.summary() for name, result in self.results.items()}
@@ -444,32 +484,3 @@ class Outcome:
         for name, result in self.results.items():
             scalars |= result.headline(name)
         return scalars | ResultTable(living, LIVING).headline()
-
-
-def frequencies(data: Trajectory) -> Metrics[FreeRun]:
-    """Metrics of models' runs against the data: frequencies by state, trajectory error, verdict."""
-    text = data.clock.frequency_text
-    f_data = {
-        state: dominant_frequency(data.t, column)
-        for state, column in zip(data.state_names, data.states.T, strict=True)
-    }
-
-    def both(run: FreeRun) -> dict[str, float]:
-        pairs = [(f"data_{s}", f"model_{s}", f, run.frequency_Hz[s]) for s, f in f_data.items()]
-        return {k: v for data, model, f, own in pairs for k, v in ((data, f), (model, own))}
-
-    return [
-        Metric("f", both, View.CSV, column="f_{}_Hz"),
-        Metric("f_data", lambda run: f_data, View.SCREEN, "frequency of the data", text),
-        Metric("f_model", lambda run: run.frequency_Hz, View.SCREEN, "of the model", text),
-        Metric("nrmse", lambda run: run.nrmse, View.SHOWN, format="{:.3f}"),
-        Metric("verdict", lambda run: run.text, View.SHOWN),
-    ]
-
-
-RECORDS: Metrics[tuple[str, str, FreeRun]] = [
-    Metric("model", lambda row: row[0], View.SHOWN),
-    Metric("record", lambda row: row[1], View.SHOWN),
-    Metric("nrmse", lambda row: row[2].nrmse, View.SHOWN, format="{:.3f}"),
-    Metric("verdict", lambda row: row[2].text, View.SHOWN),
-]

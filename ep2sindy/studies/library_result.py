@@ -26,6 +26,7 @@ from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.selection.rule import SystemSelection
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.balance import ModelBalance
 from ep2sindy.studies.living import Living
 
@@ -427,3 +428,32 @@ ESTIMATE: Metrics[Estimate] = [
     Metric("few", lambda found: found.few or None),
     Metric("rivals", lambda found: [facts(rival, RIVALS) for rival in found.rivals]),
 ]  # fmt: skip
+
+
+def frequencies(data: Trajectory) -> Metrics[FreeRun]:
+    """Metrics of models' runs against the data: frequencies by state, trajectory error, verdict."""
+    text = data.clock.frequency_text
+    f_data = {
+        state: dominant_frequency(data.t, column)
+        for state, column in zip(data.state_names, data.states.T, strict=True)
+    }
+
+    def both(run: FreeRun) -> dict[str, float]:
+        pairs = [(f"data_{s}", f"model_{s}", f, run.frequency_Hz[s]) for s, f in f_data.items()]
+        return {k: v for data, model, f, own in pairs for k, v in ((data, f), (model, own))}
+
+    return [
+        Metric("f", both, View.CSV, column="f_{}_Hz"),
+        Metric("f_data", lambda run: f_data, View.SCREEN, "frequency of the data", text),
+        Metric("f_model", lambda run: run.frequency_Hz, View.SCREEN, "of the model", text),
+        Metric("nrmse", lambda run: run.nrmse, View.SHOWN, format="{:.3f}"),
+        Metric("verdict", lambda run: run.text, View.SHOWN),
+    ]
+
+
+RECORDS: Metrics[tuple[str, str, FreeRun]] = [
+    Metric("model", lambda row: row[0], View.SHOWN),
+    Metric("record", lambda row: row[1], View.SHOWN),
+    Metric("nrmse", lambda row: row[2].nrmse, View.SHOWN, format="{:.3f}"),
+    Metric("verdict", lambda row: row[2].text, View.SHOWN),
+]

@@ -30,13 +30,25 @@ from ep2sindy.operating.quantities import REFINED, Fitted, PointResult, Quantity
 from ep2sindy.operating.quantity_law import ControlLaw, exponent, laws, trends
 from ep2sindy.operating.records import point_label
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
+from ep2sindy.report.document import (
+    Block,
+    Captioned,
+    Equation,
+    Picture,
+    Result,
+    Section,
+    Table,
+    Text,
+)
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.studies.fits import Terms, terms_of
+from ep2sindy.studies.law_tables import published_table
 from ep2sindy.studies.source import Source, open_points, point_sources
 from ep2sindy.studies.study import Check, Count
 from ep2sindy.studies.views import coefficients, with_error
+
+MOST_LAWS = 3  # on the screen
 
 INTERVALS = (
     "±: half the 95 % interval; of least squares by a moving-block bootstrap over time, of "
@@ -268,6 +280,19 @@ class Outcome:
         )
         return {"trends": Captioned(draw, f"{CAPTION}{published}{lines}.")}
 
+    def in_short(self) -> Result:
+        """How many points oscillate, and the laws of their coefficients."""
+        n_fitted = sum(bool(result.fits) for result in self.results)
+        laws = laws_table(self.laws)
+        plain = laws[~laws["fit"].str.endswith(REFINED)] if len(laws) else laws
+        shown = [f"{row['law']} ({_spoken(row['fit'])})" for row in plain.to_dict("records")]
+        return Result(
+            f"Found: {len(shown)} laws over {n_fitted} operating points that oscillate",
+            [*map(Text, shown[:MOST_LAWS]), Text("All are in tables/laws.csv.")],
+            load='pandas.read_csv("{}/tables/laws.csv")',
+            picture="trends",
+        )
+
     def sections(self) -> list[Section]:
         oscillating = [result for result in self.results if result.fits]
         cases, fits = (self.study.cases, self.study.fits) if oscillating else ((), ())
@@ -381,29 +406,6 @@ def _table(rows: pd.DataFrame, by: Sequence[str]) -> list[Block]:
     ends = (keys != keys.shift(-1)).any(axis=1)
     shown = rows.dropna(axis=1, how="all").round({"r2": 3, "exponent": 3})
     return [Table(shown, breaks=np.flatnonzero(ends)[:-1].tolist())]
-
-
-def published_table(
-    thesis: Mapping[str, Sequence[Mapping[str, float]]], parameters: Sequence[str]
-) -> pd.DataFrame:
-    """One row per published value: parameters, fit, quantity, value.
-
-    thesis: fit -> points, each with its parameters and quantities.
-    Raises ValueError for a published point without all parameters, or with nothing else.
-    """
-    rows = []
-    for fit, points in thesis.items():
-        for point in points:
-            if not set(parameters) < set(point):
-                raise ValueError(
-                    f"thesis must give {list(parameters)} and quantities at every point, or be "
-                    f"null: {point} came"
-                )
-            at = {name: point[name] for name in parameters}
-            found = {name: value for name, value in point.items() if name not in at}
-            rows += [{**at, "fit": fit, "quantity": q, "value": v} for q, v in found.items()]
-    table = pd.DataFrame(rows, columns=[*parameters, "fit", "quantity", "value"])
-    return table.astype(dict.fromkeys(parameters, float))
 
 
 def estimates_table(results: Sequence[PointResult], published: pd.DataFrame) -> pd.DataFrame:

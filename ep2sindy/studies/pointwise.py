@@ -31,7 +31,16 @@ from ep2sindy.figures.maps import MEDIANS, coefficient_maps, quality_maps, regim
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
+from ep2sindy.report.document import (
+    Block,
+    Captioned,
+    Equation,
+    Result,
+    Section,
+    Table,
+    Text,
+    pictures,
+)
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.files import fingerprint
 from ep2sindy.runtime.parallel import Workers
@@ -258,6 +267,25 @@ class Outcome:
         if (self.result["n_terms"] > 0).any():
             drawn["coefficients"] = partial(coefficient_maps, self.result, outline=self.outline)
         return {name: Captioned(draw, captions[name]) for name, draw in drawn.items()}
+
+    def in_short(self) -> Result:
+        """The regimes, with the equations of the largest."""
+        sizes = self.regimes.table.groupby("regime")["n_points"].first()
+        blocks: list[Block] = [Text(self._points_text())]
+        if len(sizes):
+            largest = int(sizes.to_numpy().argmax())
+            lead = f"in the largest, {sizes[largest]} points"
+            equations = self.regimes.equations(largest)
+            blocks += [
+                Equation(state, terms, lead=lead, on_screen=True)
+                for state, terms in equations.items()
+            ]
+        return Result(
+            f"Found: {regimes_text(self.regimes)}",
+            blocks,
+            load='xarray.open_dataset("{}/pointwise.nc")',
+            picture="regimes",
+        )
 
     def sections(self) -> list[Section]:
         about = [

@@ -35,12 +35,12 @@ from ep2sindy.report.document import (
     Captioned,
     Equation,
     Picture,
+    Result,
     Section,
     Table,
     Text,
-    places,
 )
-from ep2sindy.report.results import ResultTable, percent
+from ep2sindy.report.results import ResultTable
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.oscillation import Oscillation
@@ -52,7 +52,10 @@ from ep2sindy.studies.law_tables import (
     coefficients_table,
     laws_table,
     left_out_metrics,
+    left_out_text,
     map_table,
+    n_points,
+    number_text,
     points_table,
     skills_left_out,
     structure_metrics,
@@ -61,7 +64,6 @@ from ep2sindy.studies.law_tables import (
 from ep2sindy.studies.simulated import compile_kernels
 from ep2sindy.studies.source import Source, expand, open_points, point_sources
 from ep2sindy.studies.study import Check, Count, Counts, Positive
-from ep2sindy.studies.views import with_error
 
 INTERVALS = (
     "In SI units, and the parameters in theirs. ±: half the 95 % interval, from a sandwich with "
@@ -353,6 +355,27 @@ class Outcome:
         rows = self._tables[table]
         return rows[rows["branch"] == branch]
 
+    def in_short(self) -> Result:
+        """The law, how it does at points left out, and where it says that models oscillate."""
+        right, n, _, _ = agreement(self.branches, self.statuses)
+        name, branch = next(iter(self.branches.items()))
+        middle, numbers = most_central(branch.fit.records), error_statistics(branch.left_out)
+        model, drawn = branch.law.model_at(middle.parameters), self.figures()
+        return Result(
+            f"Found: a law over {', '.join(self.parameters)}; "
+            f"{numbers['n_lives']} of {numbers['n']} points left out live",
+            [
+                *(
+                    Equation(s, model.terms(s), lead=f"at {middle.label}", on_screen=True)
+                    for s in model.states
+                ),
+                Text(left_out_text(branch).partition(". The records")[0]),
+                Text(f"Oscillating or not, right at {right} of {n} points"),
+            ],
+            load=f'ep.operating.OperatingLaw.load("{{}}/law_{name}.json")',
+            picture=next(p for p in (f"map_{name}", "left_out") if p in drawn),
+        )
+
     def sections(self) -> list[Section]:
         return [
             Section("Operating points", self._point_lines()),
@@ -407,7 +430,7 @@ class Outcome:
             {
                 "coefficient": f"{state}: {term}",
                 **{
-                    r["function"]: _number(r["value"], 0.5 * (r["high"] - r["low"]))
+                    r["function"]: number_text(r["value"], 0.5 * (r["high"] - r["low"]))
                     for r in group.to_dict("records")
                 },
             }
@@ -425,7 +448,10 @@ class Outcome:
     def _left_out(self) -> list[Block]:
         points = self._points_left_out
         shown = sorted(points, key=lambda point: (point.branch, *point.record.parameters.values()))
-        lines: list[Block] = [Text(self._spread(name)) for name in self.branches]
+        lines: list[Block] = [
+            Text(f"{self._lead(name)}{left_out_text(branch)}")
+            for name, branch in self.branches.items()
+        ]
         for name, skills in self.skills.items():
             if typical := TypicalSkill.of(skills):
                 lines.append(Text(f"{self._lead(name)}{typical.text}."))
@@ -435,22 +461,6 @@ class Outcome:
 
     def _lead(self, name: str) -> str:
         return f"{name} cycle: " if len(self.members) > 1 else ""
-
-    def _spread(self, name: str) -> str:
-        found = error_statistics(self.branches[name].left_out)
-        smooth_f, smooth_amplitude = self.branches[name].smooth
-        text = percent(2)
-        most = f"nine in ten within {text(found['f_90'])}"
-        if not np.isfinite(found["f_90"]):
-            most = "more than one in ten do not oscillate"
-        return (
-            f"{self._lead(name)}{found['n_lives']} of {found['n']} live, diverging: "
-            f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} "
-            f"({most}), the worst state's amplitude {text(found['amplitude_median'])} and waveform "
-            f"{places(found['waveform_median'], 3)}. The records' own frequencies and amplitudes, "
-            f"interpolated by the same functions, miss by {text(float(np.median(smooth_f)))} "
-            f"and {text(float(np.median(smooth_amplitude)))} in the median."
-        )
 
     def _map(self) -> list[Block]:
         right, n, quiet_right, quiet = agreement(self.branches, self.statuses)
@@ -488,13 +498,3 @@ class Outcome:
         numbers = error_statistics(next(iter(self.branches.values())).left_out)
         first = {key: float(value) for key, value in numbers.items()}
         return {"n_points": float(len(self.points)), **first, "map_right": right / n}
-
-
-def _number(value: float, reach: float) -> str:
-    """A number of a law with its error; one that is exact has none."""
-    return with_error(value, reach) if reach else f"{value:g}"
-
-
-def n_points(n: int) -> str:
-    """`1 point`, `3 points`."""
-    return f"{n} point" if n == 1 else f"{n} points"

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Protocol, runtime_checkable
 import pandas as pd
 
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Captioned, Section
+from ep2sindy.report.document import Captioned, Result, Section
 from ep2sindy.report.run import Run
 
 
@@ -22,7 +22,8 @@ from ep2sindy.report.run import Run
 class Outcome(Protocol):
     """Everything that a study returns. The runner writes models and tables first, then the views.
 
-    figures: by name, drawn when they are written. sections: content of the terminal and the page.
+    figures: by name, drawn when they are written. in_short: what was found in five lines or so, the
+    end of the screen and the beginning of the page. sections: all else, for the page and run.log.
     summary: the findings, for `summary.json`; experiment and seed are added to it. headline: the
     few numbers by which runs are compared, in TensorBoard and in the index of a sweep. Their names
     do not depend on the findings.
@@ -33,6 +34,8 @@ class Outcome(Protocol):
     def tables(self) -> Mapping[str, pd.DataFrame]: ...
 
     def figures(self) -> Mapping[str, Captioned]: ...
+
+    def in_short(self) -> Result: ...
 
     def sections(self) -> Sequence[Section]: ...
 

@@ -28,7 +28,16 @@ from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import LimitCycle
-from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
+from ep2sindy.report.document import (
+    Block,
+    Captioned,
+    Equation,
+    Result,
+    Section,
+    Table,
+    Text,
+    pictures,
+)
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
@@ -54,6 +63,7 @@ from ep2sindy.studies.trace_hidden import HiddenStates, alone
 from ep2sindy.studies.views import (
     coefficients,
     display_equation,
+    found_model,
     interval_table,
     intervals,
     model_summary,
@@ -254,6 +264,18 @@ class Outcome:
         if self.skill is not None:
             pictures_of["forecast"] = forecast_picture(self.states, self.skill)
         return pictures_of
+
+    def in_short(self) -> Result:
+        where = "held-out record" if self.is_held_out else "whole record, too short to hold out"
+        misfit = self.found.misfit
+        return found_model(
+            f"Found from {self.signal.name}",
+            self.run,
+            file="trace",
+            picture="free_run",
+            more=[Text(misfit, warning=True)] if misfit else [],
+            where=f"the {where}",
+        )
 
     def sections(self) -> list[Section]:
         forecasts = [] if self.skill is None else [forecast_section(self.skill)]

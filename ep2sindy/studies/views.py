@@ -13,9 +13,10 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
 from ep2sindy.library.units import SECONDS, Clock, unit_product
+from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Block, Captioned, Equation, Section, Table
+from ep2sindy.report.document import Block, Captioned, Equation, Result, Section, Table, Text
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.studies.study import PositiveOrAll
 
@@ -201,6 +202,55 @@ def equation_sections(
         )
         for name, model in models.items()
     ]
+
+
+def found_model(
+    found: str, run: FreeRun, *, file: str, picture: str, more: Sequence[Block] = (), where: str
+) -> Result:
+    """A model as what was found: its equations, and how it runs.
+
+    found: how it was found, such as `Found from I_d`. file: its name among the run's models. where:
+    what it was run over, in words, such as `held-out time`.
+    """
+    clock, model = run.rollout.clock, run.model
+    return Result(
+        f"{found}: a model that {_fate(run)}",
+        [
+            *(display_equation(model, state, clock) for state in model.states),
+            Text(f"run freely from one sample over {where}: {run_words(run)}"),
+            *more,
+        ],
+        load=f'ep.load_model("{{}}/models/{file}.json")',
+        picture=picture,
+    )
+
+
+def _fate(run: FreeRun) -> str:
+    """`lives`, `has the wrong cycle`, `diverges after 12 us`."""
+    words = {Verdict.WRONG_CYCLE: "has the wrong cycle", Verdict.UNLIKE: "is unlike the data"}
+    words |= {Verdict.ALIKE: "is like the data"}
+    return words.get(run.verdict, run.text)
+
+
+def run_words(run: FreeRun) -> str:
+    """Frequency, amplitude and waveform of a run beside the data's, as far as they are known."""
+    found = []
+    frequency_Hz = run.frequency_Hz[run.model.states[0]]
+    if np.isfinite(frequency_Hz):
+        error = f" ({100 * run.f_error:+.2g} %)" if np.isfinite(run.f_error) else ""
+        found.append(f"frequency {run.rollout.clock.frequency_text(frequency_Hz)}{error}")
+    ratios = [value for value in run.amplitude_ratio.values() if np.isfinite(value)]
+    if ratios:
+        ends = dict.fromkeys(f"{value:.3g}" for value in (min(ratios), max(ratios)))
+        found.append(f"amplitude {' to '.join(ends)} times the data's")
+    waveforms = [value for value in run.waveform_error.values() if np.isfinite(value)]
+    if waveforms:
+        found.append(f"waveform within {max(waveforms):.2g} standard deviations")
+    if np.isfinite(run.periods):
+        found.append(f"in phase for {round(run.periods)} periods")
+    if not found and np.isfinite(run.nrmse):
+        found.append(f"{run.nrmse:.2g} standard deviations off")
+    return "; ".join(found) or run.text
 
 
 def with_error(value: float, reach: float) -> str:

@@ -22,7 +22,7 @@ from ep2sindy.regression.front import fit_support
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.weak import Weak
-from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures
+from ep2sindy.report.document import Captioned, Equation, Result, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
@@ -35,6 +35,7 @@ from ep2sindy.studies.views import (
     PlotRange,
     coefficients,
     equation_sections,
+    found_model,
     intervals,
     model_summary,
     rollout_tables,
@@ -307,6 +308,22 @@ class Outcome:
         models = {name: fitted.integrated for name, fitted in self.labelled.items()}
         shown, smoother = self.study.figures, self.study.formulation.smoother
         return run_figures(FIGURES, self.data, models, shown, smoother=smoother)
+
+    def in_short(self) -> Result:
+        """The setting whose model runs nearest to the data."""
+        errors = {name: fitted.integrated.nrmse for name, fitted in self.fitted.items()}
+        best = min(errors, key=lambda n: errors[n] if errors[n] == errors[n] else np.inf)
+        fitted = self.fitted[best]
+        scores = ", ".join(f"{state}' {value:.3f}" for state, value in fitted.r2.items())
+        more = [Text(f"R2 of its rows: {scores}; the nearest of {len(errors)} settings")]
+        return found_model(
+            f"Found with {_label(best, fitted)}",
+            fitted.integrated,
+            file=best,
+            picture="trajectories",
+            more=more,
+            where="the record",
+        )
 
     def sections(self) -> list[Section]:
         published = [

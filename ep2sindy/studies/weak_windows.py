@@ -20,7 +20,7 @@ from ep2sindy.figures.windows import window_error_figure
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
+from ep2sindy.report.document import Captioned, Picture, Result, Section, Table, Text
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Positive
@@ -158,6 +158,20 @@ class Outcome:
         references = [name for name, setting in self.settings.items() if not setting.boxes]
         draw = partial(window_error_figure, self.cells, references=references)
         return {"errors": Captioned(draw, FIGURE)}
+
+    def in_short(self) -> Result:
+        """The windows of least error at each level of noise."""
+        least = self.cells.loc[self.cells.groupby("noise")["error_mean"].idxmin()]
+        lines = [
+            f"{100 * row['noise']:g} % noise: {row['setting']}, {100 * row['error_mean']:.2g} %"
+            for row in least.to_dict("records")
+        ]
+        return Result(
+            f"Found: the windows of least error for {self.system.name}",
+            [Text(f"error of the coefficients in the mean: {'; '.join(lines)}")],
+            load='pandas.read_csv("{}/tables/cells.csv")',
+            picture="errors",
+        )
 
     def sections(self) -> list[Section]:
         system = self.system

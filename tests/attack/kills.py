@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.attack.left import amiss, contents, half_written, living, lost
+from tests.attack.left import amiss, contents, half_written, living, lost, run_folder
 from tests.attack.results import Outcome
 from tests.attack.runs import LIMIT_S, RUNS, Reference, reference, start
 
@@ -58,7 +58,7 @@ def ended_well(run: subprocess.Popen[str], place: Path, whole: Reference) -> lis
         return [f"hang: over {LIMIT_S:g} s {living(place)}"]
     if run.returncode:
         return [f"status {run.returncode}: {errors[-300:]}"]
-    return amiss(contents(place), Path(printed.splitlines()[-1]), whole.files) + living(place)
+    return amiss(contents(place), run_folder(printed), whole.files) + living(place)
 
 
 def paired(folder: Path, seed: int) -> Callable[[str], Outcome]:
@@ -79,7 +79,7 @@ def paired(folder: Path, seed: int) -> Callable[[str], Outcome]:
         wrong += half_written(place, after, before, whole.files)
         for status, printed, errors in ends:
             if status == 0:
-                wrong += amiss(after, Path(printed.splitlines()[-1]), whole.files)
+                wrong += amiss(after, run_folder(printed), whole.files)
             elif status != 1 or not errors.startswith("error: "):
                 wrong.append(f"status {status}: {errors}")
         kind = "both ended" if all(status == 0 for status, _, _ in ends) else "one refused"

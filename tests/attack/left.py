@@ -23,6 +23,11 @@ OF_TIME_ALONE = ("tensorboard/",)  # the time of every event; host and process i
 GROWS = ("run.log", *OF_TIME_ALONE)  # written line by line, so that it may be watched
 
 
+def run_folder(printed: str) -> Path:
+    """Folder of a run, from the last line that it prints: `open: FOLDER/report.html`."""
+    return Path(printed.splitlines()[-1].removeprefix("open: ")).parent
+
+
 def contents(folder: Path) -> dict[str, str]:
     """A digest of every file that the runs of a folder made, by its path."""
     found = {}

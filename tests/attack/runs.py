@@ -14,7 +14,7 @@ from functools import cache, partial
 from pathlib import Path
 
 from ep2sindy.runtime.threads import NUMBERS
-from tests.attack.left import EARLIER, contents, finished
+from tests.attack.left import EARLIER, contents, finished, run_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 600.0  # for a run of seconds on a machine that does other things
@@ -141,7 +141,7 @@ def _undisturbed(name: str, place: Path) -> tuple[float, dict[str, str]]:
     if run.returncode:
         raise SystemExit(f"{name} must run when nothing disturbs it:\n{errors}")
     duration_s = time.monotonic() - begin
-    return duration_s, finished(contents(place), Path(printed.splitlines()[-1]))
+    return duration_s, finished(contents(place), run_folder(printed))
 
 
 def _code(name: str) -> str:

@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.attack.left import amiss, contents, half_written, is_temporary, living, lost
+from tests.attack.left import amiss, contents, half_written, is_temporary, living, lost, run_folder
 from tests.attack.results import Outcome
 from tests.attack.runs import LIMIT_S, RUNS, Reference, reference, start
 
@@ -39,7 +39,7 @@ def failing(folder: Path) -> Callable[[str], Outcome]:
         failed = Path((place / "failed").read_text()).relative_to(place)
         wrong = living(place)
         if run.returncode == 0:
-            wrong += amiss(contents(place), Path(printed.splitlines()[-1]), whole.files)
+            wrong += amiss(contents(place), run_folder(printed), whole.files)
             return ("swallowed" if wrong else "recovered"), f"{failed} {wrong or ''}"
         wrong += _left(place, before, whole)
         if wrong:
