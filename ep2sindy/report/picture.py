@@ -18,6 +18,8 @@ SVG = "http://www.w3.org/2000/svg"
 PX_PER_INCH = 96  # of a page: letters have the same size in all figures
 DPI = 150  # of figures in a run folder
 
+LARGE = 100_000  # bytes of a PNG from which a page holds it in 256 colours, a third of its size
+
 
 @dataclass(frozen=True)
 class Drawn:
@@ -39,7 +41,19 @@ def draw(figure: Figure, png: bytes, caption: str) -> Drawn:
     speaks = figure.findobj(lambda artist: (artist.get_gid() or "").startswith(HOVER))
     if speaks:
         return Drawn(svg_html(figure), f"{caption} Marks say more under a mouse.", width)
-    return Drawn(png_html(png), caption, width)
+    return Drawn(png_html(in_few_colours(png) if len(png) > LARGE else png), caption, width)
+
+
+def in_few_colours(png: bytes) -> bytes:
+    """The image in its 256 most distinct colours, of which others differ by a few percent."""
+    from PIL import Image  # comes with matplotlib
+
+    buffer = BytesIO()
+    image = Image.open(BytesIO(png)).convert("RGB")
+    image.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        buffer, "PNG"
+    )
+    return buffer.getvalue()
 
 
 def read_png(path: Path, caption: str) -> Drawn:

@@ -152,8 +152,8 @@ class Outcome:
         shares = self.points.groupby("variant", sort=False)["identified"].mean()
         counts = "; ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items())
         return Result(
-            f"Found: {shares.idxmax()} identifies {self.system.name} from the fewest samples",
-            [Text(f"identified, of all sampling rates and durations: {counts}")],
+            f"Found: {shares.idxmax()} identifies {self.system.name} in most places",
+            [Text(f"identified, as a share of all sampling rates and durations: {counts}")],
             load='pandas.read_csv("{}/tables/points.csv")',
             picture="frontier",
         )

@@ -129,8 +129,6 @@ class Study:
         best = choose_attempt(attempts)
         if isinstance(best.chosen.embedding, Rate | Delays) and (hint := lost_mean(signal)):
             run.warn(hint)
-        if best.found.misfit:
-            run.warn(best.found.misfit)
         with run.progress(None, "", "forecasts, free run and limit cycle"):
             return evaluate(signal, n_fitted, best, attempts)
 
