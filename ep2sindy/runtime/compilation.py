@@ -51,10 +51,10 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
     if function is None:
         return lambda each: compiled(each, **options)
     _listen()
-    # Wrappers for calls from Python would be compiled too, and no one calls an inner kernel there.
-    inner = function.__name__.startswith("_")
-    wrappers: dict[str, Any] = {"no_cfunc_wrapper": True, "no_cpython_wrapper": inner}
-    kernel: Any = numba.njit(cache=True, nogil=True, **(wrappers | options))(function)
+    # No one calls kernels from C, and a wrapper for that would be compiled for each.
+    kernel: Any = numba.njit(cache=True, nogil=True, **({"no_cfunc_wrapper": True} | options))(
+        function
+    )
     kept: Any = getattr(kernel._cache, "_cache_file", None)
     if hasattr(kept, "_source_stamp"):  # numba has no public interface for this
         kept._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
