@@ -248,7 +248,7 @@ def _check_derivative(
     name: str, value: Values, derivative: Values, low: float, high: float
 ) -> None:
     """Compare a derivative with central differences at a few points of the domain."""
-    points = _points(low, high)
+    points = points_inside(low, high)
     step = 1e-5 * np.minimum(1.0, np.minimum(points - low, high - points))
     try:
         with np.errstate(all="ignore"):
@@ -277,7 +277,7 @@ def _check_derivative(
         )
 
 
-def _points(low: float, high: float) -> Float[np.ndarray, " points"]:
+def points_inside(low: float, high: float) -> Float[np.ndarray, " points"]:
     """A few points inside an interval."""
     if np.isfinite(low) and np.isfinite(high):
         return low + (high - low) * np.array([0.21, 0.47, 0.83])

@@ -141,13 +141,8 @@ def simulate(
     limit_s: float,
 ) -> Rollout:
     """Integrate a model freely from one state; see `SparseModel.simulate`."""
-    times, start = np.asarray(t, dtype=np.float64), np.asarray(x0, dtype=np.float64)
-    if start.shape != (len(model.states),) or not np.isfinite(start).all():
-        came = f"shape {start.shape}" if start.size > 8 else f"{start.tolist()}"
-        raise ValueError(
-            f"x0 must give a finite number for each of {list(model.states)}: {came} came; the "
-            "order is simulate(t, x0)"
-        )
+    times = np.asarray(t, dtype=np.float64)
+    start = check_start(model.states, x0, hint="; the order is simulate(t, x0)")
     check_time(times)
     drive, samples = driven(model.inputs, inputs, times)
     library, coef = terms_in_use(model.library, model.coef)
@@ -169,6 +164,19 @@ def simulate(
         rtol=rtol,
         limit_s=limit_s,
     )
+
+
+def check_start(
+    states: Sequence[str], x0: ArrayLike, *, hint: str = ""
+) -> Float[np.ndarray, " n_states"]:
+    """Return x0 as an array; raise ValueError unless it has a finite number for each state."""
+    start = np.asarray(x0, dtype=np.float64)
+    if start.shape != (len(states),) or not np.isfinite(start).all():
+        came = f"shape {start.shape}" if start.size > 8 else f"{start.tolist()}"
+        raise ValueError(
+            f"x0 must give a finite number for each of {list(states)}: {came} came{hint}"
+        )
+    return start
 
 
 def _integrate(
