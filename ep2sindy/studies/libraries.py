@@ -417,27 +417,24 @@ class Outcome:
             runs[best],
             file=f"{best}_living" if is_living else best,
             picture=next((name for name in shown if name in drawn), ""),
-            more=[Text(text) for text in [self.left_over] if text],
+            more=[text] if (text := self._left_over(best)) else [],
             where="held-out time" if is_living else "the record",
         )
 
-    @property
-    def left_over(self) -> str:
-        """What the fits of derivatives or samples leave beyond noise, in all libraries."""
+    def _left_over(self, best: str) -> Text | None:
+        """What the best equations, or those fitted to derivatives, leave beyond noise."""
         tests = [result.discovery.noise_test for result in self.results.values()]
-        ratios = [
-            left.chi_squared for t in tests for left in t.left.values() if not left.leaves_noise
-        ]
+        if best not in self.living:
+            misfit = self.results[best].discovery.misfit
+            return Text(misfit, warning=True) if misfit else None
         if not any(test.misfit for test in tests):
-            return ""
-        size = "more than noise"
-        if ratios:
-            ends = dict.fromkeys(f"{value:.3g}" for value in (min(ratios), max(ratios)))
-            size = f"{' to '.join(ends)} times the noise"
-        judge = "the free run above is what judges" if self.living else "judge them by free run"
-        return (
+            return None
+        left = [each for test in tests for each in test.left.values() if not each.leaves_noise]
+        ratios = sorted(each.chi_squared for each in left)
+        size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times the noise" if left else "more than noise"
+        return Text(
             f"The equations fitted to derivatives leave {size}: a state or a term is missing "
-            f"there, so they have no intervals; {judge}."
+            "there, so they have no intervals; the free run above is what judges."
         )
 
     def sections(self) -> list[Section]:
