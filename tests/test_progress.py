@@ -289,7 +289,7 @@ def test_a_run_tells_what_it_reads_computes_and_draws(
     monkeypatch.setattr("ep2sindy.app.runner.draw", lambda figure, png, caption: "")
     monkeypatch.setattr("ep2sindy.report.folder.RunFolder.write_figure", lambda *_: b"")
     monkeypatch.setattr("ep2sindy.report.tensorboard.Board.image", lambda *_: None)
-    monkeypatch.setattr("ep2sindy.app.runner.page_html", lambda *_: "")
+    monkeypatch.setattr("ep2sindy.app.runner.page_html", lambda *_, **__: "")
     with start_run(config) as run:
         watched = Run(**{name: getattr(run, name) for name in run.__dict__} | {"watch": watch})
         outcome = study.compute(watched)

@@ -22,7 +22,7 @@ from matplotlib.typing import ColorType
 from ep2sindy.data.fields import SPACE, cell_edges
 from ep2sindy.discovery.regimes import Regimes
 from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, legend_above, make_panels, unit_text
-from ep2sindy.library.equations import latex_derivative, latex_term_name, sum_latex
+from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.thruster.parameters import Thruster
 
 ABSENT = "#dcdcdc"  # colour of a term not in the equation; a masked cell stays white
@@ -185,14 +185,13 @@ def _draw_signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.Da
 def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
     """Map of the regimes, their certainty, and the terms active in each.
 
-    Coefficients are medians over the regime's points that have the term, so no single point need
-    have the equation as written. White marks points without equations.
+    White marks points without equations.
     """
-    n, n_equations = regimes.n_regimes, regimes.table["equation"].nunique()
+    n = regimes.n_regimes
     colours = MORE_COLOURS if n <= len(MORE_COLOURS) else colormaps["tab20"](np.arange(n) % 20)
     flat = len(space_axes(regimes.labels)) == 1
     n_columns = 1 if flat or n <= 3 else 2
-    text = -(-n // n_columns) * (0.15 * (1 + n_equations) + 0.12)
+    text = 0.2 * -(-n // n_columns)
     shape = (2, 1) if flat else (1, 2)
     size = _fit_size(regimes.labels, *shape, scale=2.2, extra=text + 0.75)
     heights = [1, 2] if flat else None
@@ -206,20 +205,20 @@ def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
     finish_panels(axes, regimes.labels, outline)
     figure.legend(
         handles=[Patch(color=colours[k], label=_regime_text(regimes, k)) for k in range(n)],
-        loc="outside lower center", ncols=n_columns, frameon=False, fontsize=8, labelspacing=0.8,
-        handlelength=1.2, title=MEDIANS, title_fontsize=9,
+        loc="outside lower center", ncols=n_columns, frameon=False, fontsize=9, handlelength=1.2,
+        title="terms that act in each regime", title_fontsize=9,
     )  # fmt: skip
     return figure
 
 
 def _regime_text(regimes: Regimes, regime: int) -> str:
+    """`0, 8 points: n_i' n_i u_iz; n_n' 1, n_n`, with each name typeset."""
     row = regimes.table[regimes.table["regime"] == regime].iloc[0]
-    equations = "\n".join(
-        f"${latex_derivative(state)} = {sum_latex(terms)}$"
+    acting = "; ".join(
+        f"${latex_derivative(state)}$: {', '.join(f'${latex_term_name(t)}$' for t in terms) or '0'}"
         for state, terms in regimes.equations(regime).items()
     )
-    points = f"{row['n_points']} point{'s' if row['n_points'] > 1 else ''}"
-    return f"regime {regime}: {points}, confidence {row['confidence']:.2f}\n{equations}"
+    return f"{regime}, {row['n_points']} point{'s' if row['n_points'] > 1 else ''}: {acting}"
 
 
 def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:
