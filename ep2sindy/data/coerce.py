@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -28,12 +28,13 @@ from ep2sindy.runtime.values import check_kind, check_list
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray as xr
 
 
 TIMES = ("time", "t", "time_s", "t_s")  # accepted names of a table's time column, in seconds
 
 if TYPE_CHECKING:
-    Run: TypeAlias = Trajectory | pd.DataFrame | tuple[np.ndarray, np.ndarray]
+    Run: TypeAlias = Trajectory | pd.DataFrame | xr.Dataset | tuple[np.ndarray, np.ndarray]
     Runs: TypeAlias = Run | Sequence[Run]
 else:  # pandas is not imported only to name a type
     Run = Runs = object
@@ -44,10 +45,12 @@ def trajectories_of(runs: object, *, partial: bool = False) -> list[Trajectory]:
 
     A run is one of the following.
     - A Trajectory.
-    - A pandas DataFrame with a column of times in s (`time`, `t`, `time_s`, `t_s`) or an index of
-      that name. Its other columns are states; columns labelled by a number are called x0, x1 ...
+    - A pandas DataFrame with a column of times in s (`time`, `t`, `time_s`, `t_s`), an index of
+      that name, or an index of dates. Its other columns are states; columns labelled by a number
+      are called x0, x1 ...
       Rows that hold a NaN are left out, with the warning `MissingSamples`; if partial, only those
       that hold nothing else, and in the others the state counts as missing.
+    - An xarray Dataset whose one dimension is time, such as `Trajectory.to_xarray` gives.
     - A tuple (t, x) of times (samples,) and states (samples,) or (samples, n_states). The states
       are then called x, or x0, x1 ...
     A tuple of runs, none of them an array, is a list of them.
@@ -64,9 +67,17 @@ def trajectories_of(runs: object, *, partial: bool = False) -> list[Trajectory]:
 
 def is_run(value: object) -> bool:
     """True if a value holds samples together with their times: a trajectory or a table."""
-    pandas = sys.modules.get("pandas")  # a caller who has a table has imported pandas already
-    table = pandas is not None and isinstance(value, pandas.DataFrame)
-    return table or isinstance(value, Trajectory)
+    return isinstance(value, Trajectory) or _is_of(value, "pandas", "DataFrame") or _is_field(value)
+
+
+def _is_of(value: object, package: str, name: str) -> bool:
+    """Whether a value is of a class of a package, which its maker has imported already."""
+    module = sys.modules.get(package)
+    return module is not None and isinstance(value, getattr(module, name))
+
+
+def _is_field(value: object) -> bool:
+    return _is_of(value, "xarray", "Dataset")
 
 
 def trajectory_of(run: object) -> Trajectory:
@@ -77,18 +88,35 @@ def trajectory_of(run: object) -> Trajectory:
 def _trajectory(run: object, which: str, partial: bool) -> Trajectory:
     if isinstance(run, Trajectory):
         return run
+    if _is_field(run):
+        return _from_field(cast("xr.Dataset", run), partial)
     if is_run(run):
         return _from_table(cast("pd.DataFrame", run), partial)
     if isinstance(run, tuple) and len(run) == 2:
         return _from_arrays(*run)
     raise ValueError(
-        f"a run must be a Trajectory, a pandas DataFrame with a time column, or a tuple (t, x) of "
-        f"arrays; run{which} is of type {type(run).__name__}; several runs go into a list"
+        "a run must be a Trajectory, a pandas DataFrame with a time column, an xarray Dataset over "
+        f"time, or a tuple (t, x) of arrays; run{which} is of type {type(run).__name__}; several "
+        "runs go into a list"
     )
 
 
+def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
+    if tuple(field.dims) != ("time",):
+        raise ValueError(
+            "a Dataset must have the dimension time alone to be a run: "
+            f"{list(map(str, field.dims))} came; average over a zone, ep.zone_average(field, "
+            "ep.Zone(), states=[...]), or take a point, ep.point_samples(field, ...)"
+        )
+    run = _from_table(field.to_dataframe()[list(field.data_vars)], partial)
+    units = {str(name): str(each.attrs.get("units", "1")) for name, each in field.data_vars.items()}
+    return replace(run, units=units)
+
+
 def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
-    if table.index.name in TIMES:
+    if table.index.name in TIMES or table.index.dtype.kind in "mM":
+        if table.index.name not in TIMES:
+            table = table.rename_axis(index=TIMES[0])  # dates are times, whatever they are called
         table = table.reset_index(allow_duplicates=True)
     table = table.set_axis([_word(name) for name in table.columns], axis="columns")
     if not table.columns.is_unique:

@@ -8,15 +8,21 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.export import as_dataframe, as_dataset
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.names import check_state
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_list, read_only
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 
 def read_only_mapping(values: dict) -> MappingProxyType:
@@ -190,6 +196,21 @@ class Trajectory:
             clock=self.clock,
             missing=None if self.missing is None else self.missing[start:stop],
         )
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """States, then inputs, as columns in SI over an index `time` in s; NaN where missing."""
+        return as_dataframe(self.t, self._as_measured(), self.names)
+
+    def to_xarray(self) -> xr.Dataset:
+        """States and inputs over `time` in s, with their units as attributes; NaN where missing."""
+        return as_dataset(self.t, self._as_measured(), self.names, self.units)
+
+    def _as_measured(self) -> Float[np.ndarray, "samples variables"]:
+        """All values, NaN in place of those that were interpolated."""
+        values = self.values.copy()
+        if self.missing is not None:
+            values[:, : len(self.state_names)][self.missing] = np.nan
+        return values
 
     def __repr__(self) -> str:
         table = text_table(["", "", "unit", "from", "to"], self._ranges())

@@ -136,7 +136,7 @@ def discover(
     method = method_given(method, recipe) or TrajectorySearch()
     trajectories = trajectories_of(runs, partial=True)
     names = dict.fromkeys([*trajectories[0].names, *hidden])
-    library = polynomial(list(names), degree=2) if library is None else library
+    library = polynomial(list(names)) if library is None else library
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")
     task = Task(trajectories, library, relations_of(relations), terms or {}, roles, hidden)
     rng, watch = np.random.default_rng(seed), as_progress(progress)

@@ -306,7 +306,7 @@ def named_terms(variables: Sequence[str], names: Sequence[str]) -> Library:
 def polynomial(
     variables: Sequence[str],
     *,
-    degree: int,
+    degree: int = 2,
     products: Sequence[str] = (),
     functions: Sequence[str] = (),
     function_degree: int = 1,

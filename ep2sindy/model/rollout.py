@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ep2sindy.data.export import as_dataframe, as_dataset
 from ep2sindy.data.numbers import band_of
 from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.inputs import Drive, driven, spline, spline_pieces
 from ep2sindy.model.solve import Border, Products, Rates, edges_of, solve_stages
+from ep2sindy.runtime.screen import one_screen, text_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 
 @runtime_checkable
@@ -81,6 +87,31 @@ class Rollout:
     def lasted_text(self) -> str:
         """Duration of the run, such as `182 µs`; empty if nothing was integrated."""
         return self.clock.duration_text(self.lasted_s) if self.lasted_s else ""
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """States, then inputs, as columns in SI over an index `time` in s."""
+        return as_dataframe(self.t, self._values, [*self.state_names, *self.input_names])
+
+    def to_xarray(self) -> xr.Dataset:
+        """States and inputs over the coordinate `time` in s, with their units."""
+        names = [*self.state_names, *self.input_names]
+        return as_dataset(self.t, self._values, names, self.units)
+
+    @property
+    def _values(self) -> Float[np.ndarray, "samples variables"]:
+        return np.concatenate([self.states, self.inputs], axis=1)
+
+    def __repr__(self) -> str:
+        end = f"stopped: {self.message}" if self.diverged else "ran to the end"
+        head = f"Rollout: {len(self.t)} samples over {self.lasted_text or 'no time'}, {end}" + (
+            "" if self.draws is None else f"; {len(self.draws)} draws"
+        )
+        ranges = [
+            [name, self.units.get(name, "1"), f"{column.min():.4g}", f"{column.max():.4g}"]
+            for name, column in zip(self.state_names, self.states.T, strict=True)
+            if len(column)
+        ]
+        return one_screen([head, *text_table(["state", "unit", "from", "to"], ranges)])
 
     def trajectory(self, *, label: str = "") -> Trajectory:
         """The samples of the run as a Trajectory, up to where it ended.

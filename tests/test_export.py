@@ -1,0 +1,85 @@
+"""Samples as tables and Datasets, and back: what comes from pandas and xarray is a run at once."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import ep2sindy as ep
+from ep2sindy.data.coerce import trajectories_of
+
+RUN = ep.Trajectory(
+    t=np.linspace(0.0, 2e-3, 40),
+    states=np.stack([np.sin(np.arange(40)), np.cos(np.arange(40))], axis=1),
+    state_names=["n_i", "n_n"],
+    inputs=np.arange(40.0)[:, None],
+    input_names=["V"],
+    units={"n_i": "m^-3", "n_n": "m^-3", "V": "V"},
+)
+
+
+def test_a_table_holds_the_samples_over_time_in_seconds() -> None:
+    table = RUN.to_dataframe()
+    assert list(table.columns) == ["n_i", "n_n", "V"]
+    assert table.index.name == "time"
+    np.testing.assert_array_equal(table.index, RUN.t)
+    np.testing.assert_array_equal(table.to_numpy(), RUN.values)
+    (again,) = trajectories_of(table.drop(columns="V"))
+    np.testing.assert_array_equal(again.states, RUN.states)
+
+
+def test_a_dataset_keeps_units_and_comes_back_as_a_run() -> None:
+    data = RUN.to_xarray()
+    assert {str(n): v.attrs["units"] for n, v in data.variables.items()} == {
+        "n_i": "m^-3",
+        "n_n": "m^-3",
+        "V": "V",
+        "time": "s",
+    }
+    (again,) = trajectories_of(data[["n_i", "n_n"]])
+    np.testing.assert_array_equal(again.states, RUN.states)
+    np.testing.assert_array_equal(again.t, RUN.t)
+    assert dict(again.units) == {"n_i": "m^-3", "n_n": "m^-3"}
+    few = data[["n_i", "n_n"]].isel(time=slice(0, 30))
+    assert ep.discover([few, data[["n_i", "n_n"]].isel(time=slice(30, 40))]).model.states
+
+
+def test_what_was_not_measured_is_nan() -> None:
+    states = RUN.states.copy()
+    missing = np.zeros(states.shape, dtype=bool)
+    missing[3:6, 1] = True
+    run = ep.Trajectory(RUN.t, states, ["x", "y"], missing=missing)
+    assert np.isnan(run.to_dataframe()["y"]).to_numpy().nonzero()[0].tolist() == [3, 4, 5]
+    assert int(np.isnan(run.to_xarray()["y"]).sum()) == 3
+    assert not np.isnan(run.to_dataframe()["x"]).any()
+
+
+@pytest.mark.parametrize("name", [None, "when", "time"])
+def test_an_index_of_dates_is_time(name: str | None) -> None:
+    dates = pd.date_range("2026-01-01", periods=40, freq="6h", name=name)
+    table = pd.DataFrame(RUN.states, index=dates, columns=["x", "y"])
+    (run,) = trajectories_of(table)
+    assert run.state_names == ("x", "y")
+    assert run.t[:3].tolist() == [0.0, 21600.0, 43200.0]
+
+
+def test_a_field_over_a_grid_is_no_run_and_the_error_says_what_makes_one() -> None:
+    field = xr.Dataset({"n_i": (("time", "z"), np.ones((5, 3)))}, coords={"time": np.arange(5.0)})
+    with pytest.raises(ValueError, match=r"dimension time alone .*'time', 'z'.* ep.zone_average"):
+        trajectories_of(field)
+
+
+def test_a_rollout_is_a_table_and_prints_in_a_screen() -> None:
+    model = ep.lotka_volterra().model
+    run = model.simulate(np.linspace(0.0, 20.0, 500), [1.0, 1.0])
+    table, data = run.to_dataframe(), run.to_xarray()
+    np.testing.assert_array_equal(table[["x", "y"]].to_numpy(), run.states)
+    np.testing.assert_array_equal(data["x"], run.states[:, 0])
+    lines = repr(run).splitlines()
+    assert lines[0].startswith("Rollout: 500 samples over 20 s, ran to the end")
+    assert len(lines) == 4
+    assert max(map(len, lines)) <= 100
+
+
+def test_a_library_has_degree_two_unless_another_is_asked_for() -> None:
+    assert ep.polynomial(["x", "y"]).names == ep.polynomial(["x", "y"], degree=2).names
