@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import pandas
+import xarray
 from hydra import compose, initialize_config_dir
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
+import ep2sindy as ep
 from ep2sindy.app.main import main
 from ep2sindy.app.runner import about, start_run, study_class
 from ep2sindy.app.schema import study_of
@@ -83,6 +86,8 @@ def check_end(log: str, page: str, result: Result, folder: Path) -> None:
     end = f"load: {result.load.format(folder)} open: {folder}/report.html"
     assert last.endswith("".join(end.split()))
     assert "".join(result.title.split()) in last
+    loader = result.load.partition("(")[0]  # such as `ep.SparseModel.load`
+    assert callable(eval(loader, {"ep": ep, "pandas": pandas, "xarray": xarray})), loader
     assert 0 < page.index('id="found"') < page.index("</section>") < page.index("<main>")
 
 

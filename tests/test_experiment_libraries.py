@@ -8,6 +8,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf.errors import OmegaConfBaseException
 
+import ep2sindy as ep
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.choice import NoiseTest
@@ -138,6 +139,10 @@ def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path)
     assert any(name.startswith("tensorboard/events") for name in files)
     model = SparseModel.load(folder / "models" / "simple.json")
     assert model.terms("n_i") == summary_of(folder)["models"]["simple"]["equations"]["n_i"]["terms"]
+    said = "".join((folder / "run.log").read_text().split())
+    load = re.search(r"load:(.*?)open:", said)
+    assert load is not None
+    assert eval(load[1], {"ep": ep}).states == model.states
     page = (folder / "report.html").read_text()
     for image in ("data", "phase", "front_simple"):
         assert f'id="figure-{image}"' in page

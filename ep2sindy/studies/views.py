@@ -220,7 +220,7 @@ def found_model(
             Text(f"run freely from one sample over {where}: {run_words(run)}"),
             *more,
         ],
-        load=f'ep.load_model("{{}}/models/{file}.json")',
+        load=f'ep.SparseModel.load("{{}}/models/{file}.json")',
         picture=picture,
     )
 
