@@ -69,6 +69,13 @@ def test_a_field_over_a_grid_is_no_run_and_the_error_says_what_makes_one() -> No
         trajectories_of(field)
 
 
+@pytest.mark.parametrize("coords", [{}, {"time": ("time", np.arange(5.0), {"units": "ms"})}])
+def test_a_dataset_without_times_in_seconds_is_refused(coords: dict) -> None:
+    field = xr.Dataset({"x": ("time", np.arange(5.0) ** 2)}, coords=coords)
+    with pytest.raises(ValueError, match="needs a coordinate time in s, .*: (none|ms) came"):
+        trajectories_of(field)
+
+
 def test_a_rollout_is_a_table_and_prints_in_a_screen() -> None:
     model = ep.lotka_volterra().model
     run = model.simulate(np.linspace(0.0, 20.0, 500), [1.0, 1.0])

@@ -14,7 +14,7 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from ep2sindy.runtime import parallel
-from ep2sindy.runtime.parallel import Dask, Loky, Serial, Workers, collect, rows_in_order
+from ep2sindy.runtime.parallel import Dask, Loky, Serial, Workers, collect, rows_in_order, run_alike
 
 PATIENCE_S = 300.0  # for what comes at once on an idle machine: only what hangs is longer
 PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
@@ -191,11 +191,11 @@ def test_pieces_that_are_alike_leave_this_process_only_where_it_pays(
 ) -> None:
     for start_s, leave in ((-1.0, True), (np.inf, False)):
         monkeypatch.setattr(parallel, "START_S", start_s)
-        found = dict(Loky(n_jobs=2).run_alike(process_of, [5, 6, 7], 3))
+        found = dict(run_alike(Loky(n_jobs=2), process_of, [5, 6, 7], 3))
         assert [found[k][0] for k in range(3)] == [5, 6, 7]
         assert found[0][1] == os.getpid()
         assert all((found[k][1] != os.getpid()) == leave for k in (1, 2))
-    assert not list(Loky(n_jobs=2).run_alike(process_of, [], 0))
+    assert not list(run_alike(Loky(n_jobs=2), process_of, [], 0))
 
 
 def test_a_number_of_processes_must_be_one() -> None:

@@ -108,6 +108,12 @@ def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
             f"{list(map(str, field.dims))} came; average over a zone, ep.zone_average(field, "
             "ep.Zone(), states=[...]), or take a point, ep.point_samples(field, ...)"
         )
+    if "time" not in field.coords or field["time"].attrs.get("units", "s") != "s":
+        unit = field["time"].attrs.get("units", "no unit") if "time" in field.coords else "none"
+        raise ValueError(
+            f"a Dataset that is a run needs a coordinate time in s, or of dates: {unit} came; set "
+            "field.assign_coords(time=...)"
+        )
     run = _from_table(field.to_dataframe()[list(field.data_vars)], partial)
     units = {str(name): str(each.attrs.get("units", "1")) for name, each in field.data_vars.items()}
     return replace(run, units=units)

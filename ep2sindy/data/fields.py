@@ -97,7 +97,10 @@ def grid_points(field: xr.Dataset, axis: str) -> Float[np.ndarray, " points"]:
 
 
 def grid_values(array: xr.DataArray) -> Float[np.ndarray, "time z r"]:
-    """Load a variable as (time, z, r) in float64; a dimension it lacks has length 1."""
+    """Load a variable as (time, z, r) in float64; a dimension it lacks has length 1.
+
+    The array may be the variable's own: copy it before writing into it.
+    """
     missing = [axis for axis in DIMS if axis not in array.dims]
     return array.expand_dims(missing).transpose(*DIMS).values.astype(np.float64, copy=False)
 

@@ -190,10 +190,8 @@ class CompiledPoints:
     def _rows(self, values: Float[np.ndarray, "variables samples"]) -> PointRows:
         """Scaled rows at a point, and their Gram matrices."""
         n_states, library = len(self.search.states), self.search.library
-        known, rates = (
-            np.empty((len(values) + 1, values.shape[1])),
-            np.empty_like(values[:n_states]),
-        )
+        known = np.empty((len(values) + 1, values.shape[1]))
+        rates = np.empty_like(values[:n_states])
         smooth(values, *self.filter.smoothing, known[:-1])
         differentiate(known[:n_states], self.filter.difference, rates)
         known[-1] = 1.0
@@ -358,10 +356,10 @@ def compiled_points(search: PointSearch, t: Float[np.ndarray, " samples"]) -> Co
             return None
         test = form.split.held_out(len(t), rng)
         weights, kept = method.bootstraps.draw_groups(int((~test).sum()), all_terms, rng)
-        filter = _filter(form.smoother, t)
+        weights_in_time = _filter(form.smoother, t)
     except ValueError:  # which `Regression` explains at every point
         return None
-    if filter is None:
+    if weights_in_time is None:
         return None
     padded = np.pad(weights, ((0, 0), (1, 1)))
     weights_of_rows = np.ascontiguousarray(weights.T)
@@ -370,7 +368,7 @@ def compiled_points(search: PointSearch, t: Float[np.ndarray, " samples"]) -> Co
     )
     rows = np.flatnonzero(~test), np.flatnonzero(test)
     return CompiledPoints(
-        search, rule, proposer.max_terms, form.smooth_library, filter, *rows, draws
+        search, rule, proposer.max_terms, form.smooth_library, weights_in_time, *rows, draws
     )
 
 

@@ -30,7 +30,7 @@ from ep2sindy.discovery.point_search import (
 )
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.files import WriteError, fingerprint, replacing, sweep
-from ep2sindy.runtime.parallel import Loky, Workers
+from ep2sindy.runtime.parallel import Workers, run_alike
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 
 NO_FIT = "no_fit"
@@ -118,11 +118,7 @@ def _search_blocks(
             yield block, done
     function = partial(_search_block, search)
     pieces = (part.isel(block.slices) for block in waiting)  # once read, none is held
-    if isinstance(workers, Loky):
-        results = workers.run_alike(function, pieces, len(waiting))
-    else:
-        results = workers.run(function, pieces)
-    for number, done in results:
+    for number, done in run_alike(workers, function, pieces, len(waiting)):
         if kept:
             kept.write(waiting[number], done)
         yield waiting[number], done

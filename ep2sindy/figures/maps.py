@@ -38,7 +38,6 @@ SHARE_COLOURS = colormaps["viridis"]
 COUNT_COLOURS = ListedColormap(colormaps["Purples"](np.linspace(0.35, 1.0, 256)))
 
 HALF = r"the same at $R^2 \times$ share of bootstraps = 0.5"
-MEDIANS = "terms that act, with medians over the regime's points that have them"
 
 
 def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:

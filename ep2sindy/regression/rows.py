@@ -154,11 +154,11 @@ class RegressionRows:
     @cached_property
     def train_rows(self) -> Float[np.ndarray, "train columns"]:
         """Scaled terms, then scaled targets, of the training rows."""
-        return self._scaled(~self.test)
+        return self._scaled(np.flatnonzero(~self.test))
 
     @cached_property
     def test_rows(self) -> Float[np.ndarray, "test columns"]:
-        return self._scaled(self.test)
+        return self._scaled(np.flatnonzero(self.test))
 
     @property
     def n_train(self) -> int:
@@ -172,9 +172,8 @@ class RegressionRows:
             yield self.test_rows if test else self.train_rows
             return
         for start in range(0, len(self.test), MOST_ROWS):
-            here = np.zeros_like(self.test)
-            here[start : start + MOST_ROWS] = self.test[start : start + MOST_ROWS] == test
-            yield self._scaled(here)
+            here = self.test[start : start + MOST_ROWS] == test
+            yield self._scaled(start + np.flatnonzero(here))
 
     @property
     def train_theta(self) -> Float[np.ndarray, "train terms"]:
@@ -249,8 +248,8 @@ class RegressionRows:
     def _scaled_target(self, equation: int, rows: np.ndarray) -> Float[np.ndarray, " _"]:
         return self.target[rows, equation] / self.target_scale[equation]
 
-    def _scaled(self, rows: np.ndarray) -> np.ndarray:
-        index, n = np.flatnonzero(rows), len(self.library)
+    def _scaled(self, index: Int[np.ndarray, " _"]) -> Float[np.ndarray, "_ columns"]:
+        n = len(self.library)
         # Filled in place: concatenating narrow arrays side by side takes ten times as long.
         scaled = np.empty((len(index), n + len(self.equations)))
         scaled[:, :n], scaled[:, n:] = self.theta[index], self.target[index]

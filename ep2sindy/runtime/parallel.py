@@ -133,9 +133,7 @@ ONE_BY_ONE = Serial()
 class Loky:
     """Workers in parallel processes on this machine.
 
-    n_jobs: their number; -1 for one per core. Where pieces are alike and many, as the blocks of a
-    pointwise study, the first is done in this process, and the others too if they would take less
-    time than the start of the processes.
+    n_jobs: their number; -1 for one per core.
     """
 
     n_jobs: int = -1
@@ -146,18 +144,6 @@ class Loky:
                 f"n_jobs must be a number of processes, or -1 for one per core: {self.n_jobs!r} "
                 "came"
             )
-
-    def run_alike(
-        self, function: Callable[[Any], Any], pieces: Iterable[Any], n_pieces: int
-    ) -> Iterator[tuple[int, Any]]:
-        """Run pieces of which each takes about as long; processes start only if they save time."""
-        waiting, begin = iter(pieces), perf_counter()
-        yield from ONE_BY_ONE.run(function, islice(waiting, 1))
-        rest_s = (perf_counter() - begin) * (n_pieces - 1)
-        pays = rest_s * (1.0 - 1.0 / effective_n_jobs(self.n_jobs)) > START_S
-        workers: Workers = self if pays else ONE_BY_ONE
-        for number, result in workers.run(function, waiting):
-            yield number + 1, result
 
     def run(
         self, function: Callable[[Any], Any], pieces: Iterable[Any]
@@ -171,6 +157,26 @@ class Loky:
         with isolate_children():  # all workers start here, before the first result is requested
             found = workers(delayed(_in_worker)(code, os.getpid(), each) for each in numbered)
         yield from found
+
+
+def run_alike(
+    workers: Workers, function: Callable[[Any], Any], pieces: Iterable[Any], n_pieces: int
+) -> Iterator[tuple[int, Any]]:
+    """Run pieces of which each takes about as long; processes start only if they save time.
+
+    The first piece is then done in this process, and the others too if they would take less time
+    than the start of the processes.
+    """
+    waiting = iter(pieces)
+    n_first = 1 if isinstance(workers, Loky) else 0
+    begin = perf_counter()
+    yield from ONE_BY_ONE.run(function, islice(waiting, n_first))
+    if isinstance(workers, Loky):
+        rest_s = (perf_counter() - begin) * (n_pieces - 1)
+        saved_s = rest_s * (1.0 - 1.0 / effective_n_jobs(workers.n_jobs))
+        workers = workers if saved_s > START_S else ONE_BY_ONE
+    for number, result in workers.run(function, waiting):
+        yield number + n_first, result
 
 
 @dataclass(frozen=True)

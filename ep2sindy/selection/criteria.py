@@ -133,10 +133,9 @@ def _criterion(
     masks = np.array([np.isin(problem.term_names, c.terms) for c in front.candidates])
     equation = problem.equations.index(front.equation)
     theta, target = problem.train_theta, problem.train_target(equation)
-    leader = -1
+    terms, leader = [candidate.terms for candidate in front.candidates], -1
     for _ in range(MAX_ROUNDS):
         squares, coef = _fits(theta, target, masks)
-        terms = [candidate.terms for candidate in front.candidates]
         fits = Fits(problem.library, terms, front.errors, squares, len(target))
         scores = _criterion_of(fits, penalty, coarsening, FLOOR * (target @ target))
         if problem.noisy is None or int(np.argmin(scores)) == leader:

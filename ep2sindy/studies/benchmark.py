@@ -343,9 +343,10 @@ class Outcome:
         share = counts[merit] / counts["n"]
         words = {"selected": "selected exactly right", "on_front": "right on the front"}[merit]
         lines = "; ".join(f"{name} {100 * value:.0f} %" for name, value in share.items())
+        best = str(share.idxmax())
         return Result(
-            f"Found: {share.idxmax()}, {words} in {100 * share.max():.0f} % of "
-            f"{int(counts['n'].iloc[0])} realizations",
+            f"Found: {best}, {words} in {100 * share[best]:.0f} % of {int(counts['n'][best])} "
+            "realizations",
             [Text(f"{words}: {lines}")],
             load='pandas.read_csv("{}/tables/cells.csv")',
             picture="benchmark",

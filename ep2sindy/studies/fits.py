@@ -36,6 +36,7 @@ from ep2sindy.studies.study import Check
 from ep2sindy.studies.views import (
     MARKS,
     PlotRange,
+    best_run,
     coefficients,
     equation_sections,
     found_model,
@@ -236,15 +237,14 @@ class Outcome:
         return {**runs, **more, **self.more_figures}
 
     def in_short(self) -> Result:
-        """The model that runs nearest to the data over held-out time."""
-        errors = {n: each.from_sample.nrmse for n, each in self.judged.items()}
-        best = min(errors, key=lambda n: errors[n] if errors[n] == errors[n] else np.inf)
+        """The model that runs best over held-out time."""
+        best = best_run({name: each.from_sample for name, each in self.judged.items()})
         return found_model(
             f"Found by {self.labels[best]}",
             self.judged[best].from_sample,
             file=best,
             picture=next(iter(CAPTIONS)),
-            more=[Text(f"the nearest of {len(errors)} models that were fitted")],
+            more=[Text(f"the best of {len(self.judged)} models that were fitted")],
             where="held-out time",
         )
 

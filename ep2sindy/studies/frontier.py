@@ -152,8 +152,9 @@ class Outcome:
         shares = self.points.groupby("variant", sort=False)["identified"].mean()
         counts = "; ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items())
         return Result(
-            f"Found: {shares.idxmax()} identifies {self.system.name} in most places",
-            [Text(f"identified, as a share of all sampling rates and durations: {counts}")],
+            f"Found: {shares.idxmax()} identifies {self.system.name} at the largest share of "
+            f"sampling rates and durations, {100 * shares.max():.0f} %",
+            [Text(f"identified: {counts}")],
             load='pandas.read_csv("{}/tables/points.csv")',
             picture="frontier",
         )

@@ -19,7 +19,6 @@ from ep2sindy.figures.fronts import front_figure
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.bootstraps import Bootstraps
@@ -46,6 +45,7 @@ from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
 from ep2sindy.studies.views import (
     INTEGRATED,
     PlotRange,
+    best_run,
     display_equation,
     found_model,
     interval_table,
@@ -400,15 +400,9 @@ class Outcome:
 
     def in_short(self) -> Result:
         """The living model, or the best of those that were run; and what its rows leave over."""
-        order = list(Verdict)
         runs = {name: each.living.run for name, each in self.results.items() if each.living}
         runs = runs or self.selected
-
-        def rank(name: str) -> tuple[int, float]:
-            nrmse = runs[name].nrmse
-            return order.index(runs[name].verdict), nrmse if nrmse == nrmse else np.inf
-
-        best = min(runs, key=rank)
+        best = best_run(runs)
         is_living = best in self.living
         drawn = self.figures()
         shown = [f"free_run_{best}", "trajectories", *drawn]

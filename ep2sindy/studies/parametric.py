@@ -287,8 +287,8 @@ class Outcome:
         plain = laws[~laws["fit"].str.endswith(REFINED)] if len(laws) else laws
         shown = [f"{row['law']} ({_spoken(row['fit'])})" for row in plain.to_dict("records")]
         return Result(
-            f"Found: {len(shown)} laws over {n_fitted} operating points that oscillate",
-            [*map(Text, shown[:MOST_LAWS]), Text("All are in tables/laws.csv.")],
+            f"Found: {len(shown) or 'no'} laws over {n_fitted} operating points that oscillate",
+            list(map(Text, shown[:MOST_LAWS])),
             load='pandas.read_csv("{}/tables/laws.csv")',
             picture="trends",
         )

@@ -27,7 +27,7 @@ from ep2sindy.discovery.pointwise import (
 )
 from ep2sindy.discovery.recipe import regression_of
 from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes, spread
-from ep2sindy.figures.maps import MEDIANS, coefficient_maps, quality_maps, regime_map
+from ep2sindy.figures.maps import coefficient_maps, quality_maps, regime_map
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
 from ep2sindy.model.model import SparseModel
@@ -291,7 +291,8 @@ class Outcome:
         about = [
             Text(f"{regimes_text(self.regimes)}."),
             Text(
-                f"Below, {MEDIANS}: not every point has all of them, and coefficients spread as "
+                "Below, terms that act, with medians over the regime's points that have them: not "
+                "every point has all of them, and coefficients spread as "
                 "the tables say, which hold the other terms as well (those that act are bold)."
             ),
             Text(

@@ -204,6 +204,17 @@ def equation_sections(
     ]
 
 
+def best_run(runs: Mapping[str, FreeRun]) -> str:
+    """Name of the run of the best verdict, and of these the nearest to the data."""
+    order = list(Verdict)
+
+    def rank(name: str) -> tuple[int, float]:
+        nrmse = runs[name].nrmse
+        return order.index(runs[name].verdict), nrmse if np.isfinite(nrmse) else np.inf
+
+    return min(runs, key=rank)
+
+
 def found_model(
     found: str, run: FreeRun, *, file: str, picture: str, more: Sequence[Block] = (), where: str
 ) -> Result:

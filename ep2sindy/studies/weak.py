@@ -33,6 +33,7 @@ from ep2sindy.studies.study import Coefficients, Count, Counts, Deferred, Positi
 from ep2sindy.studies.views import (
     INTEGRATED,
     PlotRange,
+    best_run,
     coefficients,
     equation_sections,
     found_model,
@@ -310,12 +311,11 @@ class Outcome:
         return run_figures(FIGURES, self.data, models, shown, smoother=smoother)
 
     def in_short(self) -> Result:
-        """The setting whose model runs nearest to the data."""
-        errors = {name: fitted.integrated.nrmse for name, fitted in self.fitted.items()}
-        best = min(errors, key=lambda n: errors[n] if errors[n] == errors[n] else np.inf)
+        """The setting whose model runs best over the record."""
+        best = best_run({name: fitted.integrated for name, fitted in self.fitted.items()})
         fitted = self.fitted[best]
         scores = ", ".join(f"{state}' {value:.3f}" for state, value in fitted.r2.items())
-        more = [Text(f"R2 of its rows: {scores}; the nearest of {len(errors)} settings")]
+        more = [Text(f"R2 of its rows: {scores}; the best of {len(self.fitted)} settings")]
         return found_model(
             f"Found with {_label(best, fitted)}",
             fitted.integrated,
