@@ -16,9 +16,9 @@ JUDGED = {
 }  # fmt: skip
 
 
-def constrained(path: Path, output: Path, *overrides: str) -> DictConfig:
-    """`+exp=constrained` on a file."""
-    on_file = [
+def on_file(path: Path, output: Path) -> list[str]:
+    """Overrides that run `+exp=constrained` on a file."""
+    return [
         "+exp=constrained",
         "data=file",
         f"data.path={path}",
@@ -26,7 +26,10 @@ def constrained(path: Path, output: Path, *overrides: str) -> DictConfig:
         "data.variables.u_iz.name=u_iz",
         f"output={output}",
     ]
-    return programs.composed(*on_file, *overrides)
+
+
+def constrained(path: Path, output: Path, *overrides: str) -> DictConfig:
+    return programs.composed(*on_file(path, output), *overrides)
 
 
 def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_path: Path) -> None:

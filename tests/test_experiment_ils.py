@@ -21,9 +21,9 @@ EXACT = {
 }
 
 
-def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
-    """`+exp=ils` on a file, at toy size."""
-    toy = [
+def toy(path: Path, output: Path) -> list[str]:
+    """Overrides that run `+exp=ils` on a file, at toy size."""
+    return [
         "+exp=ils",
         "data=file",
         f"data.path={path}",
@@ -38,7 +38,10 @@ def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
         "weak.test_functions.n_windows=500",
         "weak.test_functions.n_points=50",
     ]
-    return programs.composed(*toy, *overrides)
+
+
+def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
+    return programs.composed(*toy(path, output), *overrides)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,5 @@
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ep2sindy.app.runner import run_config, start_run
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
-from ep2sindy.figures.trends import trends_figure
+from ep2sindy.figures.trends import PUBLISHED, trends_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.quantity_law import control_law
@@ -138,8 +139,9 @@ def test_tables_figures_and_page_are_written(folder: Path) -> None:
     assert set(supports["search"]) == {"given", "each point", "all points"}
     for name in ("points", "laws", "coefficients"):
         assert len(pd.read_csv(folder / "tables" / f"{name}.csv"))
-    assert (folder / "figures" / "trends.png").is_file()
-    assert 'id="figure-trends"' in (folder / "report.html").read_text()
+    for case in ("free", "constrained"):
+        assert (folder / "figures" / f"trends_{case}.png").is_file()
+        assert f'id="figure-trends_{case}"' in (folder / "report.html").read_text()
     assert list((folder / "tensorboard").iterdir())
     page, log = (folder / "report.html").read_text(), (folder / "run.log").read_text()
     assert ">free (thesis)</h3>" in page
@@ -147,7 +149,9 @@ def test_tables_figures_and_page_are_written(folder: Path) -> None:
     assert ">Model: constrained, at V_D_V = 200, mdot_mg_s = 5</h2>" in page
     assert "<th>L_m</th><th>g_inj (m<sup>−3</sup> s<sup>−1</sup>)</th><th>eps</th>" in page
     assert "V_D_V=200, mdot_mg_s=5: oscillating" in log
-    assert "Control laws, with the RMS error at points left out" in log
+    assert "Errors are RMS over the mean, at points left out" in " ".join(log.split())
+    assert "<math>" not in (folder / "tables" / "laws.csv").read_text()
+    assert "<msub><mi>L</mi><mrow><mi>m</mi></mrow></msub><mo>=</mo>" in page  # a law
 
 
 @pytest.mark.parametrize(
@@ -192,63 +196,50 @@ def breathing_file(path: Path, *, amplitude: float, dt_s: float, rate: float = 1
     return path
 
 
-def test_a_figure_tells_fits_by_colour_and_quantities_by_marker_and_line() -> None:
-    rows = [
-        {"V": V, "m": m, "fit": "free", "quantity": q, "value": V * m, "low": 0.0, "high": 1e4}
-        for V, m in ((200.0, 5.0), (300.0, 2.0), (300.0, 5.0), (400.0, 5.0))
+def trend_table(kinds: Sequence[str]) -> pd.DataFrame:
+    """Estimates of two quantities at five points by each of these kinds."""
+    return pd.DataFrame(
+        {"V": V, "m": m, "kind": kind, "quantity": q, "value": V * m, "low": 0.0, "high": 1e4}
+        for kind in kinds
+        for V, m in ((200.0, 5.0), (300.0, 2.0), (300.0, 4.0), (300.0, 5.0), (400.0, 5.0))
         for q in ("a", "b")
-    ]
-    estimates = pd.DataFrame(rows)
-    parameters = estimates[estimates["quantity"] == "a"][["V", "m"]].to_numpy()
+    )
+
+
+def test_a_figure_has_a_panel_per_quantity_and_trend_and_a_colour_per_kind() -> None:
+    estimates = trend_table(["least squares", "refined", PUBLISHED])
+    parameters = estimates[["V", "m"]].to_numpy()
     law = control_law(parameters.prod(axis=1), parameters, polynomial(["V", "m"], degree=2))
     figure = trends_figure(
         estimates,
-        estimates.iloc[:0],
-        {"free": {"a": law, "b": law}},
-        panels=[["a", "b"]],
+        {"a": law},
         trends=[("m", {"V": 300.0}), ("V", {"m": 5.0})],
-        labels={"V": "$V_D$ (V)"},
+        labels={"V": "$V_D$ (V)", PUBLISHED: "thesis"},
     )
-    left, right = figure.axes
-    assert (left.get_title(), right.get_title()) == ("$V_D$ = 300 V", "$m$ = 5")
-    for ax in (left, right):
-        laws = [line for line in ax.lines if len(line.get_xdata()) == 60]
-        assert [line.get_linestyle() for line in laws] == ["-", "--"]
+    panels = np.array(figure.axes).reshape(2, 2)
+    assert [ax.get_title() for ax in panels[0]] == ["$a$", "$b$"]
+    assert [ax.get_ylabel() for ax in panels[:, 0]] == ["at $V_D$ = 300 V", "at $m$ = 5"]
+    assert [ax.get_xlabel() for ax in panels[:, 1]] == ["$m$", "$V_D$ (V)"]
+    for row, n_points in zip(panels, (3, 3), strict=True):
+        for ax, n_laws in zip(row, (1, 0), strict=True):
+            lines = [line for line in ax.lines if len(line.get_xdata()) == 60]
+            assert len(lines) == n_laws
+            marks = [each.lines[0] for each in ax.containers]
+            assert [len(each.get_xdata()) for each in marks] == [n_points] * 3
+            assert len({each.get_color() for each in marks}) == 3
+            assert [each.get_markerfacecolor() for each in marks].index("none") == 2
+    along = panels[0, 0].lines[0]
     known = {entry.get_label(): entry for entry in figure.legends[0].legend_handles}
-    found = [(known[name].get_marker(), known[name].get_linestyle()) for name in ("$a$", "$b$")]
-    assert found == [("o", "None"), ("^", "--")]
-    assert known["free"].get_linestyle() == "-"
+    assert list(known) == ["least squares", "refined", "thesis", "control law"]
+    assert known["control law"].get_color() == known["least squares"].get_color()
+    assert along.get_color() == known["least squares"].get_color()
 
 
-def test_laws_of_different_fits_are_different_lines() -> None:
-    points = [(2.0, 1.0), (4.0, 1.5), (5.0, 3.0), (6.0, 2.0)]
-    estimates = pd.DataFrame(
-        {"m": m, "fit": fit, "quantity": q, "value": k + m * scale, "low": 0.0, "high": 20.0}
-        for k, (fit, names) in enumerate({"free": "Lp", "free_refined": "Lp", "tied": "Lq"}.items())
-        for q in names
-        for m, scale in points
-    )
-    law = control_law(
-        np.arange(4.0), np.array([[m] for m, _ in points]), polynomial(["m"], degree=1)
-    )
-    figure = trends_figure(
-        estimates,
-        estimates.iloc[:2],
-        {"free": {"L": law, "p": law}, "tied": {"L": law, "q": law}},
-        panels=[["L"], ["q", "p"]],
-        trends=[("m", {})],
-        labels={},
-    )
-    for ax in figure.axes:
-        laws = [line for line in ax.lines if len(line.get_xdata()) == 60]
-        assert [line.get_linestyle() for line in laws] == ["-", "--"]
-        assert len({line.get_color() for line in laws}) == 2
-    entries = {entry.get_label(): entry for entry in figure.legends[0].legend_handles}
-    assert [entries[name].get_linestyle() for name in ("free", "tied")] == ["-", "--"]
-    assert entries["free, refined"].get_linestyle() == "None"
-    assert [entries[name].get_marker() for name in ("$q$", "$p$")] == ["o", "^"]
+def test_the_legend_of_trends_stands_above_all_panels() -> None:
+    figure = trends_figure(trend_table(["refined"]), {}, trends=[("m", {})], labels={})
     figure.draw_without_rendering()
     (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["refined"]
     lowest = legend.get_window_extent().y0
     assert all(ax.get_window_extent().y1 < lowest for ax in figure.axes)
 
@@ -302,7 +293,8 @@ def test_without_published_values_nothing_speaks_of_a_thesis(tmp_path: Path) -> 
         run.screen.show(outcome.sections())
         log = (run.folder.path / "run.log").read_text()
     page = page_html(config.experiment, outcome.sections(), {})
-    assert "thesis" not in page + log + outcome.figures()["trends"].caption
+    captions = [each.caption for each in outcome.figures().values()]
+    assert "thesis" not in "".join([page, log, *captions])
 
 
 def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:
@@ -347,7 +339,7 @@ def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
         (["+library.variables_if_present=[u_ir]"], LIBRARY_KEYS),
         (["~library.products", "+library.n_norm=max_terms"], LIBRARY_KEYS),
         (["trends=[{along: V_D_V, at: {}}]"], "a trend goes along one parameter and holds"),
-        (["figures.panels=[[L]]"], "figures.panels names ['L']; there are ["),
+        (["+figures.panels=[[L]]"], "figures must have labels"),
         (["+laws=1"], "unknown keys ['laws']"),
         (["law.max_terms=0"], "max_terms must be a whole number, one or more: 0 came"),
         (["+law.terms=3"], "law must have degree, max_terms and tied_degree"),

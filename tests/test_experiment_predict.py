@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 
@@ -14,7 +15,9 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.choice import map_points
 from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.studies.predict import Study
+from ep2sindy.operating.map import Fate
+from ep2sindy.report.document import Text
+from ep2sindy.studies.predict import Outcome, Study
 from ep2sindy.studies.source import expand
 from tests import programs
 
@@ -201,6 +204,19 @@ def test_own_records_over_one_parameter_make_a_law_and_its_line(tmp_path: Path) 
     assert "3 of 3 live, diverging: 0." in log
     assert "f (mHz)" in log
     assert "also: other cycles" not in log
+    said_by_the_empty(found.outcome)
+
+
+def said_by_the_empty(outcome: Outcome) -> None:
+    """A map on which nothing oscillates is no figure; the page says so instead."""
+    (branch,) = outcome.branches.values()
+    still = [replace(point, fate=Fate.RESTS, frequency_Hz=np.nan) for point in branch.map]
+    quiet = replace(outcome, branches={"all": replace(branch, map=still)})
+    assert set(quiet.figures()) == {"laws_all", "left_out"}
+    assert quiet.in_short().picture == "left_out"
+    (last,) = (section for section in quiet.sections() if section.title == "Where it oscillates")
+    said = [block.text for block in last.blocks if isinstance(block, Text)]
+    assert said[1] == "nowhere on the map does the law's model oscillate"
 
 
 def test_of_models_that_are_named_one_is_chosen(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def test_every_model_has_a_row_and_every_state_a_column(
         assert all("m" in ax.get_title() for ax in figure.axes[:2])  # units
 
 
-@pytest.mark.parametrize(("n_models", "n_columns"), [(1, 1), (3, 3), (5, 3), (8, 4)])
+@pytest.mark.parametrize(("n_models", "n_columns"), [(1, 1), (3, 3), (5, 3), (8, 3)])
 def test_phase_portraits_leave_no_empty_panel(
     oscillation: Trajectory, n_models: int, n_columns: int
 ) -> None:

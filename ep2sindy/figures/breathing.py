@@ -17,6 +17,8 @@ from ep2sindy.figures.style import (
     COLOURS,
     DATA,
     GREY,
+    TITLE,
+    WIDTH,
     legend_above,
     make_grid,
     make_panels,
@@ -33,7 +35,7 @@ MS, KHZ = 1e3, 1e-3
 
 def current_figure(field: xr.Dataset, window: slice) -> Figure:
     """The discharge current over the whole record, and with the beam current over a few periods."""
-    figure, axes = make_panels(2, 1, (9.0, 4.8))
+    figure, axes = make_panels(2, 1, (WIDTH, 4.8))
     whole, part = axes.flat
     time = MS * field["time"].values
     whole.plot(time, field["I_d"].values, color=DATA, lw=0.5)
@@ -65,7 +67,7 @@ def current_spectrum_figure(
     """
     frequency, power = power_spectrum(field["time"].values, field["I_d"].values)
     shown = (frequency > 0.0) & (frequency <= f_max_Hz)
-    figure, ((ax,),) = make_panels(1, 1, (9.0, 3.8))
+    figure, ((ax,),) = make_panels(1, 1, (WIDTH, 3.8))
     floor = max(1e-12 * power.max(), np.finfo(float).tiny)
     ax.loglog(KHZ * frequency[shown], np.maximum(power[shown], floor), color=DATA, lw=0.8)
     if np.isfinite(f_kHz):
@@ -97,7 +99,7 @@ def profile_figure(field: xr.Dataset) -> Figure:
     """Mean profiles with bands of 5 to 95 % and of the full range; the channel's exit is dashed."""
     profiles = profile_table(field)
     figure, axes = make_grid(
-        len(profiles), width=10 / 3, height=2.6, extra=0.4, sharex=True, most=3,
+        len(profiles), width=10 / 3, height=2.6, extra=0.4, sharex=True,
         x_label="distance from the anode (cm)",
     )  # fmt: skip
     z = CM * field["z"].values
@@ -107,7 +109,7 @@ def profile_figure(field: xr.Dataset) -> Figure:
         label = f"{BAND_PERCENT[0]} to {BAND_PERCENT[1]} % of the time"
         ax.fill_between(z, low, high, color=COLOURS[0], alpha=0.35, lw=0, label=label)
         ax.plot(z, mean, color=DATA, lw=1.5, label="mean")
-        ax.set_title(_words(field[name]), fontsize=10)
+        ax.set_title(_words(field[name]), fontsize=TITLE)
         ax.set_ylabel(unit)
         _mark_exit(ax, field, along="x")
         ax.margins(x=0.0)
@@ -120,7 +122,7 @@ def space_time_figure(field: xr.Dataset, window: slice) -> Figure:
     names = [name for name in MAPS if name in field]
     shown = field.isel(time=window)
     time = MS * shown["time"].values
-    size, heights = (9.0, 1.7 + 2.4 * len(names)), [1.0, *[1.7] * len(names)]
+    size, heights = (WIDTH, 1.7 + 2.4 * len(names)), [1.0, *[1.7] * len(names)]
     figure, grid = make_panels(1 + len(names), 1, size, sharex=True, heights=heights)
     axes = grid[:, 0]
     axes[0].plot(time, shown["I_d"].values, color=DATA, lw=1.3)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.style import COLOURS, DATA, GREY, axis_label, legend_above, make_panels
+from ep2sindy.figures.style import COLOURS, DATA, GREY, axis_label, legend_above, make_grid
 from ep2sindy.forecasting.bands import LEVEL
 from ep2sindy.forecasting.skill import MODEL, ForecastSkill
 
@@ -23,12 +23,13 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
     """
     ahead = skill.example
     names = [name for name in ahead.state_names if name in run.names and _is_measured(skill, name)]
-    figure, axes = make_panels(1, len(names) + 1, (4.3 * (len(names) + 1), 3.2))
+    width = 4.5 if len(names) == 1 else 3.0
+    figure, axes = make_grid(len(names) + 1, width=width, height=2.8, extra=0.4)
     low, high = ahead.band(LEVEL)
     begin = run.t[max(0, int(np.searchsorted(run.t, ahead.t[0] - 1e-9 * run.dt_s)) - 1)]
     factor, unit = run.clock.scale(float(ahead.t[-1] - begin))
     shown = (run.t >= begin - HISTORY * (ahead.t[-1] - begin)) & (run.t <= ahead.t[-1])
-    for ax, name in zip(axes[0], names, strict=False):
+    for ax, name in zip(axes, names, strict=False):
         k = ahead.state_names.index(name)
         since = factor * (run.t[shown] - begin)
         values = run.columns([name])[shown, 0]
@@ -40,13 +41,13 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
         )  # fmt: skip
         ax.plot(later, ahead.states[:, k], color=COLOURS[0], lw=1.2, label="forecast")
         ax.axvline(0.0, color=GREY, lw=0.8, ls="--")
-        ax.set_xlabel(f"time since the start of the forecast ({unit})")
+        ax.set_xlabel(f"time since the start ({unit})")
         ax.set_ylabel(axis_label(name, run.units[name]))
         ax.set_ylim(_limits(values))
-    _draw_errors(axes[0, -1], skill)
-    baselines = axes[0, -1].lines[1 : len(skill.nrmse)]  # the first line is the model's
-    handles = [*axes[0, 0].get_legend_handles_labels()[0], *baselines]
-    legend_above(figure, handles, size=8.0)
+    _draw_errors(axes[-1], skill)
+    baselines = axes[-1].lines[1 : len(skill.nrmse)]  # the first line is the model's
+    handles = [*axes[0].get_legend_handles_labels()[0], *baselines]
+    legend_above(figure, handles)
     return figure
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from ep2sindy.figures.style import COLOURS, GREY, hover_spot, legend_above, make_grid
+from ep2sindy.figures.style import COLOURS, GREY, SMALL, TITLE, hover_spot, legend_above, make_grid
 from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
 
@@ -47,10 +47,10 @@ def front_figure(
         _add_hovers(ax, front, label)
         score = f"{_score_label(label)} = {front.best.score:.4g}"
         terms = _write_terms(front.best)
-        ax.set_title(f"${latex_derivative(state)}$: {terms}\n{score}", fontsize=9)
+        ax.set_title(f"${latex_derivative(state)}$: {terms}\n{score}", fontsize=TITLE)
     entries = {line.get_label(): line for ax in axes for line in ax.lines if _has_label(line)}
     shown = [entries[name] for name in _LAYERS if name in entries]
-    legend_above(figure, shown, n_columns=2 if len(axes) == 1 else None, size=9.0)
+    legend_above(figure, shown, n_columns=2 if len(axes) == 1 else None)
     return figure
 
 
@@ -71,7 +71,7 @@ def _draw_front(ax: Axes, front: ParetoFront, chosen: int) -> None:
     if lowest <= FLOOR:
         ax.axhline(FLOOR, color=GREY, lw=0.8, ls=":", zorder=1)
         ax.annotate(
-            rf"$10^{{{np.log10(FLOOR):.0f}}}$ or less", (0.02, FLOOR), (0, 3), fontsize=8,
+            rf"$10^{{{np.log10(FLOOR):.0f}}}$ or less", (0.02, FLOOR), (0, 3), fontsize=SMALL,
             xycoords=("axes fraction", "data"), textcoords="offset points", color="#666666",
         )  # fmt: skip
 

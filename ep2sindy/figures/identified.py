@@ -24,6 +24,9 @@ from ep2sindy.figures.style import (
     COLOURS,
     DATA,
     GREY,
+    SMALL,
+    TITLE,
+    WIDTH,
     Limits,
     frame_limits,
     legend_above,
@@ -88,14 +91,14 @@ def frontier_figure(points: pd.DataFrame) -> Figure:
     points: from `Study.points` of `studies.frontier`.
     """
     variants = list(points["variant"].unique())
-    size = (2.6 * len(variants) + 0.4, 3.5)
+    size = (min(WIDTH, 2.6 * len(variants) + 0.4), 3.5)
     figure, (axes,) = make_panels(1, len(variants), size, sharex=True, sharey=True)
     for ax, variant in zip(axes, variants, strict=True):
         for (found, ran), marker in _MARKERS.items():
             kind = (points["identified"] == found) & ((points["reason"] == "") == ran)
             one = points[kind & (points["variant"] == variant)]
             ax.plot(one["duration_s"], one["rate_Hz"], **marker)
-        ax.set_title(variant, fontsize=10)
+        ax.set_title(variant, fontsize=TITLE)
         ax.set_xlabel("duration (s)")
     axes[0].set_xscale("log")
     axes[0].set_yscale("log")
@@ -128,7 +131,7 @@ def benchmark_figure(cells: pd.DataFrame, *, thesis: pd.DataFrame) -> Figure:
     figure, (axes,) = make_panels(1, len(PANELS), size, sharey=True)
     for ax, (merit, table) in zip(axes, tables.items(), strict=True):
         _draw_heat_map(ax, table)
-        ax.set_title(f"{PANELS[merit]} (%)", fontsize=10, pad=24)
+        ax.set_title(f"{PANELS[merit]} (%)", fontsize=TITLE, pad=24)
     _name_rows(axes[0], tables["on_front"].index)
     return figure
 
@@ -156,20 +159,20 @@ def _draw_heat_map(ax: Axes, table: pd.DataFrame) -> None:
 def _name_columns(ax: Axes, columns: pd.Index) -> None:
     """Write noise levels below the columns and system names above; leave a gap between systems."""
     ax.set_xticks(np.arange(len(columns)) + 0.5, [f"{100 * noise:g}" for _, noise in columns])
-    ax.tick_params(axis="x", labelsize=7.5)
-    ax.set_xlabel("noise (% of RMS)", fontsize=8.5)
+    ax.tick_params(axis="x", labelsize=SMALL)
+    ax.set_xlabel("noise (% of RMS)")
     systems = columns.get_level_values(0)
     for system in systems.unique():
         places = np.flatnonzero(systems == system)
         label = SYSTEM_LABELS.get(system, system)
         middle = places.mean() + 0.5
-        ax.text(middle, -0.25, label, ha="center", va="bottom", fontsize=8.5)
+        ax.text(middle, -0.25, label, ha="center", va="bottom", fontsize=SMALL)
         ax.axvline(places[0], color="white", lw=5)
 
 
 def _name_rows(ax: Axes, rows: pd.Index) -> None:
     labels = ["thesis" if published else name.replace("_", " ") for name, published in rows]
-    ax.set_yticks(np.arange(len(rows)) + 0.5, labels, fontsize=8.5)
+    ax.set_yticks(np.arange(len(rows)) + 0.5, labels, fontsize=SMALL)
     for text, (_, published) in zip(ax.get_yticklabels(), rows, strict=True):
         if published:
             text.set(style="italic", color="#555555")
@@ -201,7 +204,7 @@ def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) ->
     systems = list(dict.fromkeys(each.system for each in found))
     noises = sorted({each.noise for each in found})
     width, height = (3.4, 1.7) if over_time else (2.6, 2.5)
-    size = (width * len(systems) + 0.6, height * len(noises) + 0.9)
+    size = (min(WIDTH, width * len(systems) + 0.6), height * len(noises) + 0.9)
     figure, axes = make_panels(len(noises), len(systems), size, sharex="col", sharey="col")
     limits = {
         system: _frame_samples([each for each in found if each.system == system], over_time)
@@ -216,7 +219,7 @@ def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) ->
         if each.noise == noises[-1]:
             ax.set_xlabel(across)
     for ax, system in zip(axes[0], systems, strict=True):
-        ax.set_title(f"{SYSTEM_LABELS.get(system, system)}\n{ax.get_title()}", fontsize=9)
+        ax.set_title(f"{SYSTEM_LABELS.get(system, system)}\n{ax.get_title()}", fontsize=TITLE)
     for ax, noise in zip(axes[:, 0], noises, strict=True):
         ax.set_ylabel(f"noise {100 * noise:g} %\n\n{ax.get_ylabel()}")
     legend_curves(figure, list(axes.flat), n=3)
@@ -246,8 +249,7 @@ def _draw_one(
     verdict = "true terms" if each.right else "other terms"
     if each.rollout.diverged:
         verdict += f", {when_it_diverges(each.rollout)}"
-    ax.set_title(verdict, fontsize=8, color=DATA if each.right else IDENTIFIED)
-    ax.tick_params(labelsize=8)
+    ax.set_title(verdict, fontsize=TITLE, color=DATA if each.right else IDENTIFIED)
 
 
 def _coordinates(

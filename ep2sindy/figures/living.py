@@ -15,6 +15,8 @@ from ep2sindy.figures.style import (
     COLOURS,
     DATA,
     GREY,
+    TITLE,
+    WIDTH,
     axis_label,
     frame_limits,
     legend_above,
@@ -39,7 +41,8 @@ def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Fi
     shown = min(PERIODS * period_s, 0.5 * float(run.t[-1] - run.t[0]))
     factor, unit = run.clock.scale(shown)
     n = len(run.state_names)
-    figure, axes = make_panels(n, 2, (9.0, 2.2 * n + 0.8), sharex="col", sharey="row")
+    height = float(np.clip(5.0 / n, 1.3, 2.2))
+    figure, axes = make_panels(n, 2, (WIDTH, height * n + 0.8), sharex="col", sharey="row")
     since = run.t - run.t[0]
     parts = (since <= shown, since >= since[-1] - shown)
     for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
@@ -54,7 +57,7 @@ def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Fi
         row[0].set_ylim(frame_limits(run.states[:, k], model))
         row[0].set_ylabel(axis_label(name, run.units[name]))
     for ax, words in zip(axes[0], ("first periods", "last periods"), strict=True):
-        ax.set_title(words, fontsize=9)
+        ax.set_title(words, fontsize=TITLE)
     for ax in axes[-1]:
         ax.set_xlabel(f"time since the model's start ({unit})")
     legend_above(figure, axes[0, 0].lines[:2])
@@ -92,7 +95,7 @@ def cycle_figure(
         Line2D([], [], color=COLOURS[1], lw=2.0, label="the model's cycle"),
         Line2D([], [], color=COLOURS[5], marker="o", ms=4, lw=0.8, label="from other starts"),
     ]
-    legend_above(figure, handles, size=9.0)
+    legend_above(figure, handles)
     return figure
 
 
@@ -118,7 +121,7 @@ def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
         ax.set(xlabel="phase (periods)", ylabel=axis_label(name, run.units[name]))
         ax.set_xlim(0.0, 2.0)
     samples = Line2D([], [], color=GREY, marker=".", ls="none", label="samples")
-    legend_above(figure, [samples, *axes[0].lines[-2:]], size=9.0)
+    legend_above(figure, [samples, *axes[0].lines[-2:]])
     return figure
 
 
@@ -142,11 +145,11 @@ def balance_figure(
     """A panel per process: its rate in the record and by the model's terms, in m^-3/s."""
     factor, unit = clock.scale(float(t[-1] - t[0]))
     n_rows = -(-len(parts) // 2)
-    figure, axes = make_panels(n_rows, 2, (9.0, 2.2 * n_rows + 0.6), sharex=True)
+    figure, axes = make_panels(n_rows, 2, (WIDTH, 2.2 * n_rows + 0.6), sharex=True)
     for ax, (name, (recorded, modelled)) in zip(axes.flat, parts.items(), strict=False):
         ax.plot(factor * (t - t[0]), recorded, color=GREY, lw=2.4, label="record")
         ax.plot(factor * (t - t[0]), modelled, color=COLOURS[0], lw=1.1, label="model")
-        ax.set_title("\n".join(wrap(name, 44)), fontsize=9)
+        ax.set_title("\n".join(wrap(name, 44)), fontsize=TITLE)
         both = np.concatenate([recorded, modelled, [0.0]])
         ax.set_ylim(1.1 * both.min(), 1.1 * both.max())
     for ax in list(axes.flat)[len(parts) :]:

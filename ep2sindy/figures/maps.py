@@ -21,7 +21,17 @@ from matplotlib.typing import ColorType
 
 from ep2sindy.data.fields import SPACE, cell_edges
 from ep2sindy.discovery.regimes import Regimes
-from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, legend_above, make_panels, unit_text
+from ep2sindy.figures.style import (
+    COLOURS,
+    DATA,
+    MORE_COLOURS,
+    SMALL,
+    TITLE,
+    WIDTH,
+    legend_above,
+    make_panels,
+    unit_text,
+)
 from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.thruster.parameters import Thruster
 
@@ -59,7 +69,7 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
     size = _fit_size(coef, *shape, extra=1.1)
     figure, axes = make_panels(*shape, size, sharex=True, sharey="col" if flat else True)
     for column, term in zip(axes.T, terms, strict=True):
-        column[0].set_title(f"${latex_term_name(str(term))}$", fontsize=10)
+        column[0].set_title(f"${latex_term_name(str(term))}$", fontsize=TITLE)
         if flat:
             _draw_signed_points(list(column), coef.sel(term=term), trust.sel(term=term))
         else:
@@ -67,7 +77,7 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
     for row, equation in zip(axes, coef["equation"].values, strict=True):
         name = f"${latex_derivative(str(equation))}$"
         row[0].annotate(
-            name, (-0.48 if flat else -0.42, 0.5), xycoords="axes fraction", fontsize=12,
+            name, (-0.48 if flat else -0.42, 0.5), xycoords="axes fraction", fontsize=TITLE,
             ha="right", va="center",
         )  # fmt: skip
     finish_panels(axes, coef, outline)
@@ -76,7 +86,7 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
     if not flat:
         entries |= {"not selected": ABSENT}
     patches = [Patch(color=colour, label=label) for label, colour in entries.items()]
-    legend_above(figure, patches, size=9.0)
+    legend_above(figure, patches)
     return figure
 
 
@@ -114,13 +124,13 @@ def _draw_signed_maps(
         pad=0.02, shrink=0.95,
     )  # fmt: skip
     units = dict.fromkeys(map(_coef_unit, coef))
-    bar.set_label(" / ".join(units), fontsize=8, labelpad=1)
+    bar.set_label(" / ".join(units), fontsize=SMALL, labelpad=1)
     bar.set_ticks(
         [-1.0, 0.0, 1.0], labels=[f"$-10^{{{high}}}$", rf"$\pm 10^{{{low}}}$", f"$10^{{{high}}}$"]
     )
     inner = _place(np.arange(low + 1, high), low, high)
     bar.set_ticks([*-inner, *inner], minor=True)
-    bar.ax.tick_params(labelsize=7, length=2)
+    bar.ax.tick_params(labelsize=SMALL, length=2)
 
 
 def _coef_unit(coef: xr.DataArray) -> str:
@@ -171,14 +181,14 @@ def _draw_signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.Da
         if not (np.abs(values) > 0.0).any():
             ax.text(
                 0.5, 0.5, "not selected", transform=ax.transAxes, ha="center", va="center",
-                color="#777777", fontsize=8,
+                color="#777777", fontsize=SMALL,
             )  # fmt: skip
         for sign, colour, marker in ((1, SOURCE, "^"), (-1, SINK, "v")):
             chosen = sign * values.values > 0
             at, magnitudes = CM * coef[axis].values[chosen], np.abs(values.values[chosen])
             faded = _fade(colour, shown.fillna(1.0).values[chosen])
             ax.scatter(at, magnitudes, s=10, marker=marker, c=faded, linewidths=0)
-        ax.set_ylabel(_coef_unit(values), fontsize=7, labelpad=2)
+        ax.set_ylabel(_coef_unit(values), labelpad=2)
 
 
 def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
@@ -198,14 +208,14 @@ def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
     labels = regimes.labels.where(regimes.labels >= 0)
     norm = BoundaryNorm(np.arange(n + 1) - 0.5, n)
     draw_map(axes.flat[0], labels, ListedColormap(list(colours[:n])), norm)
-    axes.flat[0].set_title("regime", fontsize=10)
+    axes.flat[0].set_title("regime", fontsize=TITLE)
     draw_values(axes.flat[1], regimes.confidence, SHARE_COLOURS, Normalize(0.0, 1.0))
-    axes.flat[1].set_title("confidence", fontsize=10)
+    axes.flat[1].set_title("confidence", fontsize=TITLE)
     finish_panels(axes, regimes.labels, outline)
     figure.legend(
         handles=[Patch(color=colours[k], label=_regime_text(regimes, k)) for k in range(n)],
-        loc="outside lower center", ncols=n_columns, frameon=False, fontsize=9, handlelength=1.2,
-        title="terms that act in each regime", title_fontsize=9,
+        loc="outside lower center", ncols=n_columns, frameon=False, fontsize=SMALL,
+        handlelength=1.2, title="terms that act in each regime", title_fontsize=SMALL,
     )  # fmt: skip
     return figure
 
@@ -238,9 +248,11 @@ def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figu
         name = latex_derivative(str(equation))
         shown = r2.sel(equation=equation).clip(min=0.0)
         draw_values(row[0], shown, SHARE_COLOURS, Normalize(0.0, 1.0))
-        row[0].set_title(f"${name}$: $R^2$, {'held-out' if held_out else 'training'}", fontsize=9)
+        row[0].set_title(
+            f"${name}$: $R^2$, {'held-out' if held_out else 'training'}", fontsize=TITLE
+        )
         draw_values(row[1], result["n_terms"].sel(equation=equation), COUNT_COLOURS, counts)
-        row[1].set_title(f"${name}$: number of terms", fontsize=9)
+        row[1].set_title(f"${name}$: number of terms", fontsize=TITLE)
     finish_panels(axes[:, :2], r2, outline)
     if n_columns == 3:
         _draw_status(figure, axes[0, 2], result["status"])
@@ -255,7 +267,7 @@ def _draw_status(figure: Figure, ax: Axes, status: xr.DataArray) -> None:
     found = [k for k in range(len(meanings)) if (status == k).any()]
     norm = BoundaryNorm(np.arange(len(meanings) + 1) - 0.5, len(meanings))
     draw_map(ax, status.astype(float), ListedColormap(list(STATUS_COLOURS)), norm)
-    ax.set_title("status of the points", fontsize=9)
+    ax.set_title("status of the points", fontsize=TITLE)
     figure.legend(
         handles=[
             Patch(
@@ -264,7 +276,7 @@ def _draw_status(figure: Figure, ax: Axes, status: xr.DataArray) -> None:
             )
             for k in found
         ],
-        loc="outside lower center", ncols=len(found), frameon=False, fontsize=8,
+        loc="outside lower center", ncols=len(found), frameon=False, fontsize=SMALL,
     )  # fmt: skip
 
 
@@ -277,7 +289,7 @@ def _fit_size(
 ) -> tuple[float, float]:
     """Size of a canvas whose panels keep the field's proportions; extra: margins in inches."""
     spans = [float(np.ptp(_edges(array, axis))) for axis in space_axes(array)]
-    width = scale * PANEL_WIDTH
+    width = min(scale * PANEL_WIDTH, (WIDTH - 0.8) / n_columns - 0.35)
     height = width * min(max(spans[1] / spans[0], 0.25), 2.0) if len(spans) == 2 else 1.3
     return max(n_columns * (width + 0.35) + 0.8, 5.5), n_rows * (height + 0.45) + extra
 
@@ -327,7 +339,7 @@ def draw_values(ax: Axes, values: xr.DataArray, colours: Colormap, norm: Normali
     bar = ax.figure.colorbar(ScalarMappable(norm, colours), ax=ax, shrink=0.7, aspect=12, pad=0.02)
     if isinstance(norm, BoundaryNorm):
         bar.set_ticks(_middles(norm))
-    bar.ax.tick_params(labelsize=7)
+    bar.ax.tick_params(labelsize=SMALL)
 
 
 def _middles(norm: BoundaryNorm) -> list[float]:
@@ -338,17 +350,16 @@ def finish_panels(axes: np.ndarray, array: xr.DataArray, outline: Thruster | Non
     """Finish panels: outer labels, the channel's outline, and the full range of a single axis."""
     space = space_axes(array)
     for ax in axes.flat:
-        ax.tick_params(labelsize=8)
         if len(space) == 1:
             ax.set_xlim(*CM * _edges(array, space[0])[[0, -1]])
         if outline is not None:
             _draw_channel(ax, space, outline)
     for ax in axes[-1]:
         ax.tick_params(labelbottom=True)
-        ax.set_xlabel(f"{space[0]} (cm)", fontsize=9)
+        ax.set_xlabel(f"{space[0]} (cm)")
     if len(space) == 2:
         for ax in axes[:, 0]:
-            ax.set_ylabel("r (cm)", fontsize=9)
+            ax.set_ylabel("r (cm)")
 
 
 def _draw_channel(ax: Axes, space: Sequence[str], thruster: Thruster) -> None:

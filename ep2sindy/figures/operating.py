@@ -25,6 +25,9 @@ from ep2sindy.figures.style import (
     DATA,
     GREY,
     MORE_COLOURS,
+    SMALL,
+    TITLE,
+    WIDTH,
     held_label,
     legend_above,
     make_grid,
@@ -65,12 +68,12 @@ def laws_figure(
     """
     along, others = parameters[-1], list(parameters[:-1])
     pairs = list(law.coefficients)
-    figure, axes = make_grid(len(pairs), width=3.3, height=2.5, extra=0.7, most=3)
+    figure, axes = make_grid(len(pairs), width=3.3, height=2.5, extra=0.7)
     groups = _choose_lines(coefficients, along, others)
     for ax, (state, term) in zip(axes, pairs, strict=True):
         unit = unit_text(_unit_of_coef(law, state, term))
         name = f"${latex_derivative(state)}$:  ${latex_term_name(term)}$  ({unit})"
-        ax.set_title(name, fontsize=10, pad=14.0)
+        ax.set_title(name, fontsize=TITLE, pad=14.0)
         for (held, rows), colour in zip(groups, MORE_COLOURS, strict=False):
             here = rows[(rows["state"] == state) & (rows["term"] == term)].sort_values(along)
             _draw_law(ax, here, law, (state, term), along, held, colour)
@@ -85,7 +88,7 @@ def laws_figure(
             )
             for (held, _), colour in zip(groups, MORE_COLOURS, strict=False)
         ]
-        legend_above(figure, entries, size=9.0)
+        legend_above(figure, entries)
     return figure
 
 
@@ -147,14 +150,14 @@ def left_out_figure(rows: pd.DataFrame) -> Figure:
     states = [name.removeprefix("amplitude_") for name in columns if name.startswith("amplitude_")]
     cycles = list(dict.fromkeys(rows["branch"]))
     colours = dict(zip(cycles, MORE_COLOURS, strict=False))
-    figure, ((left, right),) = make_panels(1, 2, (9.0, 4.2))
+    figure, ((left, right),) = make_panels(1, 2, (WIDTH, 4.2))
     _draw_frequencies(left, rows, colours)
     _draw_shapes(right, rows, states, colours)
     for ax in (left, right):
         ax.set_box_aspect(1.0)
         ax.grid(alpha=0.3)
         ax.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, fontsize=9.0
+            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, fontsize=SMALL
         )
     return figure
 
@@ -238,7 +241,7 @@ def _draw_cycle_map(
 ) -> Figure:
     x, y = (np.unique(rows[name].to_numpy(float)) for name in parameters)
     own, quiet, other = records
-    figure, (axes,) = make_panels(1, 2, (11.0, 4.4), sharex=True, sharey=True)
+    figure, (axes,) = make_panels(1, 2, (WIDTH, 4.0), sharex=True, sharey=True)
     for ax, quantity in zip(axes, QUANTITIES, strict=True):
         factor, title = _scale_quantity(quantity, own)
         values = factor * rows[quantity].to_numpy(float).reshape(len(x), len(y))
@@ -254,7 +257,7 @@ def _draw_cycle_map(
         ax.set(xlabel=xlabel, ylabel=ylabel)
         bar = figure.colorbar(ScalarMappable(scale, colours), ax=ax, pad=0.02, extend="both")
         bar.set_label(title)
-    legend_above(figure, [*_list_entries(quiet, other, face=GREY), *boundaries], size=9.0)
+    legend_above(figure, [*_list_entries(quiet, other, face=GREY), *boundaries])
     return figure
 
 
@@ -267,7 +270,7 @@ def _draw_cycle_line(
 ) -> Figure:
     (name,) = parameters
     own, quiet, other = records
-    figure, (axes,) = make_panels(1, 2, (8.4, 3.6))
+    figure, (axes,) = make_panels(1, 2, (WIDTH, 3.6))
     for ax, quantity in zip(axes, QUANTITIES, strict=True):
         factor, title = _scale_quantity(quantity, own)
         ax.axvspan(fitted.min(), fitted.max(), color=GREY, alpha=0.2, lw=0)
@@ -280,9 +283,7 @@ def _draw_cycle_line(
         ax.grid(alpha=0.3)
     entries = _list_entries(quiet, other, face="white")
     law = Line2D([], [], color=COLOURS[0], lw=1.8, label="the model's cycle")
-    legend_above(
-        figure, [law, *entries, Patch(color=GREY, alpha=0.2, label="points fitted")], size=9.0
-    )
+    legend_above(figure, [law, *entries, Patch(color=GREY, alpha=0.2, label="points fitted")])
     return figure
 
 

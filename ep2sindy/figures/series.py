@@ -21,6 +21,9 @@ from ep2sindy.figures.style import (
     DATA,
     GREY,
     MORE_COLOURS,
+    SMALL,
+    TITLE,
+    WIDTH,
     Limits,
     axis_label,
     frame_limits,
@@ -45,7 +48,7 @@ RARE = 0.01  # share of derivative samples, low or high, kept out of the scale a
 def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figure:
     """A row per state: its first `duration_s`, and its power spectrum up to `f_max_Hz`."""
     n = len(run.state_names)
-    figure, axes = make_panels(n, 2, (9.0, 2.2 * n + 0.6), sharex="col", widths=[3, 2])
+    figure, axes = make_panels(n, 2, (WIDTH, 2.2 * n + 0.6), sharex="col", widths=[3, 2])
     states = first_part(run.t, run.states, duration_s, run.clock)
     spectra = _spectra(run.t, run.states, f_max_Hz, run.clock)
     for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
@@ -137,7 +140,7 @@ def spectrum_figure(
             ax.axvline(peak, color=DATA, lw=0.8, ls="--")
             if not rollout.diverged:
                 text = run.clock.frequency_text(dominant_frequency(rollout.t, rollout.states[:, k]))
-                ax.text(0.98, 0.82, text, transform=ax.transAxes, ha="right", fontsize=8)
+                ax.text(0.98, 0.82, text, transform=ax.transAxes, ha="right", fontsize=SMALL)
     return figure
 
 
@@ -158,15 +161,13 @@ def _draw_rows(
     """
     n_rows, n_columns = len(models), len(titles)
     height = float(np.clip(5.0 / n_rows, 1.05, 2.2))
-    size = (max(10.0, 2.6 * n_columns + 1.0), height * n_rows + 1.2)
+    size = (WIDTH, height * n_rows + 1.2)
     figure, axes = make_panels(n_rows, n_columns, size, sharex=True, sharey="col")
     for row, colour, (name, curves) in zip(axes, cycle(MORE_COLOURS), models.items(), strict=False):
         for k, ax in enumerate(row):
             # Wider than the model, so that it shows on both sides of one that follows it.
             ax.plot(data.x, data.y[:, k], color=GREY, lw=2.4, label="data")
             ax.plot(curves.x, curves.y[:, k], color=colour, lw=1.1)
-            ax.tick_params(labelsize=8)
-            ax.yaxis.get_offset_text().set(size=8)
             for shown, shade in ((data, GREY), (curves, colour)):
                 if limits and len(shown.x):
                     frame = (float(shown.x[0]), float(shown.x[-1])), limits[k]
@@ -175,11 +176,11 @@ def _draw_rows(
                         ax, shown.x, shown.y[:, k], colour=shade, limits=frame, diverged=stops
                     )
         text = labels.get(name, name).replace(", ", ",\n")
-        row[0].set_ylabel(text, rotation=0, ha="right", va="center", fontsize=9)
+        row[0].set_ylabel(text, rotation=0, ha="right", va="center")
     for ax in axes[1:].flat:  # panels of a column share their axis and so the first row's factor
         ax.yaxis.get_offset_text().set_visible(False)
     for column, title in zip(axes.T, titles, strict=True):
-        column[0].set_title(title, fontsize=10)
+        column[0].set_title(title, fontsize=TITLE)
         column[-1].set_xlabel(x_label)
     for column, ends in zip(axes.T, limits, strict=False):
         column[0].set_ylim(ends)
@@ -293,7 +294,7 @@ def phase_figure(
         ax.plot(*data.y.T, color=GREY, lw=1.4, label="data")
         ax.plot(*curves.y.T, color=colour, lw=1.1)
         ax.plot(*curves.y[:1].T, "o", color=colour, ms=4)
-        ax.set_title(labels[name], fontsize=9, pad=13.0)  # above the ordinate's factor
+        ax.set_title(labels[name], fontsize=TITLE, pad=13.0)  # above the ordinate's factor
         mark_exits(
             ax, *curves.y.T, colour=colour, limits=(limits[0], limits[1]),
             diverged=name in diverged,

@@ -20,6 +20,8 @@ from ep2sindy.figures.style import (
     COLOURS,
     DATA,
     GREY,
+    TITLE,
+    WIDTH,
     legend_above,
     make_grid,
     make_panels,
@@ -55,7 +57,7 @@ def stability_figure(
     x, y = (list(dict.fromkeys(points[name])) for name in (along, up))
     figure, panels = make_grid(
         len(groups), width=0.95 * len(x) + 0.7, height=0.62 * len(y) + 0.9, extra=0.7,
-        sharex=True, sharey=True, most=max(1, 12 // (2 * len(x))),
+        sharex=True, sharey=True,
     )  # fmt: skip
     figure.set_figwidth(max(figure.get_figwidth() + 1.8, 5.5))
     known = points.loc[~points["status"].isin(WORTHLESS), "I_d_std"]
@@ -64,13 +66,13 @@ def stability_figure(
         for row in group.to_dict("records"):
             _draw_cell(ax, x.index(row[along]), y.index(row[up]), row, scale)
         title = [f"{labels[name]}: {value}" for name, value in zip(others, held, strict=True)]
-        ax.set_title(", ".join(title), fontsize=10)
+        ax.set_title(", ".join(title), fontsize=TITLE)
         ax.set(xlim=(0, len(x)), ylim=(0, len(y)))
         ax.set_xticks(np.arange(len(x)) + 0.5, x)
         ax.set_yticks(np.arange(len(y)) + 0.5, y)
         ax.tick_params(length=0)
-    figure.supxlabel(labels[along], fontsize=10)
-    figure.supylabel(fill(labels[up], 26), fontsize=10, multialignment="center")
+    figure.supxlabel(labels[along])
+    figure.supylabel(fill(labels[up], 26), multialignment="center")
     bar = figure.colorbar(ScalarMappable(scale, colormaps["Blues"]), ax=panels, pad=0.02)
     bar.set_label("standard deviation of the\ndischarge current (A)")
     seen = [name for name in HATCHES if (points["status"] == name).any()]
@@ -103,7 +105,7 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
 
     points: values or texts in the column `along`, and the columns of CURVES; markers show statuses.
     """
-    figure, panels = make_panels(2, 2, (8.0, 5.2), sharex=True)
+    figure, panels = make_panels(2, 2, (WIDTH, 5.2), sharex=True)
     numbers = pd.api.types.is_numeric_dtype(points[along])
     x = points[along].to_numpy(float) if numbers else np.arange(len(points), dtype=float)
     for ax, (name, (title, factor)) in zip(panels.flat, CURVES.items(), strict=True):
@@ -118,7 +120,7 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
             ax.errorbar(x[here], values[here], reach, capsize=3, ms=5, **_status_style(status))
         for place, status in zip(x[~kept], points["status"][~kept], strict=True):
             ax.axvline(place, lw=1.0, **_status_style(status))
-        ax.set_title(title, fontsize=10)
+        ax.set_title(title, fontsize=TITLE)
         ax.grid(alpha=0.3)
         ax.margins(x=0.08)
         if not numbers:

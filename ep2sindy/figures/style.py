@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
+from matplotlib.ticker import ScalarFormatter
 
 from ep2sindy.library.equations import latex_derivative, latex_name
 
@@ -27,6 +28,10 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 # For separate panels, whose colours need not differ from all others.
 MORE_COLOURS = (*COLOURS, "#7F3C8D", "#666666")
+
+# One width and three sizes of type in all figures: in inches, which a page shows at 96 px, and in
+# points. Ticks, marks in panels and legends are small, titles and labels of axes are larger.
+WIDTH, TITLE, LABEL, SMALL = 9.0, 10.0, 10.0, 9.0
 
 Limits = tuple[float, float]
 
@@ -63,6 +68,13 @@ def make_panels(
         n_rows, n_columns, squeeze=False, sharex=sharex, sharey=sharey, width_ratios=widths,
         height_ratios=heights,
     )  # fmt: skip
+    for ax in axes.flat:
+        ax.tick_params(labelsize=SMALL)
+        for axis in (ax.xaxis, ax.yaxis):
+            formatter = ScalarFormatter(useMathText=True)  # 2 with 10^5 above the axis, not 200000
+            formatter.set_powerlimits((-3, 4))
+            axis.set_major_formatter(formatter)
+            axis.get_offset_text().set_size(SMALL)
     return figure, axes
 
 
@@ -74,15 +86,14 @@ def make_grid(
     extra: float,
     sharex: bool = False,
     sharey: bool = False,
-    most: int = 4,
     x_label: str = "",
 ) -> tuple[Figure, Sequence[Axes]]:
-    """A canvas of n panels of this size in inches, at most `most` in a row, none empty.
+    """A canvas of n panels of this size in inches, as many in a row as fit, none empty.
 
     extra: additional height in inches. sharex, sharey: whether the panels share these axes.
     x_label: written below the lowest panel of every column.
     """
-    n_rows = -(-n // most)
+    n_rows = -(-n // max(1, int(WIDTH / width)))
     n_columns = -(-n // n_rows)
     size = (width * n_columns, height * n_rows + extra)
     figure, grid = make_panels(n_rows, n_columns, size, sharex=sharex, sharey=sharey)
@@ -101,7 +112,6 @@ def legend_above(
     handles: Sequence[Artist],
     *,
     n_columns: int | None = None,
-    size: float | None = None,
 ) -> None:
     """A legend of the labelled artists over all panels, by default in one line."""
     figure.legend(
@@ -109,14 +119,14 @@ def legend_above(
         loc="outside upper center",
         ncols=n_columns or len(handles),
         frameon=False,
-        fontsize=size,
+        fontsize=SMALL,
     )
 
 
 def write_in_cell(ax: Axes, column: int, row: int, text: str, *, colour: str) -> Text:
     """Write small text into the middle of a cell, on a map whose cells have unit sides."""
     return ax.text(
-        column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=7.5, color=colour
+        column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=SMALL, color=colour
     )
 
 
@@ -266,4 +276,4 @@ def legend_curves(figure: Figure, axes: Sequence[Axes], n: int = 1) -> None:
         for label, marker in signs.items()
         if f"_{label}" in there
     ]
-    legend_above(figure, [*axes[0].lines[:n], *marks], size=9.0)
+    legend_above(figure, [*axes[0].lines[:n], *marks])

@@ -10,7 +10,16 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ep2sindy.figures.style import COLOURS, DATA, GREY, legend_above, make_panels
+from ep2sindy.figures.style import (
+    COLOURS,
+    DATA,
+    GREY,
+    SMALL,
+    TITLE,
+    WIDTH,
+    legend_above,
+    make_panels,
+)
 
 
 def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
@@ -19,7 +28,7 @@ def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
     rows: method, window (samples), loss, f_error, nrmse, f_error_started, nrmse_started.
     period: of the data, in samples.
     """
-    figure, (axes,) = make_panels(1, 3, (10.0, 3.6), sharex=True)
+    figure, (axes,) = make_panels(1, 3, (WIDTH, 3.6), sharex=True)
     lengths = [int(n) for n in rows["window"].unique()]
     titles = ("loss (1: a constant)", "frequency error (%)", "nrmse on held-out data")
     for (name, each), colour in zip(rows.groupby("method", sort=False), COLOURS, strict=False):
@@ -32,10 +41,10 @@ def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
             ax.plot(each["window"], started, label=f"{name}, start fitted", **dashed)
     for ax, title in zip(axes, titles, strict=True):
         ax.set_xscale("log")
-        ax.set_xticks(lengths, [str(n) for n in lengths], fontsize=8)
+        ax.set_xticks(lengths, [str(n) for n in lengths], fontsize=SMALL)
         ax.set_xticks([], minor=True)
         ax.axvline(period, color=DATA, lw=0.8, ls=":")
-        ax.set_title(title, fontsize=10)
+        ax.set_title(title, fontsize=TITLE)
         ax.set_xlabel("samples in a window")
         ax.grid(which="major", alpha=0.3)
     axes[0].set_ylim(bottom=0.0)
@@ -56,7 +65,7 @@ def window_error_figure(cells: pd.DataFrame, *, references: Sequence[str]) -> Fi
     noisy = cells[cells["noise"] > 0.0]
     shown = noisy if len(noisy) else cells
     lengths = cells["n_points"].dropna().unique()
-    size = (2.9 * len(lengths) + 0.4, 3.6)
+    size = (min(WIDTH, 2.9 * len(lengths) + 0.4), 3.6)
     figure, (axes,) = make_panels(1, len(lengths), size, sharex=True, sharey=True)
     for ax, n_points in zip(axes, lengths, strict=True):
         for style, name in zip(("--", "-", ":"), references, strict=False):
@@ -66,7 +75,7 @@ def window_error_figure(cells: pd.DataFrame, *, references: Sequence[str]) -> Fi
         for colour, n_windows in zip(COLOURS, panel["n_windows"].unique(), strict=False):
             one = panel[panel["n_windows"] == n_windows]
             _draw_error(ax, one, label=f"{n_windows} windows", color=colour, marker="o", ms=3.5)
-        ax.set_title(f"{n_points} points per window", fontsize=10)
+        ax.set_title(f"{n_points} points per window", fontsize=TITLE)
         ax.set_xlabel("noise (% of RMS)")
         ax.grid(which="major", alpha=0.3)
     axes[0].set_yscale("log")

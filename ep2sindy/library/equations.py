@@ -108,14 +108,21 @@ def equation_parts(
 
 def sum_latex(terms: Mapping[str, float], *, digits: int = 3) -> str:
     r"""LaTeX of the right-hand side of an equation: `- 2.62 \cdot 10^{5} \, n_{i} + ...`."""
+    return " ".join(terms_latex(terms, digits=digits)) or "0"
+
+
+def terms_latex(terms: Mapping[str, float], *, digits: int = 3) -> list[str]:
+    """LaTeX of every term with its sign; a factor of exactly one is not written."""
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
         sign = "-" if coef < 0 else "+" if k else ""
         mantissa, exponent = _number(coef, digits)
         number = mantissa + ("" if exponent is None else rf" \cdot 10^{{{exponent}}}")
-        factors = "" if name == "1" else rf" \, {latex_term_name(name)}"
-        parts.append(f"{sign} {number}{factors}".strip())
-    return " ".join(parts) or "0"
+        factors = [] if name == "1" else [latex_term_name(name)]
+        numbers = [] if factors and abs(coef) == 1.0 else [number]
+        product = r" \, ".join([*numbers, *factors])
+        parts.append(f"{sign} {product}".strip())
+    return parts
 
 
 def equations_latex(equations: Mapping[str, Mapping[str, float]], *, digits: int = 3) -> str:

@@ -19,6 +19,8 @@ ASKED = {  # keys of a config in the order of the page, with their names there
     "selection": "selection",
     "depth": "candidates kept per size",
 }
+DATA = "data: "  # begins the message on what was read
+
 ASIDE = ("experiment", "study", "output", "figures", "thesis", "parallel")
 
 
@@ -37,6 +39,16 @@ class About:
     warnings: Sequence[str]
     provenance: Mapping[str, Any]
     config: str
+
+    @property
+    def data(self) -> str:
+        """What was read, in a line; empty if the run did not say it."""
+        return next((text for text in self.said if text.startswith(DATA)), "")
+
+    @property
+    def notes(self) -> list[str]:
+        """All else that was said."""
+        return [text for text in self.said if text != self.data]
 
     @property
     def command(self) -> str:

@@ -27,8 +27,9 @@ class Text:
 class Equation:
     """One equation: state -> terms.
 
-    lead: text before it; mark: text after it. unit: of the derivative, consistent with the terms;
-    may be left out if they are in SI. aside: set less prominently, as of lesser importance.
+    rate: the terms make the time derivative of the state; if False, they make its value, as in a
+    law. lead: text before it; mark: text after it. unit: of the left side, consistent with the
+    terms; may be left out if they are in SI. aside: set less prominently, as of lesser importance.
     Shown only on the page, unless on_screen. As a cell of a table it is always shown.
     """
 
@@ -39,13 +40,19 @@ class Equation:
     unit: str = ""
     aside: bool = False
     on_screen: bool = False
+    rate: bool = True
 
     @property
     def text(self) -> str:
         """The equation as text, such as `thesis: n_i' = -2 n_i [m^-3 s^-1]`."""
         lead = f"{self.lead}: " if self.lead else ""
         unit = f" [{self.unit}]" if self.unit else ""
-        return f"{lead}{equation_text(self.state, self.terms)}{unit}{self.mark}"
+        text = equation_text(self.state, self.terms)
+        text = text if self.rate else text.replace("'", "", 1)
+        return f"{lead}{text}{unit}{self.mark}"
+
+    def __str__(self) -> str:
+        return self.text  # in CSV files
 
 
 @dataclass(frozen=True, eq=False)

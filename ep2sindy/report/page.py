@@ -8,14 +8,24 @@ from __future__ import annotations
 
 import html
 import re
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
-from ep2sindy.library.equations import latex_name, sum_latex
+from ep2sindy.library.equations import latex_name, terms_latex
 from ep2sindy.report.about import About
-from ep2sindy.report.document import Equation, Link, Result, Section, Table, cell_text
+from ep2sindy.report.document import (
+    Block,
+    Equation,
+    Link,
+    Result,
+    Section,
+    Table,
+    Text,
+    cell_text,
+)
 from ep2sindy.report.picture import Drawn
 
 if TYPE_CHECKING:
@@ -23,6 +33,8 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 TEMPLATES = Path(__file__).parent / "templates"
+
+CHARACTERS = 100  # of text in a line of the page
 
 
 def page_html(
@@ -74,7 +86,12 @@ def _environment(template: Path) -> Environment:
         lstrip_blocks=True,
     )
     environment.globals.update(
-        equation=equation_html, cell=cell_html, classes=_classes, kind_of=_kind
+        equation=equation_html,
+        cell=cell_html,
+        classes=_classes,
+        kind_of=_kind,
+        lines=_lines,
+        math_font=b64encode((TEMPLATES / "math.woff2").read_bytes()).decode(),
     )
     environment.filters.update(numeric=numeric_columns, raised=powers_html)
     return environment
@@ -98,19 +115,17 @@ def cell_html(value: object) -> Markup:
         return equation_html(value)
     if isinstance(value, Link):
         return Markup('<a href="{}">{}</a>').format(value.to, value.text)
-    if _is_number(value):
-        text = re.sub(r"e([+-])0*(\d+)", r"·10^\1\2", cell_text(value))
-        return powers_html(text.replace("^+", "^"))
-    return powers_html(cell_text(value))
+    return powers_html(re.sub(r"(?<![\w.)^])-(?=\d)", "−", cell_text(value)))
 
 
 def powers_html(text: str) -> Markup:
-    """Text with powers such as `m^-3 s^-1` as superscripts, and all else escaped."""
+    """Text with powers as superscripts, and all else escaped: `m^-3`, `2e-5` as 2·10^-5."""
     from markupsafe import Markup, escape
 
-    escaped = str(escape(text))
-    minus = re.sub(r"(?<![\w.)])-(?=\d)", "−", escaped)
-    return Markup(re.sub(r"(?<=\w)\^([\d.−]+)", r"<sup>\1</sup>", minus))
+    tens = re.sub(r"(?<![\w.])(\d+(?:\.\d+)?)e\+?(-?)0*(\d+)\b", r"\1·10^\2\3", str(escape(text)))
+    return Markup(
+        re.sub(r"(?<=\w)\^(-?[\d.]*\d)", lambda m: f"<sup>{m[1].replace('-', '−')}</sup>", tens)
+    )
 
 
 def numeric_columns(table: Table) -> list[bool]:
@@ -125,6 +140,12 @@ def _is_number(value: Any) -> bool:
     return bool(re.fullmatch(r"-|[+-]?\d[\d.e+-]*( ?[%µ\w/^-]{1,5})?", cell_text(value)))
 
 
+def _lines(blocks: Sequence[Block]) -> int:
+    """How many lines these texts and equations take on a wide page."""
+    texts = [block.text for block in blocks if isinstance(block, (Text, Equation))]
+    return sum(-(-len(text) // CHARACTERS) for text in texts)
+
+
 def _kind(block: object) -> str:
     return type(block).__name__
 
@@ -135,9 +156,15 @@ def _classes(table: Table, row: int) -> str:
 
 
 def equation_mathml(equation: Equation) -> str:
-    """The equation as MathML, without lead, unit and mark."""
-    slope = rf"\mathrm{{d}} {latex_name(equation.state)} / \mathrm{{d}} t"
-    return mathml(f"{slope} = {sum_latex(equation.terms)}")
+    """The equation as MathML, without lead, unit and mark.
+
+    Every term is an element of its own: browsers break a line between two, and never within one.
+    """
+    left = latex_name(equation.state)
+    if equation.rate:
+        left = rf"\mathrm{{d}} {left} / \mathrm{{d}} t"
+    first, *others = terms_latex(equation.terms) or ["0"]
+    return " ".join(map(mathml, (f"{left} = {first}", *(f"{t[0]} \\,{t[1:]}" for t in others))))
 
 
 def mathml(latex: str) -> str:

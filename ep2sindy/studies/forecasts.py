@@ -20,8 +20,8 @@ LEAST_SAMPLES = 20  # of the fitted part and of the rest
 
 SHOWN_PERIODS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 CAPTION = (
-    "Left: forecast from the first held-out sample on, fitted to the past alone, with the band "
-    "that is to hold 90 % of the samples. Right: error of forecasts from starts all over the "
+    "Forecast from the first held-out sample on, fitted to the past alone, with the band "
+    "that is to hold 90 % of the samples. Last panel: error of forecasts from starts all over the "
     "held-out part, by horizon (1: no better than the mean); persistence: the last sample "
     "stays; harmonics: the mean cycle goes on; autoregression: linear, its order by AIC."
 )

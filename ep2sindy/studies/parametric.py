@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Annotated, Any
 
@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.figures.trends import rows_at, trends_figure
-from ep2sindy.library.equations import equation_text
+from ep2sindy.figures.trends import PUBLISHED, rows_at, trends_figure
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import constraint
 from ep2sindy.library.units import SECONDS
@@ -34,11 +33,11 @@ from ep2sindy.report.document import (
     Block,
     Captioned,
     Equation,
-    Picture,
     Result,
     Section,
     Table,
     Text,
+    pictures,
 )
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
@@ -58,20 +57,29 @@ INTERVALS = (
     "which may be many times as large; refinements differentiate nothing. Refined models follow "
     "trajectories: R2 is that of the derivative, and may be negative where pulses are sharp."
 )
-TIED = "One support for all points: R2 with coefficients of its own at each, and tied by a law"
+TIED = "R2 at every point, with coefficients of its own, and with those of one law for all points."
 TRENDS = (
-    "Trends: exponents p of quantity ~ parameter^p, the other parameters held, with 95 % "
-    "intervals; r2: whether points follow it"
+    "Exponents p of quantity ~ parameter^p, with the other parameters held, and their 95 % "
+    "intervals. R2 says whether the points follow it."
 )
-LAWS = "Control laws, with the RMS error at points left out, over the mean"
 LEFT_OUT = (
-    "loo_error: the law's terms, fitted without the point that they predict. search_error: the "
-    "terms searched without it too, the honest one of the two."
+    "Errors are RMS over the mean, at points left out: of the law's terms, fitted without the "
+    "point that they predict; and of terms searched without it too, the honest one of the two."
 )
+WORDS = {
+    "n_terms": "terms",
+    "text": "equation",
+    "n_points": "points",
+    "r2": "R2",
+    "r2_free": "R2, own coefficients",
+    "r2_tied": "R2, one law",
+    "loo_error": "error, same terms",
+    "search_error": "error, searched",
+}
 UNITS = "Units are SI, unless a name ends in another, such as mdot_mg_s."
 CAPTION = (
-    "Quantities against one parameter, the others held: filled with 95 % intervals, which are "
-    "smaller than the markers where no bars show"
+    "Quantities of the fit {}, against one parameter with the others held: filled marks with 95 % "
+    "intervals, which are smaller than the marks where no bars show"
 )
 
 
@@ -116,11 +124,8 @@ class Trend:
 
 
 @dataclass(frozen=True)
-class Panels:
-    """Quantities that share a panel of the figure, and their labels on axes and in legends."""
-
-    panels: Sequence[Sequence[str]]
-    labels: Mapping[str, str]
+class Drawing:
+    labels: Mapping[str, str]  # of parameters, quantities and publications on axes and in legends
 
 
 Cases = Annotated[
@@ -157,7 +162,7 @@ class Study:
     library: SearchLibrary
     law: LawSettings
     trends: Sequence[Trend]
-    figures: Panels
+    figures: Drawing
     thesis: Published | None = None
 
     def __post_init__(self) -> None:
@@ -167,10 +172,6 @@ class Study:
                 raise ValueError(
                     f"a trend goes along one parameter and holds the others of {names}: {each} came"
                 )
-        known = {name for case in self.cases.values() for name in case.quantities}
-        unknown = {name for panel in self.figures.panels for name in panel} - known
-        if unknown:
-            raise ValueError(f"figures.panels names {sorted(unknown)}; there are {sorted(known)}")
 
     def compute(self, run: Run) -> Outcome:
         # Everything but the data is built first: a misspelt setting must not cost a simulation.
@@ -197,7 +198,7 @@ class Study:
             joint=search_shared(points, results, how, tying, rng=together, progress=run.watch),
             along=[(each.along, each.at) for each in self.trends],
             published=published,
-            shown=self.figures,
+            labels=self.figures.labels,
         )
 
     def at_every_point(self) -> PointStudy:
@@ -230,7 +231,7 @@ class Outcome:
     joint: SharedResult | None
     along: Sequence[tuple[str, Mapping[str, float]]]
     published: pd.DataFrame
-    shown: Panels
+    labels: Mapping[str, str]
 
     @property
     def searches(self) -> dict[str, Sequence[Fitted | None]]:
@@ -263,34 +264,40 @@ class Outcome:
         }
 
     def figures(self) -> dict[str, Captioned]:
-        """The figures; empty if no point oscillates or no trend was asked for."""
+        """A figure of each case that was fitted; none if no trend was asked for."""
         estimates = self._tables["quantities"]
-        if estimates.empty or not self.along or not self.shown.panels:
+        if estimates.empty or not self.along:
             return {}
-        published = ", open what the thesis found in its data" if len(self.published) else ""
-        lines = ", lines the control laws of least squares" if self.laws else ""
-        draw = partial(
-            trends_figure,
-            estimates[estimates["usable"]],
-            self.published,
-            {fit: laws for fit, laws in self.laws.items() if not fit.endswith(REFINED)},
-            panels=self.shown.panels,
-            trends=self.along,
-            labels=self.shown.labels,
-        )
-        return {"trends": Captioned(draw, f"{CAPTION}{published}{lines}.")}
+        fitted = set(estimates[estimates["usable"]]["fit"])
+        return {f"trends_{case}": self._trends(case) for case in self.study.cases if case in fitted}
+
+    def _trends(self, case: str) -> Captioned:
+        """Quantities of one case: of least squares, refined, and published."""
+        kinds = {case: "least squares", case + REFINED: "refined"}
+        ours = self._tables["quantities"].query("usable and fit in @kinds")
+        theirs = rows_at(self.published, {"fit": case})
+        theirs = theirs.assign(low=theirs["value"], high=theirs["value"], kind=PUBLISHED)
+        table = pd.concat([ours.assign(kind=ours["fit"].map(kinds)), theirs])
+        laws = self.laws.get(case, {})
+        published = "; open what the thesis found in its data" if len(theirs) else ""
+        lines = "; lines are the control laws of least squares" if laws else ""
+        draw = partial(trends_figure, table, laws, trends=self.along, labels=self.labels)
+        return Captioned(draw, f"{CAPTION.format(_spoken(case))}{published}{lines}.")
 
     def in_short(self) -> Result:
         """How many points oscillate, and the laws of their coefficients."""
         n_fitted = sum(bool(result.fits) for result in self.results)
-        laws = laws_table(self.laws)
-        plain = laws[~laws["fit"].str.endswith(REFINED)] if len(laws) else laws
-        shown = [f"{row['law']} ({_spoken(row['fit'])})" for row in plain.to_dict("records")]
+        shown = [
+            replace(_law(name, law), mark=f" ({_spoken(fit)})", on_screen=True)
+            for fit, by_quantity in self.laws.items()
+            for name, law in by_quantity.items()
+            if not fit.endswith(REFINED)
+        ]
         return Result(
             f"Found: {len(shown) or 'no'} laws over {n_fitted} operating points that oscillate",
-            list(map(Text, shown[:MOST_LAWS])),
+            shown[:MOST_LAWS],
             load='pandas.read_csv("{}/tables/laws.csv")',
-            picture="trends",
+            picture=next(iter(self.figures()), ""),
         )
 
     def sections(self) -> list[Section]:
@@ -329,21 +336,21 @@ class Outcome:
     def _together(self) -> list[Section]:
         """Sections on all points together: laws, trends, common support."""
         shown = self._tables
-        tied = _table(shown["tied"], ["state"])
+        tied = _table(shown["tied"], ["state"], TIED)
         if self.joint and self.joint.why_not_tied:
             tied = [Text(f"Not tied by a law: {self.joint.why_not_tied}.")]
-        laws = [*_table(shown["laws"], ["fit"]), Text(LEFT_OUT)]
+        laws = _table(shown["laws"], ["fit"], LEFT_OUT)
         if not self.laws:
             n = max(sum(each.usable(fit) for each in self.results) for fit in self.study.fits)
             needed = "a law needs 3, and all parameters to vary over them"
             laws = [Text(f"None: {n} points fitted; {needed}.")]
         supports = _table(shown["supports"], list(self.results[0].parameters))
-        trends = _table(shown["trends"], ["along", "fit"])
+        trends = _table(shown["trends"], ["along", "fit"], TRENDS)
         return [
             Section("Terms found, beside those given", supports),
-            Section(TIED, tied),
-            Section(TRENDS, [*trends, Picture("trends")]),
-            Section(LAWS if self.laws else "Control laws", laws),
+            Section("One support for all points", tied),
+            Section("Trends", [*trends, *pictures(self.figures())]),
+            Section("Control laws", laws),
         ]
 
     def summary(self) -> dict[str, Any]:
@@ -396,7 +403,7 @@ def _cell(row: Mapping[Any, Any]) -> str:
     return text if np.isnan(row["thesis"]) else f"{text} ({row['thesis']:.3g})"
 
 
-def _table(rows: pd.DataFrame, by: Sequence[str]) -> list[Block]:
+def _table(rows: pd.DataFrame, by: Sequence[str], note: str = "") -> list[Block]:
     """A table without its empty columns; a rule is drawn where the values of `by` change."""
     if rows.empty:
         return [Text("None.")]
@@ -405,7 +412,8 @@ def _table(rows: pd.DataFrame, by: Sequence[str]) -> list[Block]:
     keys = rows[list(by)]
     ends = (keys != keys.shift(-1)).any(axis=1)
     shown = rows.dropna(axis=1, how="all").round({"r2": 3, "exponent": 3})
-    return [Table(shown, breaks=np.flatnonzero(ends)[:-1].tolist())]
+    shown = shown.rename(columns=WORDS)
+    return [Table(shown, breaks=np.flatnonzero(ends)[:-1].tolist(), note=note)]
 
 
 def estimates_table(results: Sequence[PointResult], published: pd.DataFrame) -> pd.DataFrame:
@@ -458,7 +466,7 @@ def supports_table(
             if (fitted := found[k]) is not None:
                 for state, r2 in ((s, fitted.r2[s]) for s in fitted.model.states):
                     terms = fitted.model.terms(state)
-                    row = (search, state, len(terms), r2, equation_text(state, terms))
+                    row = (search, state, len(terms), r2, Equation(state, terms))
                     rows.append((*result.parameters.values(), *row))
     columns = [*results[0].parameters, "search", "state", "n_terms", "r2", "text"]
     return pd.DataFrame(rows, columns=columns)
@@ -476,16 +484,16 @@ def tied_table(joint: SharedResult | None) -> pd.DataFrame:
 
 def laws_table(laws: Mapping[str, Mapping[str, ControlLaw]]) -> pd.DataFrame:
     rows = [
-        (fit, name, _law_text(name, law), law.r2, law.loo_error, law.search_error)
+        (fit, name, _law(name, law), law.r2, law.loo_error, law.search_error)
         for fit, by_quantity in laws.items()
         for name, law in by_quantity.items()
     ]
     return pd.DataFrame(rows, columns=["fit", "quantity", "law", "r2", "loo_error", "search_error"])
 
 
-def _law_text(name: str, law: ControlLaw) -> str:
-    """A law as text: `L_m = 0.00816 + 5.37e-05 V_D_V`, like an equation without the derivative."""
-    return equation_text(name, law.coef_by_term).replace("'", "", 1)
+def _law(name: str, law: ControlLaw) -> Equation:
+    """A law such as `L_m = 0.00816 + 5.37e-05 V_D_V`."""
+    return Equation(name, law.coef_by_term, rate=False)
 
 
 def trends_table(

@@ -117,7 +117,7 @@ class Study:
         search = self.search(self.library(lacking=lacking), seed=run.seed)
         left_out = [name for name in map(str, self.terms) if name not in search.library.names]
         if left_out:
-            run.say(f"terms left out, for this field lacks their variables: {left_out}")
+            run.say(f"terms left out, for this field lacks their variables: {', '.join(left_out)}")
         key = blocks_key(run.settings)
         kept = Kept(Path(self.keep) / key, key)  # runs of other settings may be at work beside it
         begin = time.perf_counter()

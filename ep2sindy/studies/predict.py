@@ -10,11 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.figures.operating import (
-    cycle_figure,
-    laws_figure,
-    left_out_figure,
-)
+from ep2sindy.figures.operating import cycle_figure, laws_figure, left_out_figure
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
@@ -39,7 +35,7 @@ from ep2sindy.report.document import (
     Section,
     Table,
     Text,
-)
+)  # fmt: skip
 from ep2sindy.report.results import ResultTable
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
@@ -331,18 +327,18 @@ class Outcome:
         }
 
     def figures(self) -> dict[str, Captioned]:
-        found = {
-            "left_out": Captioned(
-                partial(left_out_figure, self._tables["left_out"]), CAPTIONS["left_out"]
-            )
-        }
+        """Those that show something: none of runs or maps without an oscillation."""
+        found: dict[str, Captioned] = {}
+        left_out = self._tables["left_out"]
+        if left_out["f_model_kHz"].notna().any():
+            found["left_out"] = Captioned(partial(left_out_figure, left_out), CAPTIONS["left_out"])
         for name, branch in self.branches.items():
             at_points = self._of("coefficients", name)
             draw = partial(
                 laws_figure, at_points, branch.law, parameters=self.parameters, labels=self.labels
             )
             found[f"laws_{name}"] = Captioned(draw, CAPTIONS["laws"])
-            if branch.map:
+            if any(point.fate is Fate.OSCILLATES for point in branch.map):
                 caption = CAPTIONS["map" if len(self.parameters) == 2 else "line"]
                 draw = partial(
                     cycle_figure, self._of("map", name), self._tables["points"], branch.law.points,
@@ -373,7 +369,7 @@ class Outcome:
                 Text(f"Oscillating or not, right at {right} of {n} points"),
             ],
             load=f'ep.operating.OperatingLaw.load("{{}}/law_{name}.json")',
-            picture=next(p for p in (f"map_{name}", "left_out") if p in drawn),
+            picture=next(p for p in (f"map_{name}", "left_out", f"laws_{name}") if p in drawn),
         )
 
     def sections(self) -> list[Section]:
@@ -469,9 +465,12 @@ class Outcome:
             text += (
                 f"; at {quiet_right} of the {quiet} that do not oscillate, which no fit has seen"
             )
-        pictures = [Picture(f"map_{name}") for name in self.branches]
-        drawn = [p for p in pictures if p.name in self.figures()]
-        return [Text(f"{text}."), *drawn]
+        still = [
+            Text(f"{self._lead(name)}nowhere on the map does the law's model oscillate")
+            for name, branch in self.branches.items()
+            if branch.map and f"map_{name}" not in self.figures()
+        ]
+        return [Text(f"{text}."), *still, *(Picture(f"map_{name}") for name in self.branches)]
 
     def summary(self) -> dict[str, Any]:
         right, n, quiet_right, quiet = agreement(self.branches, self.statuses)

@@ -11,7 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import xarray as xr
 
-from ep2sindy.data.fields import grid_points
+from ep2sindy.data.fields import clock_of, grid_points
 from ep2sindy.data.gaps import describe_gaps
 from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
@@ -163,11 +163,12 @@ def balances_of(source: Source, field: xr.Dataset, run: Run) -> dict[str, xr.Dat
 
 def say_field(run: Run, field: xr.Dataset) -> None:
     """Report which data are used, for a study of every grid point."""
-    t = grid_points(field, "time")
+    t, clock = grid_points(field, "time"), clock_of(field)
     words = [
         field.attrs.get("file", ""),
         describe_zone(None, field),
-        f"{len(t)} samples of {(t[-1] - t[0]) / (len(t) - 1):.4g} s from {t[0]:.4g} s",
+        f"{len(t)} samples of {clock.duration_text((t[-1] - t[0]) / (len(t) - 1), digits=4)} "
+        f"from {clock.duration_text(t[0], digits=4)}",
     ]
     run.say(in_line(f"data: {'; '.join(word for word in words if word)}"))
     say_doubts(run, field)
