@@ -50,7 +50,7 @@ def front_figure(
         ax.set_title(f"${latex_derivative(state)}$: {terms}\n{score}", fontsize=TITLE)
     entries = {line.get_label(): line for ax in axes for line in ax.lines if _has_label(line)}
     shown = [entries[name] for name in _LAYERS if name in entries]
-    legend_above(figure, shown, n_columns=2 if len(axes) == 1 else None)
+    legend_above(figure, shown)
     return figure
 
 

@@ -68,7 +68,7 @@ def laws_figure(
     """
     along, others = parameters[-1], list(parameters[:-1])
     pairs = list(law.coefficients)
-    figure, axes = make_grid(len(pairs), width=3.3, height=2.5, extra=0.7)
+    figure, axes = make_grid(len(pairs), width=3.0, height=2.4, extra=0.7)
     groups = _choose_lines(coefficients, along, others)
     for ax, (state, term) in zip(axes, pairs, strict=True):
         unit = unit_text(_unit_of_coef(law, state, term))

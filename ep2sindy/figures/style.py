@@ -107,17 +107,17 @@ def make_grid(
     return figure, axes
 
 
-def legend_above(
-    figure: Figure,
-    handles: Sequence[Artist],
-    *,
-    n_columns: int | None = None,
-) -> None:
-    """A legend of the labelled artists over all panels, by default in one line."""
+def legend_above(figure: Figure, handles: Sequence[Artist]) -> None:
+    """A legend of the labelled artists over all panels, in as few lines as the figure's width has.
+
+    A label has some twelve letters to an inch; its sign takes half an inch.
+    """
+    longest = max(0.5 + 0.08 * len(str(each.get_label())) for each in handles)
+    n_lines = -(-len(handles) // max(1, int(figure.get_figwidth() / longest)))
     figure.legend(
         handles=handles,
         loc="outside upper center",
-        ncols=n_columns or len(handles),
+        ncols=-(-len(handles) // n_lines),
         frameon=False,
         fontsize=SMALL,
     )

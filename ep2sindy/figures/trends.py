@@ -123,7 +123,7 @@ def sweep_figure(
 
     x: the setting of each job, or its number. values: NaN if a job has none.
     """
-    figure, axes = make_grid(len(values), width=3.4, height=2.5, extra=0.2)
+    figure, axes = make_grid(len(values), width=3.0, height=2.4, extra=0.2)
     for ax, (name, numbers) in zip(axes, values.items(), strict=True):
         there = np.isfinite(numbers)
         ax.plot(x[there], numbers[there], "o", color=COLOURS[0], ms=6)

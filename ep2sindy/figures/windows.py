@@ -51,7 +51,7 @@ def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
     axes[1].axhline(1.0, color=GREY, lw=0.8)
     axes[1].set_yscale("log")
     axes[2].set_ylim(bottom=0.0)
-    legend_above(figure, axes[1].get_legend_handles_labels()[0], n_columns=4)
+    legend_above(figure, axes[1].get_legend_handles_labels()[0])
     return figure
 
 
