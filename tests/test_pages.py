@@ -38,7 +38,7 @@ Toy = Callable[[Path, Path], list[str]]  # of a file of predator and prey, and a
 def zones(path: Path, output: Path) -> list[str]:
     return [
         "data=file", f"data.path={path}", f"output={output}",
-        "trajectory.zones={a: [0.0, 0.02], b: [0.02, 0.05]}", "living=none", "held_out=null",
+        "trajectory.zones={a: [0.0, 0.012], b: [0.012, 0.03]}", "living=none", "held_out=null",
         "bootstraps.n=4",
     ]  # fmt: skip
 
@@ -72,6 +72,7 @@ TOYS: dict[str, Toy] = {
     ],
     "pointwise": lambda path, output: [
         *test_experiment_pointwise.on_file(path, output), "data.r.name=null",
+        "data.variables.u_ir.name=null",
     ],
     "predict": lambda _, output: [
         *test_experiment_predict.toy(output), test_experiment_predict.POINTS,
