@@ -17,6 +17,7 @@ from tests import (
     test_experiment_simulate,
     test_experiment_trace,
     test_experiment_weak,
+    test_several_zones,
 )
 from tests.browser import browser, seen
 from tests.programs import EXPERIMENTS, composed
@@ -33,14 +34,6 @@ QUESTIONS = {
 }
 
 Toy = Callable[[Path, Path], list[str]]  # of a file of predator and prey, and an empty folder
-
-
-def zones(path: Path, output: Path) -> list[str]:
-    return [
-        "data=file", f"data.path={path}", f"output={output}",
-        "trajectory.zones={a: [0.0, 0.012], b: [0.012, 0.03]}", "living=none", "held_out=null",
-        "bootstraps.n=4",
-    ]  # fmt: skip
 
 
 def discover(path: Path, output: Path) -> list[str]:
@@ -84,7 +77,7 @@ TOYS: dict[str, Toy] = {
         "n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]", "parallel=serial",
         "n_realizations=2", f"output={output}",
     ],
-    "zones": zones,
+    "zones": lambda _, output: test_several_zones.toy(output),
 }  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """Several zones in one trajectory: averages, names, roles by neighbourhood, and balances."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -257,7 +259,8 @@ def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones,
     assert np.array_equal(found[name].recorded, made)
 
 
-def test_the_experiment_reports_zones_and_their_processes(tmp_path) -> None:
+def toy(output: Path) -> list[str]:
+    """Overrides that run `+exp=zones` on a file of the chain, which is written beside its runs."""
     record = chain()
     z = np.array([0.0025, 0.0075, 0.0125, 0.0175, 0.0225, 0.0275])
     density = {
@@ -267,12 +270,17 @@ def test_the_experiment_reports_zones_and_their_processes(tmp_path) -> None:
     field = xr.Dataset(density, coords={"time": 1e-6 * record.t, "z": z})
     for name, unit in (("n_i", "m^-3"), ("n_n", "m^-3"), ("time", "s"), ("z", "m")):
         field[name].attrs["units"] = unit
-    ep.write_field(field, tmp_path / "chain.nc")
-    found = computed(composed(
-        "+exp=zones", "data=file", f"data.path={tmp_path}/chain.nc", f"output={tmp_path}",
+    ep.write_field(field, output / "chain.nc")
+    return [
+        "+exp=zones", "data=file", f"data.path={output}/chain.nc", f"output={output}",
         "trajectory.zones={a: [0.0, 0.01], b: [0.01, 0.03]}", "data.z.name=z", "bootstraps.n=4",
         "living.search.max_terms=7", "living.depth=2", "rollout_s=null",
-    ))  # fmt: skip
+    ]  # fmt: skip
+
+
+def test_the_experiment_reports_zones_and_their_processes(tmp_path: Path) -> None:
+    record = chain()
+    found = computed(composed(*toy(tmp_path)))
     assert found.summary["data"]["variables"] == NAMES
     result = found.summary["models"]["zones"]
     living = result["living"]["coefficients"]
