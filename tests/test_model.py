@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.systems.systems import lotka_volterra
+from ep2sindy.systems.systems import lorenz, lotka_volterra
 
 VARIABLES = ["n_i", "n_n", "R_ion"]
 UNITS = {"n_i": "m^-3", "n_n": "m^-3", "R_ion": "m^3/s"}
@@ -189,3 +190,32 @@ def test_a_model_without_covariance_has_no_intervals() -> None:
 def test_covariance_of_another_size_is_refused() -> None:
     with pytest.raises(ValueError, match=r"shape \(3, 3\) came for 4"):
         replace(breathing(), covariance=np.eye(3))
+
+
+def test_equal_models_compare_equal_and_hash_alike() -> None:
+    model = lorenz().model
+    again = SparseModel.from_json(model.to_json())
+    assert again == model
+    assert len({model, again, replace(model, provenance={"from": "elsewhere"})}) == 1
+    minus_zero = replace(model, coef=np.where(model.coef == 0.0, -0.0, model.coef))
+    assert minus_zero == model
+    assert hash(minus_zero) == hash(model)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"coef": lorenz().model.coef * (1.0 + 1e-15)},
+        {"units": {"x": "m"}},
+        {"covariance": np.eye(7)},
+        {"states": ["z", "y", "x"]},
+        {"library": polynomial(["x", "y", "z"], degree=2).take(np.arange(10)[::-1])},
+    ],
+)
+def test_models_that_differ_are_not_equal(change: dict[str, Any]) -> None:
+    model = lorenz().model
+    assert replace(model, **change) != model
+    assert model != model.text()
+    with_covariance = replace(model, covariance=np.eye(7))
+    assert with_covariance == replace(model, covariance=np.eye(7))
+    assert with_covariance != replace(model, covariance=2.0 * np.eye(7))

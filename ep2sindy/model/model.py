@@ -80,6 +80,25 @@ class SparseModel:
                     f"shape {self.covariance.shape} came for {n_coefs}"
                 )
 
+    def __eq__(self, other: object) -> bool:
+        """True for the same equations, from the same library, in the same units and as certain.
+
+        Numbers are compared exactly; provenance may differ.
+        """
+        if not isinstance(other, SparseModel):
+            return NotImplemented
+        mine, theirs = (
+            (m.states, m.library.variables, m.library.names, m.units) for m in (self, other)
+        )
+        if mine != theirs or not np.array_equal(self.coef, other.coef):
+            return False
+        if self.covariance is None or other.covariance is None:
+            return self.covariance is other.covariance
+        return np.array_equal(self.covariance, other.covariance)
+
+    def __hash__(self) -> int:
+        return hash((self.states, tuple(self.coef[self.coef != 0.0].tolist())))
+
     @property
     def inputs(self) -> tuple[str, ...]:
         """Variables of the library that are not states."""
