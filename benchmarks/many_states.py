@@ -137,7 +137,7 @@ def main() -> None:
         settings = RefinementSettings(n_windows=20, n_reweights=0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            found = refine(models, [[run]] * len(models), settings, rng=0)
+            found = refine(models, [[run]] * len(models), settings, seed=0)
         cpu_s = (time.process_time() - begin) / len(models)
         counts = Counter(str(each.status) for each in found)
         kind = "all terms" if len(case.seen) == len(case.truth.states) else "hidden"

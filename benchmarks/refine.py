@@ -224,7 +224,7 @@ def ours(case: Case, method: MultipleShooting | SingleShooting, *, free_start: b
         method=method,
         free_start=free_start,
         n_reweights=0,
-        rng=np.random.default_rng(0),
+        seed=np.random.default_rng(0),
     )
     return found.loss
 
@@ -270,7 +270,7 @@ def many(n_points: int, rng: np.random.Generator, *, points_per_batch: int) -> N
     begin = time.process_time()
     found = refine(
         [START] * n_points, data, RefinementSettings(n_windows=10, window=WINDOW),
-        points_per_batch=points_per_batch, rng=rng,
+        points_per_batch=points_per_batch, seed=rng,
     )  # fmt: skip
     each_ms = 1e3 * (time.process_time() - begin) / n_points
     n_converged = sum(each.status == "converged" for each in found)

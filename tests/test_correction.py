@@ -48,7 +48,7 @@ def network(n_in: int, n_out: int, *, hidden: int = 8) -> nn.Module:
 def refined(model: SparseModel, run: Trajectory, module: nn.Module, **settings: Any) -> Corrected:
     """From the same windows at each call."""
     rng = np.random.default_rng(0)
-    return refine_with_correction(model, [run], module, rng=rng, **settings)
+    return refine_with_correction(model, [run], module, seed=rng, **settings)
 
 
 class Fixed(nn.Module):
@@ -110,7 +110,7 @@ def test_parts_are_ambiguous_and_their_sum_is_not() -> None:
     rng = np.random.default_rng(0)
     found = refine_with_correction(
         known_part(), [PREY.trajectory(noise=0.01, rng=rng)], network(2, 2), window=25,
-        n_windows=20, rng=rng,
+        n_windows=20, seed=rng,
     )  # fmt: skip
     assert found.status == "converged"
     assert found.loss < 1e-3 * found.loss_before

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
+from ep2sindy.discovery.result import Discovery
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.judge import RefinementStatus
@@ -48,7 +49,7 @@ def discovery() -> Discovery:
 def refinement() -> Refinement:
     system = lotka_volterra()
     rng = np.random.default_rng(0)
-    return refine(system.model, [system.trajectory()], n_windows=4, window=60, rng=rng)
+    return refine(system.model, [system.trajectory()], n_windows=4, window=60, seed=rng)
 
 
 def assert_one_screen(text: str) -> None:

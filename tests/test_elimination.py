@@ -36,7 +36,7 @@ def support(model: SparseModel) -> dict[str, set[str]]:
 def test_spurious_terms_go_and_the_truth_is_recommended(noise: float) -> None:
     runs = [PREY.trajectory(noise=noise, rng=0)]
     model = widened(PREY.model, 2, np.random.default_rng(1))
-    found = ep.eliminate(model, runs, n_settings(), min_free=2, rng=0)
+    found = ep.eliminate(model, runs, n_settings(), min_free=2, seed=0)
     assert support(found.model) == support(PREY.model)
     assert found.best == 4
     assert [np.count_nonzero(r.model.coef) for r in found.refinements] == [8, 7, 6, 5, 4, 3, 2]
@@ -53,7 +53,7 @@ def test_eighteen_terms_of_four_states_come_down_to_the_truth() -> None:
     run = record(case)
     fitted, later = run.window(0, 700), run.window(700, run.n_samples)
     model = widened(case.truth, 2, np.random.default_rng(1))
-    found = ep.eliminate(model, [fitted], n_settings(), min_free=9, run_over=later, rng=0)
+    found = ep.eliminate(model, [fitted], n_settings(), min_free=9, run_over=later, seed=0)
     assert len(found.verdicts) == len(found.refinements) == len(found.scores)
     assert support(found.model) == support(case.truth)
     assert found.verdicts[found.best] == "alike"  # two frequencies: no cycle
@@ -76,7 +76,7 @@ def test_relations_hold_on_the_way_and_bound_terms_go_together() -> None:
     )
     settings = ep.RefinementSettings(n_windows=10, constraint=relations)
     runs = [PREY.trajectory(noise=0.02, rng=0)]
-    found = ep.eliminate(model, runs, settings, min_free=3, rng=0)
+    found = ep.eliminate(model, runs, settings, min_free=3, seed=0)
     assert found.dropped == ((("x", "x^2"), ("y", "x^2")),)
     assert found.best == 1
     for each in found.refinements:
@@ -95,7 +95,7 @@ def test_the_path_ends_where_a_state_would_lose_its_last_term() -> None:
     coef = np.zeros((len(LIBRARY), 2))
     coef[LIBRARY.index("x"), 0], coef[LIBRARY.index("y"), 1] = -1.0, -2.0
     model = SparseModel(LIBRARY, ["x", "y"], coef)
-    found = ep.eliminate(model, [run], n_settings(), rng=0)
+    found = ep.eliminate(model, [run], n_settings(), seed=0)
     assert len(found.refinements) == 1
     with pytest.raises(ValueError, match="min_free must be a whole number, one or more: 0 came"):
-        ep.eliminate(model, [run], min_free=0, rng=0)
+        ep.eliminate(model, [run], min_free=0, seed=0)

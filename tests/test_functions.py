@@ -544,7 +544,7 @@ def test_functions_are_refined_and_those_of_ones_own(name: str, way: dict, tanh:
     t = np.linspace(0.0, 6.0, 301)
     run = truth.simulate(t, [1.5, 0.0]).trajectory()
     off = replace(truth, coef=1.03 * truth.coef)
-    found = refine(off, [run], n_windows=4, window=60, rng=np.random.default_rng(0), **way)
+    found = refine(off, [run], n_windows=4, window=60, seed=np.random.default_rng(0), **way)
     # Steps of 0.02 s are exact to 1e-6 where tanh(3 x) turns.
     np.testing.assert_allclose(found.model.coef, truth.coef, atol=1e-4)
 
@@ -557,7 +557,7 @@ def test_refinement_survives_windows_that_leave_a_domain() -> None:
     off = model_of({"x": {"1": -6.0, "sqrt(x)": -1.0, "u": 1.0}}, ("u",))
     for free_start in (True, False):
         found = refine(
-            off, [run], n_windows=4, window=80, rng=np.random.default_rng(0), free_start=free_start
+            off, [run], n_windows=4, window=80, seed=np.random.default_rng(0), free_start=free_start
         )
         assert isinstance(found.status, str)
         assert found.status != "converged" or np.isfinite(found.model.coef).all()

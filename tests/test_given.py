@@ -67,7 +67,7 @@ def test_a_list_holds_several_runs_of_any_kind() -> None:
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
-        ([], "needs at least one run: an empty list came"),
+        ([], "at least one run is needed: an empty list came"),
         ([T, X], "a run must be a Trajectory, a pandas DataFrame .* run 0 of the list is of type"),
         (X, "run is of type ndarray; several runs go into a list"),
         (pd.DataFrame({"x": T}), r"must have one time column, .* its columns are \['x'\]"),

@@ -167,7 +167,7 @@ def test_constraints_of_the_points_of_a_law_must_be_alike() -> None:
     other = [*own[:2], constraint(LIBRARY, STRUCTURE)]
     for wrong, message in ((own[:2], "2 came"), (other, "3 came, not alike")):
         with pytest.raises(ValueError, match=f"one constraint for each of its 3 points.*{message}"):
-            refine_law(models, runs, basis, constraints=wrong, rng=0)
+            refine_law(models, runs, basis, constraints=wrong, seed=0)
     settings = replace(SETTINGS, constraint=own[0])
     with pytest.raises(ValueError, match="one for all in the settings"):
-        refine_law(models, runs, basis, settings, constraints=own, rng=0)
+        refine_law(models, runs, basis, settings, constraints=own, seed=0)

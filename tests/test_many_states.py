@@ -20,7 +20,7 @@ def test_true_terms_that_are_off_come_back(number: int) -> None:
     run = record(case)
     truth = case.truth
     for found in refine(
-        starts(case, run)[:3], [[run]] * 3, RefinementSettings(n_windows=10), rng=0
+        starts(case, run)[:3], [[run]] * 3, RefinementSettings(n_windows=10), seed=0
     ):
         assert found.status == "converged"
         assert not found.message
@@ -37,7 +37,7 @@ def test_models_that_miss_hidden_states_follow_what_they_can(number: int) -> Non
     case = cases()[number]
     run = record(case)
     settings = RefinementSettings(n_windows=10, n_reweights=0)
-    for found in refine(starts(case, run)[:3], [[run]] * 3, settings, rng=0):
+    for found in refine(starts(case, run)[:3], [[run]] * 3, settings, seed=0):
         assert found.status not in ("non_finite", "flat")
 
 
@@ -46,7 +46,7 @@ def test_a_failure_says_where() -> None:
     run = record(case)
     method = MultipleShooting(first_memory=1000, max_iter=1)
     settings = RefinementSettings(n_windows=5, method=method, n_reweights=0)
-    found = refine(starts(case, run)[1], [run], settings, periods=8.0, rng=0)
+    found = refine(starts(case, run)[1], [run], settings, periods=8.0, seed=0)
     assert found.status in ("non_finite", "flat", "max_iter")
     assert "the longest memory without gaps was 1 of " in found.message
     assert " of trajectory 0, " in found.message
@@ -59,13 +59,13 @@ def test_every_model_of_a_list_keeps_its_own_constraint() -> None:
     (term, *_), row = support["x"], model.library.index(support["x"][0])
     known = [constraint(model.library, support, [f"x: {term} == {v}"]) for v in (0.7, 0.6)]
     settings = RefinementSettings(window=60, n_windows=6)
-    together = refine([model] * 3, [[run]] * 3, settings, constraints=[*known, None], rng=0)
+    together = refine([model] * 3, [[run]] * 3, settings, constraints=[*known, None], seed=0)
     held = [found.model.coef[row, 0] for found in together[:2]]
     np.testing.assert_allclose(held, [0.7, 0.6], rtol=1e-12)
     np.testing.assert_allclose(together[2].model.coef, truth.coef, rtol=1e-5, atol=1e-12)
-    alone = refine([model], [[run]], settings, constraint=known[0], rng=0)[0]
+    alone = refine([model], [[run]], settings, constraint=known[0], seed=0)[0]
     np.testing.assert_allclose(together[0].model.coef, alone.model.coef, rtol=1e-8)
     with pytest.raises(ValueError, match=r"one entry per model.* 2 came for 3 models$"):
-        refine([model] * 3, [[run]] * 3, constraints=known, rng=0)
+        refine([model] * 3, [[run]] * 3, constraints=known, seed=0)
     with pytest.raises(ValueError, match="beside a common one; leave out one$"):
-        refine([model] * 2, [[run]] * 2, constraint=known[0], constraints=known, rng=0)
+        refine([model] * 2, [[run]] * 2, constraint=known[0], constraints=known, seed=0)

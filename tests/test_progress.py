@@ -144,7 +144,7 @@ def test_refinements_tell_their_iterations_and_windows(prey: ep.Trajectory) -> N
     model = ep.lotka_volterra().model
     lengths = [20, 40]
     found = [
-        ep.refine(model, [prey], window=length, n_windows=2, rng=0, progress=watch)
+        ep.refine(model, [prey], window=length, n_windows=2, seed=0, progress=watch)
         for length in count_pieces(watch, lengths, "window length")
     ]
     outer, *inner = watch.stages

@@ -2,6 +2,7 @@ from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from scipy.integrate import solve_ivp
@@ -62,7 +63,7 @@ def test_exact_data_give_the_exact_coefficients(free_start: bool) -> None:
         window=60,
         n_windows=8,
         free_start=free_start,
-        rng=rng,
+        seed=rng,
     )
     assert found.status == "converged"
     # rk4 at 0.1 of a time unit of one: h^4 / 120.
@@ -77,7 +78,7 @@ def test_methods_agree_on_the_minimiser() -> None:
     def fitted(method: object, **settings: bool) -> Refinement:
         return refine(
             start, [data], window=15, n_windows=3, method=method, n_reweights=0,
-            rng=np.random.default_rng(1), **settings,
+            seed=np.random.default_rng(1), **settings,
         )  # fmt: skip
 
     for free_start in (True, False):
@@ -100,7 +101,7 @@ def test_gradient_descent_finds_the_same_minimum(free_start: bool) -> None:
     data, start = noisy(PREY, 0.05, rng), spread(PREY.model, 0.1, rng)
     settings = {"window": 25, "n_windows": 3, "n_reweights": 0, "free_start": free_start}
     best, other = (
-        refine(start, [data], method=method, rng=np.random.default_rng(1), **settings)
+        refine(start, [data], method=method, seed=np.random.default_rng(1), **settings)
         for method in (MultipleShooting(), GradientDescent())
     )
     assert other.status == "converged"
@@ -111,7 +112,7 @@ def test_gradient_descent_finds_the_same_minimum(free_start: bool) -> None:
 def test_reported_loss_is_that_of_an_independent_integration() -> None:
     rng = np.random.default_rng(0)
     data = noisy(PREY, 0.05, rng)
-    found = refine(PREY.model, [data], window=100, n_windows=5, rng=rng)
+    found = refine(PREY.model, [data], window=100, n_windows=5, seed=rng)
     scale = found.batch.scale
     for w, start in enumerate(found.batch.start.tolist()):
         window = data.window(start, start + 100)
@@ -136,7 +137,7 @@ def test_rescaled_units_change_the_coefficients_and_nothing_else() -> None:
     powers = model.library.exponents.sum(axis=1)
     rescaled = off(model, 1e6 * 1e18 ** (1.0 - powers[:, None]))
     small, large = (
-        refine(m, [d], window=100, n_windows=5, rng=np.random.default_rng(1))
+        refine(m, [d], window=100, n_windows=5, seed=np.random.default_rng(1))
         for m, d in ((model, data), (rescaled, big))
     )
     np.testing.assert_allclose(errors(large, rescaled), errors(small, model), rtol=1e-6)
@@ -151,7 +152,7 @@ def test_constraint_holds_after_refinement_and_shapes_the_covariance() -> None:
         ["x: x*y == -1 * y: x*y"],
     )  # fmt: skip
     data = noisy(PREY, 0.05, rng)
-    found = refine(model, [data], window=50, n_windows=20, constraint=relations, rng=rng)
+    found = refine(model, [data], window=50, n_windows=20, constraint=relations, seed=rng)
     assert found.model.terms("x")["x*y"] == -found.model.terms("y")["x*y"]
     covariance = found.model.covariance
     assert covariance is not None
@@ -164,7 +165,7 @@ def test_covariance_follows_the_order_of_the_model() -> None:
     swapped = constraint(model.library, {s: tuple(model.terms(s)) for s in ("y", "x")})
     data = noisy(PREY, 0.05, rng)
     plain, other = (
-        refine(model, [data], window=50, n_windows=20, constraint=c, rng=np.random.default_rng(1))
+        refine(model, [data], window=50, n_windows=20, constraint=c, seed=np.random.default_rng(1))
         for c in (None, swapped)
     )
     assert plain.model.covariance is not None
@@ -201,7 +202,7 @@ def test_unequal_steps_and_inputs_are_followed() -> None:
     model = SparseModel(library, ["x"], np.array([[-0.6]]))
     data = Trajectory(t, x[:, None], ["x"], u[:, None], ["u"])
     for method in (MultipleShooting(), MultipleShooting(step=HermiteSimpson()), SingleShooting()):
-        found = refine(model, [data], window=50, n_windows=4, method=method, rng=rng)
+        found = refine(model, [data], window=50, n_windows=4, method=method, seed=rng)
         assert found.model.coef[0, 0] == pytest.approx(-1.0, abs=1e-6)
 
 
@@ -216,7 +217,7 @@ def test_a_right_model_follows_windows_of_any_length() -> None:
     rng = np.random.default_rng(0)
     data = noisy(PREY, 0.05, rng)
     for window in (20, 80):
-        found = refine(PREY.model, [data], window=window, n_windows=6, rng=rng)
+        found = refine(PREY.model, [data], window=window, n_windows=6, seed=rng)
         assert found.trajectories.shape[1] == window
         assert found.loss < 0.05**2 * 1.2
 
@@ -224,15 +225,15 @@ def test_a_right_model_follows_windows_of_any_length() -> None:
 def test_keywords_stand_for_what_settings_say() -> None:
     data = noisy(PREY, 0.05, np.random.default_rng(0))
     settings = RefinementSettings(n_windows=3, window=30, n_reweights=0)
-    by_settings = refine(PREY.model, [data], settings, rng=1)
-    by_keywords = refine(PREY.model, [data], n_windows=3, window=30, n_reweights=0, rng=1)
+    by_settings = refine(PREY.model, [data], settings, seed=1)
+    by_keywords = refine(PREY.model, [data], n_windows=3, window=30, n_reweights=0, seed=1)
     np.testing.assert_array_equal(by_settings.model.coef, by_keywords.model.coef)
-    longer = refine(PREY.model, [data], settings, window=40, rng=1)
+    longer = refine(PREY.model, [data], settings, window=40, seed=1)
     assert longer.trajectories.shape == (3, 40, 2)
     by_periods = RefinementSettings(periods=2.0).override({"window": 40, "n_windows": None})
     assert (by_periods.window, by_periods.periods, by_periods.n_windows) == (40, None, 30)
-    assert refine([], [], rng=1) == []
-    (first, second) = refine([PREY.model] * 2, [[data]] * 2, settings, rng=1)
+    assert refine([], [], seed=1) == []
+    (first, second) = refine([PREY.model] * 2, [[data]] * 2, settings, seed=1)
     np.testing.assert_array_equal(first.model.coef, by_settings.model.coef)
     assert second.batch.start.tolist() != first.batch.start.tolist()  # windows of its own
 
@@ -267,7 +268,7 @@ def test_settings_that_say_nothing_or_two_things_are_refused(
     with pytest.raises(ValueError, match=message):
         RefinementSettings(**settings)
     with pytest.raises(ValueError, match=message):
-        refine(PREY.model, [clean(PREY)], rng=0, **settings)
+        refine(PREY.model, [clean(PREY)], seed=0, **settings)
 
 
 def test_history_reports_every_iteration_as_it_comes() -> None:
@@ -275,7 +276,7 @@ def test_history_reports_every_iteration_as_it_comes() -> None:
     rng = np.random.default_rng(0)
     data = noisy(PREY, 0.05, rng)
     model = spread(PREY.model, 0.2, rng)
-    found = refine(model, [data], window=60, n_windows=6, rng=rng, callback=seen.append)
+    found = refine(model, [data], window=60, n_windows=6, seed=rng, callback=seen.append)
     assert tuple(seen) == found.history
     assert seen[0].memory == 5
     assert seen[-1].memory == 60
@@ -287,7 +288,7 @@ def test_model_without_dynamics_of_its_own_is_flat() -> None:
     library = named_terms(["x", "y"], ["x", "y"])
     model = SparseModel(library, ["x", "y"], np.array([[1e-3, 0.0], [0.0, 1e-3]]))
     rng = np.random.default_rng(0)
-    found = refine(model, [clean(PREY)], window=300, n_windows=3, rng=rng)
+    found = refine(model, [clean(PREY)], window=300, n_windows=3, seed=rng)
     assert found.status in ("flat", "unidentifiable")
 
 
@@ -300,14 +301,14 @@ def test_terms_that_the_data_cannot_tell_apart_are_unidentifiable() -> None:
     rng = np.random.default_rng(0)
     states = (x + 1e-3 * rng.standard_normal(100))[:, None]
     data = Trajectory(t, states, ["x"], x[:, None], ["u"])
-    assert refine(model, [data], window=20, n_windows=5, rng=rng).status == "unidentifiable"
+    assert refine(model, [data], window=20, n_windows=5, seed=rng).status == "unidentifiable"
 
 
 def test_start_that_blows_up_is_a_result() -> None:
     library = named_terms(["x", "y"], ["x", "x^2*y^2", "y"])
     model = SparseModel(library, ["x", "y"], np.array([[0.0, 0.0], [1e200, 0.0], [0.0, 1e3]]))
     rng = np.random.default_rng(0)
-    found = refine(model, [clean(PREY)], window=50, n_windows=3, rng=rng)
+    found = refine(model, [clean(PREY)], window=50, n_windows=3, seed=rng)
     assert found.status == "non_finite"
     assert found.loss == np.inf
     assert "window 0 (from sample " in found.message
@@ -321,8 +322,8 @@ def test_points_refined_together_are_those_refined_alone() -> None:
     data = [[noisy(PREY, noise, rng)] for noise in (0.01, 0.1, 0.05)]
     starts = [spread(model, share, rng) for share in (0.1, 0.9, 0.3)]
     settings = RefinementSettings(window=200, n_windows=5)
-    together = refine(starts, data, settings, rng=np.random.default_rng(1))
-    alone = refine(starts, data, settings, points_per_batch=1, rng=np.random.default_rng(1))
+    together = refine(starts, data, settings, seed=np.random.default_rng(1))
+    alone = refine(starts, data, settings, points_per_batch=1, seed=np.random.default_rng(1))
     for one, other in zip(together, alone, strict=True):
         assert one.status == other.status == "converged"
         assert len(one.history) == len(other.history)
@@ -338,8 +339,8 @@ def test_models_of_different_terms_are_refined_and_judged_as_if_alone(method: Me
     models = [SparseModel(library, ["x", "y"], coef_matrix(library, t)) for t in (wider, terms)]
     data = [[noisy(PREY, 0.05, rng)]] * 2
     settings = RefinementSettings(window=40, n_windows=6, method=method)
-    together = refine(models, data, settings, rng=np.random.default_rng(1))
-    alone = refine(models, data, settings, points_per_batch=1, rng=np.random.default_rng(1))
+    together = refine(models, data, settings, seed=np.random.default_rng(1))
+    alone = refine(models, data, settings, points_per_batch=1, seed=np.random.default_rng(1))
     for one, other in zip(together, alone, strict=True):
         assert one.status == other.status
         np.testing.assert_allclose(one.model.coef, other.model.coef, rtol=1e-6)
@@ -359,28 +360,49 @@ def test_models_of_different_states_are_refused_in_one_batch() -> None:
         for a, b in (("x", "y"), ("y", "x"))
     ]
     with pytest.raises(ValueError, match="must share their states and inputs"):
-        refine(models, data, RefinementSettings(window=50), rng=np.random.default_rng(0))
+        refine(models, data, RefinementSettings(window=50), seed=np.random.default_rng(0))
+
+
+def test_one_run_is_a_list_of_one_and_the_seed_is_zero() -> None:
+    data = noisy(PREY, 0.02, np.random.default_rng(0))
+    settings = RefinementSettings(n_windows=3, window=30)
+    known = refine(PREY.model, [data], settings, seed=0).model
+    arrays = {"t": data.t, **dict(zip(data.state_names, data.states.T, strict=True))}
+    for run in (data, pd.DataFrame(arrays)):
+        assert refine(PREY.model, run, settings).model == known
+
+
+def test_the_old_name_of_the_seed_warns() -> None:
+    data, settings = clean(PREY), RefinementSettings(n_windows=3, window=30)
+    with pytest.warns(FutureWarning, match="rng=.*: write seed=") as told:
+        old = refine(PREY.model, data, settings, rng=1)
+    assert told[0].filename == __file__
+    assert old.model == refine(PREY.model, data, settings, seed=1).model
+    with pytest.raises(ValueError, match="seed and rng are one argument"):
+        refine(PREY.model, data, settings, rng=1, seed=1)
 
 
 def test_bad_input_is_refused() -> None:
     rng = np.random.default_rng(0)
     data, model = clean(PREY), PREY.model
     with pytest.raises(ValueError, match="1001 samples were asked of trajectories of at most 1000"):
-        refine(model, [data], window=1001, rng=rng)
+        refine(model, [data], window=1001, seed=rng)
     with pytest.raises(ValueError, match="at least one term"):
-        refine(off(model, 0.0), [data], rng=rng)
+        refine(off(model, 0.0), [data], seed=rng)
     library = named_terms(["x", "u"], ["x", "u"])
     with pytest.raises(ValueError, match="unknown variable 'u'"):
-        refine(SparseModel(library, ["x"], np.ones((2, 1))), [data], window=50, rng=rng)
-    with pytest.raises(ValueError, match="at least one trajectory"):
-        refine(model, [], window=50, rng=rng)
+        refine(SparseModel(library, ["x"], np.ones((2, 1))), [data], window=50, seed=rng)
+    with pytest.raises(ValueError, match="at least one run is needed"):
+        refine(model, [], window=50)
     with pytest.raises(ValueError, match="a list of trajectories of its own: 2 models and 1 lists"):
-        refine([model] * 2, [[data]], RefinementSettings(window=50), rng=rng)
-    for models, runs in ((model, data), ([model], data), ([model], [data]), (model, [[data]])):
-        with pytest.raises(ValueError, match=r"one model takes a list of trajectories, as in re"):
-            refine(models, runs, window=50, rng=rng)
+        refine([model] * 2, [[data]], RefinementSettings(window=50), seed=rng)
+    for runs, came in ((data, "one run"), ([data], "a list of runs")):
+        with pytest.raises(ValueError, match=f"as in refine.* 1 models came with {came}"):
+            refine([model], runs, window=50, seed=rng)
+    with pytest.raises(ValueError, match="run 0 of the list is of type list"):
+        refine(model, [[data]], window=50, seed=rng)
     with pytest.raises(ValueError, match="NelderMead cannot fit initial states"):
-        refine(model, [data], window=50, method=NelderMead(), rng=rng)
+        refine(model, [data], window=50, method=NelderMead(), seed=rng)
 
 
 @cache
@@ -417,7 +439,7 @@ def test_stiff_model_is_right_or_says_that_it_is_not(
     data = replace(data, states=data.states + noise * std * rng.standard_normal(data.states.shape))
     method = MultipleShooting(step=step)
     found = refine(
-        spread(model, 0.2, rng), [data], window=100, n_windows=10, method=method, rng=rng
+        spread(model, 0.2, rng), [data], window=100, n_windows=10, method=method, seed=rng
     )
     if found.status == "converged":
         covariance = found.model.covariance
@@ -446,7 +468,7 @@ def test_free_starts_reach_the_accuracy_that_the_noise_allows(
     for seed in range(20):
         rng = np.random.default_rng(seed)
         start = spread(system.model, 0.2, rng)
-        result = refine(start, [noisy(system, noise, rng)], window=window, rng=rng)
+        result = refine(start, [noisy(system, noise, rng)], window=window, seed=rng)
         assert result.status == "converged"
         found.append(errors(result, system.model))
     assert np.sqrt(np.square(found).mean()) < rms
@@ -471,7 +493,7 @@ def test_far_starts_converge(system: System, window: int, start: str) -> None:
         rng = np.random.default_rng(seed)
         data = noisy(system, 0.05, rng)
         model = off(system.model, STARTS[start](rng, system.model.coef.shape))
-        found = refine(model, [data], window=window, rng=rng)
+        found = refine(model, [data], window=window, seed=rng)
         assert found.status == "converged"
         assert np.abs(errors(found, system.model)).max() < 0.15
 
@@ -486,7 +508,7 @@ def test_intervals_cover_as_they_say(structured: bool) -> None:
         rng = np.random.default_rng(seed)
         white = exact + 0.05 * exact.std(axis=0) * rng.standard_normal(exact.shape)
         states = contaminated(exact, t, rng) if structured else white
-        found = refine(START, [Trajectory(t, states, STATES)], window=100, rng=rng)
+        found = refine(START, [Trajectory(t, states, STATES)], window=100, seed=rng)
         assert found.status == "converged"
         assert found.model.covariance is not None
         error = (found.model.coef - TRUTH.coef).T[used]
@@ -499,6 +521,6 @@ def test_gpu_gives_the_same_coefficients() -> None:
     rng = np.random.default_rng(0)
     data = noisy(PREY, 0.05, rng)
     refined = partial(refine, PREY.model, [data], window=100, n_windows=10)
-    cpu = refined(rng=np.random.default_rng(1))
-    gpu = refined(rng=np.random.default_rng(1), device="cuda")
+    cpu = refined(seed=np.random.default_rng(1))
+    gpu = refined(seed=np.random.default_rng(1), device="cuda")
     np.testing.assert_allclose(gpu.model.coef, cpu.model.coef, rtol=1e-8)

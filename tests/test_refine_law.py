@@ -72,7 +72,7 @@ def tied(
     basis: np.ndarray = BASIS,
     **settings: object,
 ) -> LawRefinement:
-    return refine_law(models, data, basis, replace(SETTINGS, **settings), rng=0)
+    return refine_law(models, data, basis, replace(SETTINGS, **settings), seed=0)
 
 
 def test_exact_data_give_the_exact_law() -> None:
@@ -91,7 +91,7 @@ def test_exact_data_give_the_exact_law() -> None:
 def test_a_saturated_basis_gives_what_separate_refinements_do() -> None:
     data = runs(0.02)
     method = MultipleShooting(tolerance=1e-9)
-    apart = refine(near(), data, replace(SETTINGS, method=method), rng=0)
+    apart = refine(near(), data, replace(SETTINGS, method=method), seed=0)
     for basis in (np.eye(6), np.random.default_rng(1).normal(size=(6, 6))):
         found = tied(near(), data, basis, method=method)
         for model, own in zip(found.models, apart, strict=True):
@@ -108,7 +108,7 @@ def test_tying_never_lowers_the_loss() -> None:
 def test_in_noise_a_tied_law_is_closer_to_the_truth_than_one_through_separate_fits() -> None:
     """One pulse leaves directions of a point free that the others fix."""
     data = runs(0.05)
-    apart = refine(near(), data, replace(SETTINGS, n_reweights=1), rng=0)
+    apart = refine(near(), data, replace(SETTINGS, n_reweights=1), seed=0)
     used = truths()[0].coef.T != 0.0
     own = np.array([each.model.coef.T[used] for each in apart])
     truth = np.array([each.coef.T[used] for each in truths()])
@@ -127,7 +127,7 @@ def test_intervals_hold_the_truth() -> None:
         data = [[each.trajectory(noise=0.01, rng=6 * number + k)] for k, each in enumerate(systems)]
         # Twenty windows a point, none twice: 120 clusters for 12 coefficients.
         settings = RefinementSettings(n_windows=20, window=25, n_reweights=0)
-        found = refine_law(truths(), data, BASIS, settings, rng=number)
+        found = refine_law(truths(), data, BASIS, settings, seed=number)
         assert found.covariance is not None
         assert found.covariance.shape == (12, 12)
         z.append((found.law - TRUE_LAW).ravel() / np.sqrt(np.diag(found.covariance)))

@@ -63,7 +63,7 @@ ASKED = [
     ({"terms": {"x": ["x^3"]}}, "unknown term 'x\\^3'; this library has"),
     ({"relations": ["z: x == 1"]}, r"unknown state 'z'; there are \['x', 'y'\]"),
     ({"relations": ["x: w == 1"]}, "unknown variable 'w'"),
-    ({"runs": []}, "needs at least one run: an empty list came"),
+    ({"runs": []}, "at least one run is needed: an empty list came"),
     ({"library": ep.polynomial(["x", "u"], degree=1)}, r"the library needs \['u'\]: sample it as"),
 ]
 

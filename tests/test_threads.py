@@ -80,7 +80,7 @@ def test_a_refinement_runs_on_one_thread() -> None:
 
     method = WatchedFit()
     rng = np.random.default_rng(0)
-    refine(PREY.model, [PREY.trajectory()], window=40, n_windows=3, method=method, rng=rng)
+    refine(PREY.model, [PREY.trajectory()], window=40, n_windows=3, method=method, seed=rng)
     assert method.seen
     assert set(method.seen) == {(1, 1)}
     assert threads() == (2, 2)

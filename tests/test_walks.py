@@ -42,8 +42,8 @@ def test_a_discovery_by_the_default_makes_no_rows() -> None:
 def test_a_refinement_is_followed_through_few_files() -> None:
     prey = ep.lotka_volterra()
     run = prey.trajectory(noise=0.02, rng=0)
-    ep.refine(prey.model, [run], window=30, n_windows=4, rng=0)  # imports, and compiles
-    entered = files_entered(lambda: ep.refine(prey.model, [run], window=30, n_windows=4, rng=0))
+    ep.refine(prey.model, [run], window=30, n_windows=4, seed=0)  # imports, and compiles
+    entered = files_entered(lambda: ep.refine(prey.model, [run], window=30, n_windows=4, seed=0))
     assert {path for path in entered if path.startswith("refinement/")} == {
         "refinement/judge.py",
         "refinement/kernels.py",
@@ -54,4 +54,4 @@ def test_a_refinement_is_followed_through_few_files() -> None:
         "refinement/steps.py",
         "refinement/windows.py",
     }
-    assert len(entered) <= 20, sorted(entered)
+    assert len(entered) <= 21, sorted(entered)  # with data/coerce.py, for it takes tables

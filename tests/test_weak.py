@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
+from ep2sindy.discovery.result import Discovery
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.regression.rows import RegressionRows

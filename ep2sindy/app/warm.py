@@ -97,7 +97,7 @@ def _refinement() -> None:
     system = ep.lotka_volterra()
     for step in (ep.refinement.RungeKutta(), ep.refinement.HermiteSimpson()):
         method = ep.refinement.MultipleShooting(step=step)
-        ep.refine(system.model, [system.trajectory()], window=20, n_windows=2, method=method, rng=0)
+        ep.refine(system.model, system.trajectory(), window=20, n_windows=2, method=method)
     model = system.model
     windows = DrivenWindows.free(np.ones((2, 1)), step_s=0.1, n_samples=3)
     Ensemble(model.library, model.states, model.coef[..., None]).paths(

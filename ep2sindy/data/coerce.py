@@ -60,7 +60,7 @@ def trajectories_of(runs: object, *, partial: bool = False) -> list[Trajectory]:
         runs = list(runs)
     if isinstance(runs, Sequence) and not isinstance(runs, tuple | str):
         if not runs:
-            raise ValueError("finding equations needs at least one run: an empty list came")
+            raise ValueError("at least one run is needed: an empty list came")
         return [_trajectory(run, f" {k} of the list", partial) for k, run in enumerate(runs)]
     return [_trajectory(runs, "", partial)]
 

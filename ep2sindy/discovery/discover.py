@@ -2,106 +2,31 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from ep2sindy.data.coerce import Runs, Task, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import NoiseTest, noise_test
+from ep2sindy.discovery.choice import noise_test
 from ep2sindy.discovery.method import (
     DiscoveryMethod,
     IdentifiedEquations,
     TrajectorySearch,
-    method_given,
 )
-from ep2sindy.estimation.estimate import Estimate
+from ep2sindy.discovery.result import Discovery
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.library.relations import Constraint, Relation, relations_of
+from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.library.roles import Roles
-from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
-from ep2sindy.regression.ambiguity import Ambiguity
-from ep2sindy.regression.front import Candidate, ParetoFront
+from ep2sindy.regression.front import Candidate
 from ep2sindy.runtime.progress import Progress, as_progress
-from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.runtime.values import check_kind
-
-MAX_NOTES = 6  # shown in the repr
+from ep2sindy.runtime.values import check_kind, old_keyword
 
 
-@dataclass(frozen=True, eq=False)
-class Discovery:
-    """Result of a discovery: the candidates of every state, and the model of the selected ones.
-
-    fronts: for each state, candidates with their scores, the lowest selected. chosen: for each
-    state, the selected candidate with its coefficients in the model. If the noise of the samples is
-    propagated into the rows, these come from a weighted refit. Their covariance is in the model.
-    method: that found the model. noise_test: test of the residuals against the noise.
-    ambiguities: terms that these data cannot tell apart, and warnings of too few rows for the
-    terms. note: how a rule for whole systems decided, how certain a trajectory search is, or that
-    the residuals exceed the noise; else empty. remarks: sentences on where the samples deviate from
-    the assumptions (`Estimate.remarks`). estimate: of states and coefficients together, after a
-    trajectory search. constraint: that the model's coefficients obey under relations or roles, to
-    be handed to `refine`; None without.
-
-    >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
-    >>> found = ep.discover(run)
-    >>> found.model.terms("x")
-    {'x': 0.66..., 'x*y': -0.99...}
-    >>> found.fronts["y"].candidates[2].terms
-    ('y', 'x*y')
-    """
-
-    fronts: Mapping[str, ParetoFront] = field(repr=False)
-    chosen: Mapping[str, Candidate]
-    model: SparseModel = field(repr=False)
-    method: DiscoveryMethod
-    ambiguities: Sequence[Ambiguity]
-    noise_test: NoiseTest = field(default_factory=NoiseTest)
-    note: str = ""
-    remarks: Sequence[str] = ()
-    estimate: Estimate | None = field(default=None, repr=False)
-    constraint: Constraint | None = field(default=None, repr=False)
-
-    @property
-    def scores(self) -> dict[str, Float[np.ndarray, " _candidates"]]:
-        """For each state, one score per candidate of its front, the lowest selected."""
-        return {state: front.scores for state, front in self.fronts.items()}
-
-    @property
-    def misfit(self) -> str:
-        """The reason why the model does not explain the data to within their noise.
-
-        Empty if it does, or if the model was not tested: `noise_test.tested` is then False.
-        """
-        return self.noise_test.misfit
-
-    def __repr__(self) -> str:
-        notes = [f"note: {each}" for each in self._notes()[:MAX_NOTES]]
-        left = len(self._notes()) - len(notes)
-        tail = [*notes, *([f"... {left} more notes"] if left else [])]
-        head = [self._headline(), *([self.note] if self.note else [])]
-        body = model_lines(self.model, n_lines=N_LINES - len(head) - len(tail))
-        return one_screen([*head, *body, *tail])
-
-    def _repr_html_(self) -> str:
-        notes = "".join(f"<li>{html.escape(each)}</li>" for each in self._notes())
-        lines = [self._headline(), *([self.note] if self.note else [])]
-        head = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
-        return head + model_html(self.model) + (f"<ul>{notes}</ul>" if notes else "")
-
-    def _notes(self) -> list[str]:
-        return [*self.remarks, *(each.message for each in self.ambiguities)]
-
-    def _headline(self) -> str:
-        return f"Discovery of {len(self.chosen)} equations, chosen by {self.method.selection!r}"
-
-
+@old_keyword(recipe="method")
 @one_thread()
 def discover(
     runs: Runs,
@@ -114,7 +39,6 @@ def discover(
     hidden: Sequence[str] = (),
     seed: int | np.random.Generator = 0,
     progress: Progress | bool = False,
-    recipe: DiscoveryMethod | None = None,
 ) -> Discovery:
     """Find sparse equations for every state of the runs.
 
@@ -128,12 +52,11 @@ def discover(
     coefficients, all terms of that equation. roles: of terms, for equations that conserve what
     states exchange (`Roles`); for a `Regression` by FreeRunScore or RefinedScore. hidden: names of
     states that nobody measured; they and their equations are found with the others', by a
-    `TrajectorySearch`. progress: True shows bars. recipe: the old name of method, for one more
-    version.
+    `TrajectorySearch`. progress: True shows bars.
     Raises ValueError for a relation, term or role that the library or the states do not have, roles
     that the method cannot keep, runs whose states or units differ, states or samples that repeat.
     """
-    method = method_given(method, recipe) or TrajectorySearch()
+    method = method or TrajectorySearch()
     trajectories = trajectories_of(runs, partial=True)
     names = dict.fromkeys([*trajectories[0].names, *hidden])
     library = polynomial(list(names)) if library is None else library

@@ -7,11 +7,10 @@ chosen ones.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool
@@ -35,8 +34,6 @@ from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.values import check_kind, set_counts
 from ep2sindy.selection.criteria import EBIC, Evidence
 from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
-
-M = TypeVar("M")
 
 
 @dataclass(frozen=True, eq=False)
@@ -381,18 +378,6 @@ class Regression:
 
 
 AnyMethod = TrajectorySearch | Regression
-
-
-def method_given(method: M | None, recipe: M | None) -> M | None:
-    """The method, also by its old name `recipe`, which warns; ValueError for both at once."""
-    if recipe is not None:
-        if method is not None:
-            raise ValueError("method and recipe are one argument, and both came: write method=...")
-        warnings.warn(
-            "recipe=... goes with the next version: write method=...", FutureWarning, stacklevel=4
-        )
-        return recipe
-    return method
 
 
 def _labels(task: Task) -> dict[str, str]:

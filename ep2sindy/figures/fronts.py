@@ -40,10 +40,10 @@ def front_figure(
     figure, axes = make_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
     for ax, (state, front) in zip(axes, fronts.items(), strict=True):
         index = front.candidates.index(front.best)
-        if front.problem is None:
-            _draw_scores(ax, front, index, label)
-        else:
+        if front.has_errors:
             _draw_front(ax, front, index)
+        else:
+            _draw_scores(ax, front, index, label)
         _add_hovers(ax, front, label)
         score = f"{_score_label(label)} = {front.best.score:.4g}"
         terms = _write_terms(front.best)
@@ -116,12 +116,11 @@ def _finite(scores: np.ndarray) -> np.ndarray:
 
 def _add_hovers(ax: Axes, front: ParetoFront, label: str) -> None:
     """Put an invisible spot over every candidate, whose hover text names it."""
-    has_rows = front.problem is not None
-    heights = np.clip(front.errors, FLOOR, TOP) if has_rows else _finite(front.scores)
+    heights = np.clip(front.errors, FLOOR, TOP) if front.has_errors else _finite(front.scores)
     for each, height in zip(front.candidates, heights, strict=True):
         terms = ", ".join(name.replace("*", " ") for name in each.terms) or "none"
         text = f"{front.equation}' of {each.n_terms} terms: {terms}"
-        error = f" | 1 - R2 = {height:.3g}" if has_rows else ""
+        error = f" | 1 - R2 = {height:.3g}" if front.has_errors else ""
         hover_spot(ax, float(each.n_terms), height, f"{text}{error} | {label} = {each.score:.4g}")
 
 

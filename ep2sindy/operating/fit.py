@@ -147,7 +147,7 @@ class OperatingFit:
             settings,
             constraints=self.relations.at(values_of(self.records)),
             start=near,
-            rng=self.seed,
+            seed=self.seed,
             progress=progress,
         )
         return self._law(functions, found.law, found.covariance, "tied"), found
@@ -232,11 +232,11 @@ def _refine_each(
     runs = [[record.run] for record in records]
     if not any(own.d.any() for own in relations):
         common = replace(settings, constraint=relations[0])
-        return refine(models, runs, common, rng=seed, progress=progress)
+        return refine(models, runs, common, seed=seed, progress=progress)
     rng = np.random.default_rng(seed)
     each = zip(models, runs, relations, strict=True)
     return [
-        refine(model, run, replace(settings, constraint=own), rng=rng, progress=progress)
+        refine(model, run, replace(settings, constraint=own), seed=rng, progress=progress)
         for model, run, own in each
     ]
 

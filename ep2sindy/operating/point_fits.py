@@ -213,7 +213,7 @@ def _refined(
         method=MultipleShooting(max_iter=study.refining.max_iter),
         constraint=case.constraint,
     )
-    found = refine(start, [run], settings, rng=rng)
+    found = refine(start, [run], settings, seed=rng)
     known = found.model.covariance is not None
     return Fitted(
         model=found.model,

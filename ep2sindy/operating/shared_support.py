@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.discovery.choice import assemble_model, fit_last
-from ep2sindy.discovery.method import Regression, method_given
+from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
@@ -20,7 +20,7 @@ from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.runtime.values import check_kind
+from ep2sindy.runtime.values import check_kind, old_keyword
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 
@@ -55,6 +55,7 @@ class SharedDiscovery:
     ambiguities: Mapping[str, Sequence[Ambiguity]] = field(repr=False)
 
 
+@old_keyword(recipe="method")
 @one_thread()
 def discover_shared(
     points: Mapping[str, Sequence[Trajectory]],
@@ -63,7 +64,6 @@ def discover_shared(
     *,
     seed: int | np.random.Generator = 0,
     progress: Progress | bool = False,
-    recipe: Regression | None = None,
 ) -> SharedDiscovery:
     """Find equations whose terms are the same at every operating point, with free coefficients.
 
@@ -74,12 +74,12 @@ def discover_shared(
     counted once. A term may vanish at some points, if it shows at others. For a single point the
     result is that of `discover` by the same `Regression`.
     points: name -> trajectories. Points are assembled in the order of their names. method: None
-    means Regression(). recipe: the old name of method, for one more version.
+    means Regression().
     Raises ValueError for a search that cannot serve several points, bootstraps (not available for
     several points), no point, or points whose states, variables or units differ.
     Source of the idea, for thresholding: Rudy et al. 2019, doi:10.1137/18M1191944.
     """
-    method = method_given(method, recipe) or Regression()
+    method = method or Regression()
     check_kind("method", method, Regression, "ep.Regression(search=ep.BestSubset())")
     search = _search_of(method)
     _check_points(points, library)

@@ -29,6 +29,7 @@ from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
+from ep2sindy.runtime.values import old_keyword
 
 # Default settings and method.
 SETTINGS = RefinementSettings(n_reweights=0)
@@ -90,6 +91,7 @@ class Corrected:
         return rate.reshape(states.shape) * self.rate
 
 
+@old_keyword(rng="seed")
 @one_thread()
 def refine_with_correction(
     model: SparseModel,
@@ -104,7 +106,7 @@ def refine_with_correction(
     constraint: Constraint | None = None,
     free_start: bool | None = None,
     n_reweights: int | None = None,
-    rng: np.random.Generator | int,
+    seed: int | np.random.Generator = 0,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
     progress: Progress | bool = False,
@@ -132,7 +134,7 @@ def refine_with_correction(
     )  # fmt: skip
     with as_progress(progress).stage(None, "iteration", "refinement") as advance:
         history, observe = record(callback, advance)
-        return _train(model, trajectories, correction, settings, rng, history, observe, device)
+        return _train(model, trajectories, correction, settings, seed, history, observe, device)
 
 
 def _train(
@@ -140,7 +142,7 @@ def _train(
     trajectories: Sequence[Trajectory],
     correction: nn.Module,
     settings: RefinementSettings,
-    rng: np.random.Generator | int,
+    seed: int | np.random.Generator,
     history: Sequence[Iteration],
     observe: Callable[[Iteration], None],
     device: str,
@@ -149,7 +151,7 @@ def _train(
     method = DESCENT if settings.method is None else settings.method
     if not isinstance(method, GradientDescent):
         raise ValueError(f"a learned correction is trained by GradientDescent alone: {method} came")
-    (batch,) = settings.cut([model], [trajectories], np.random.default_rng(rng))
+    (batch,) = settings.cut([model], [trajectories], np.random.default_rng(seed))
     known, ode = _known_and_whole(model, correction, batch, settings.constraint, device)
     problem = RefinementProblem(
         (ode,), (batch,), settings.free_start, settings.n_reweights, observe

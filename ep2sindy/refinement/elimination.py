@@ -17,7 +17,7 @@ from ep2sindy.refinement.ode import unconstrained
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine, with_coef
 from ep2sindy.runtime.progress import Progress, as_progress
-from ep2sindy.runtime.values import check_count
+from ep2sindy.runtime.values import check_count, old_keyword
 
 SETTINGS = RefinementSettings()
 
@@ -75,6 +75,7 @@ def join_names(terms: Sequence[tuple[str, str]]) -> str:
     return ", ".join(f"{state}: {term}" for state, term in terms)
 
 
+@old_keyword(rng="seed")
 def eliminate(
     model: SparseModel | Refinement,
     trajectories: Sequence[Trajectory],
@@ -82,7 +83,7 @@ def eliminate(
     *,
     min_free: int = 1,
     run_over: Trajectory | None = None,
-    rng: np.random.Generator | int,
+    seed: int | np.random.Generator = 0,
     progress: Progress | bool = False,
 ) -> Elimination:
     """Refine a model, drop the term of least |t|, refine the rest from there, and so on.
@@ -99,13 +100,13 @@ def eliminate(
 
     >>> runs = [ep.lotka_volterra().trajectory(noise=0.02, rng=0)]
     >>> model = ep.discover(runs).model
-    >>> ep.eliminate(model, runs, min_free=3, rng=0).best
+    >>> ep.eliminate(model, runs, min_free=3).best
     0
     """
     check_count("min_free", min_free)
     model = model.model if isinstance(model, Refinement) else model
     constraint = unconstrained(model) if settings.constraint is None else settings.constraint
-    seed = int(np.random.default_rng(rng).integers(2**32))
+    places = int(np.random.default_rng(seed).integers(2**32))  # the same windows for all
     path: list[Refinement] = []
     dropped: list[tuple[tuple[str, str], ...]] = []
     scores: list[float] = []
@@ -113,7 +114,7 @@ def eliminate(
     with as_progress(progress).stage(None, "model", "elimination") as advance:
         while shorter is not None:
             model, constraint, gone = shorter
-            found = refine(model, trajectories, settings, constraint=constraint, rng=seed)
+            found = refine(model, trajectories, settings, constraint=constraint, seed=places)
             path.append(found)
             dropped.append(gone)
             scores.append(_score(found, len(constraint.free)))

@@ -27,6 +27,7 @@ from ep2sindy.refinement.weighted_law import Basis, weighted_law
 from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
+from ep2sindy.runtime.values import old_keyword
 
 # Default settings; states are weighted by their standard deviation at every point.
 SETTINGS = RefinementSettings(n_windows=20, n_reweights=0)
@@ -58,6 +59,7 @@ class LawRefinement:
     history: tuple[Iteration, ...]
 
 
+@old_keyword(rng="seed")
 @one_thread()
 def refine_law(
     models: Sequence[SparseModel],
@@ -67,7 +69,7 @@ def refine_law(
     *,
     constraints: Sequence[Constraint] | None = None,
     start: Float[np.ndarray, "free terms"] | None = None,
-    rng: np.random.Generator | int,
+    seed: int | np.random.Generator = 0,
     callback: Callable[[Iteration], None] | None = None,
     progress: Progress | bool = False,
 ) -> LawRefinement:
@@ -91,7 +93,7 @@ def refine_law(
     _check_structure(models, len(basis), len(trajectories))
     relations = _one_for_each(models, settings.constraint, constraints)
     method = _multiple_shooting(settings)
-    batches = settings.cut(models, trajectories, np.random.default_rng(rng))
+    batches = settings.cut(models, trajectories, np.random.default_rng(seed))
     _check_counts(batches)
     with as_progress(progress).stage(None, "iteration", "refinement of a law") as advance:
         history, observe = record(callback, advance)

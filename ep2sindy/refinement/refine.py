@@ -5,12 +5,13 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import cast, overload
+from typing import Any, cast, overload
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.coerce import Runs, is_run, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.display import model_html, model_lines
@@ -36,6 +37,7 @@ from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.runtime.progress import Advance, Progress, as_progress, nothing
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
+from ep2sindy.runtime.values import old_keyword
 
 SETTINGS = RefinementSettings()
 
@@ -84,7 +86,7 @@ class Refinement:
 @overload
 def refine(
     model: SparseModel,
-    trajectories: Sequence[Trajectory],
+    trajectories: Runs,
     settings: RefinementSettings = SETTINGS,
     *,
     n_windows: int | None = None,
@@ -94,7 +96,7 @@ def refine(
     constraint: Constraint | None = None,
     free_start: bool | None = None,
     n_reweights: int | None = None,
-    rng: np.random.Generator | int,
+    seed: int | np.random.Generator = 0,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
     progress: Progress | bool = False,
@@ -116,17 +118,18 @@ def refine(
     n_reweights: int | None = None,
     constraints: Sequence[Constraint | None] | None = None,
     points_per_batch: int = 8,
-    rng: np.random.Generator | int,
+    seed: int | np.random.Generator = 0,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
     progress: Progress | bool = False,
 ) -> list[Refinement]: ...
 
 
+@old_keyword(rng="seed")
 @one_thread()
 def refine(
     model: SparseModel | Sequence[SparseModel],
-    trajectories: Sequence[Trajectory] | Sequence[Sequence[Trajectory]],
+    trajectories: Runs | Sequence[Sequence[Trajectory]],
     settings: RefinementSettings = SETTINGS,
     *,
     n_windows: int | None = None,
@@ -138,23 +141,23 @@ def refine(
     n_reweights: int | None = None,
     constraints: Sequence[Constraint | None] | None = None,
     points_per_batch: int = 8,
-    rng: np.random.Generator | int,
+    seed: int | np.random.Generator = 0,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
     progress: Progress | bool = False,
 ) -> Refinement | list[Refinement]:
     """Fit the free coefficients to windows spread over trajectories, by least squares.
 
-    model: one model, or a list of models of the same states, each with its own list of
-    trajectories; for a list the result is a list. n_windows to n_reweights: override `settings`,
-    see there. constraints: for a list, the constraint of each model or None, in place of
-    `constraint`. points_per_batch: models integrated together, few enough for the processor's
-    cache; thousands on a GPU. Each costs as much as the largest. progress: see `Progress`.
+    model: one model, or a list of models of the same states. trajectories: one run or a list, as
+    `discover` takes them; for a list of models a list each, and the result is a list. n_windows to
+    n_reweights: override `settings`, see there. constraints: for a list, the constraint of each
+    model or None, in place of `constraint`. points_per_batch: models integrated together, few
+    enough for the processor's cache; thousands on a GPU. progress: see `Progress`.
     Raises ValueError for a window that fits no trajectory, a missing variable, a model without
     terms, a constraint that leaves out one, or models that differ in their variables or the number
     of their windows. A failed fit is a result: see `status` and `message`.
     >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
-    >>> refined = ep.refine(ep.discover(run).model, [run], rng=0)
+    >>> refined = ep.refine(ep.discover(run).model, run)
     >>> str(refined.status)
     'converged'
     """
@@ -165,7 +168,7 @@ def refine(
     settings = settings.override(changes)
     models, records = _by_model(model, trajectories)
     relations = _by_constraint(settings, models, constraints)
-    batches = settings.cut(models, records, np.random.default_rng(rng))
+    batches = settings.cut(models, records, np.random.default_rng(seed))
     with as_progress(progress).stage(None, "iteration", "refinement") as advance:
         refinements: list[Refinement] = []
         for some in _chunks(len(models), points_per_batch):
@@ -178,22 +181,21 @@ def refine(
 
 def _by_model(
     model: SparseModel | Sequence[SparseModel],
-    trajectories: Sequence[Trajectory] | Sequence[Sequence[Trajectory]],
+    trajectories: Runs | Sequence[Sequence[Trajectory]],
 ) -> tuple[Sequence[SparseModel], Sequence[Sequence[Trajectory]]]:
     """Arguments of `refine` as a list of models and the trajectories of each."""
-    alone = isinstance(trajectories, Trajectory)
-    flat = alone or any(isinstance(each, Trajectory) for each in trajectories)
-    if alone or (len(trajectories) and flat != isinstance(model, SparseModel)):
-        raise ValueError(
-            "one model takes a list of trajectories, as in refine(model, [run]), and a list of "
-            "models a list of such lists, as in refine(models, [[run] for run in runs]): "
-            f"{type(model).__name__} came with {type(trajectories).__name__}"
-            f"{' of trajectories' if flat and not alone else ''}"
-        )
     if isinstance(model, SparseModel):
-        model, trajectories = [model], [cast("Sequence[Trajectory]", trajectories)]
-    records = cast("Sequence[Sequence[Trajectory]]", trajectories)
-    return model, [[run.complete() for run in runs] for runs in records]
+        models, records = [model], [trajectories_of(cast("Runs", trajectories), partial=True)]
+    else:
+        models = list(model)
+        if is_run(trajectories) or any(map(is_run, cast("Sequence[Any]", trajectories))):
+            raise ValueError(
+                "a list of models takes a list of trajectories for each, as in "
+                f"refine(models, [[run] for run in runs]): {len(models)} models came with "
+                f"{'one run' if is_run(trajectories) else 'a list of runs'}"
+            )
+        records = [list(runs) for runs in cast("Sequence[Sequence[Trajectory]]", trajectories)]
+    return models, [[run.complete() for run in runs] for runs in records]
 
 
 def _by_constraint(

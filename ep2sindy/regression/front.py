@@ -98,10 +98,16 @@ class ParetoFront:
         """Rows of the regression. Raises ValueError if there are none."""
         if self.problem is None:
             raise ValueError(
-                f"rows are needed to judge the candidates of {self.equation!r}, and a search of "
-                "trajectories has none: take a regression, such as Regression(WeightedWeak())"
+                f"rows are needed to judge the candidates of {self.equation!r}; a search of "
+                "trajectories has none, and a discovery that was stored keeps none: take a "
+                "regression, such as Regression(WeightedWeak())"
             )
         return self.problem
+
+    @property
+    def has_errors(self) -> bool:
+        """True after a regression; a search of trajectories has scores alone."""
+        return not np.isnan(self.candidates[0].r2)
 
     @property
     def held_out(self) -> bool:
@@ -155,11 +161,11 @@ class ParetoFront:
     @property
     def _figure(self) -> str:
         """Heading of the figure of merit in tables."""
-        return "R2" if self.problem is not None else "deviance"
+        return "R2" if self.has_errors else "deviance"
 
     @property
     def _figures(self) -> list[str]:
-        if self.problem is not None:
+        if self.has_errors:
             return [f"{c.r2:.6f}" for c in self.candidates]
         return ["" if c.deviance is None else f"{c.deviance:.6g}" for c in self.candidates]
 

@@ -77,7 +77,7 @@ class TrialSystem:
             window=window,
             constraint=self.constraint,
             n_reweights=n_reweights,
-            rng=seed,
+            seed=seed,
         )
         return found.model
 

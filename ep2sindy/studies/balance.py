@@ -451,7 +451,7 @@ def _without(
     values = np.array([model.terms(s).get(term, 0.0) for s, term in less.coefficients])
     start = with_coef(model, less, less.coef(values[less.free]))[0]
     found = refine(
-        start, [train], window=window, constraint=less, n_reweights=0, rng=0, progress=progress
+        start, [train], window=window, constraint=less, n_reweights=0, seed=0, progress=progress
     )
     if found.status == "non_finite":
         return None

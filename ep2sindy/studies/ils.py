@@ -124,11 +124,11 @@ class Study:
         for name, (_, each) in count_pieces(run.watch, starts.items(), "refinement"):
             watch = watcher(run.board.scalars, name, each)
             refinement = partial(again[name], callback=watch, progress=run.watch)
-            judged[name] = refine_and_judge(refinement, held, rng=next(streams))
+            judged[name] = refine_and_judge(refinement, held, seed=next(streams))
         by_window = {
             name: {
                 length: refine_and_judge(
-                    partial(again[name], window=length, progress=run.watch), held, rng=stream
+                    partial(again[name], window=length, progress=run.watch), held, seed=stream
                 )
                 for length in count_pieces(run.watch, self.windows, "window length", name)
             }
@@ -136,7 +136,7 @@ class Study:
         }
         draws = {
             name: [
-                free_run(again[name](rng=each).model, held)
+                free_run(again[name](seed=each).model, held)
                 for each in count_pieces(run.watch, stream.spawn(self.n_draws), "draw", name)
             ]
             for name, stream in zip(starts, draws_rng.spawn(3), strict=True)
@@ -173,7 +173,7 @@ class Study:
     def _refinement(
         self, start: SparseModel, relations: Constraint, train: Trajectory, window: int | None
     ) -> Callable[..., Refinement]:
-        """The refinement from a start, as a function of its rng and the remaining arguments."""
+        """The refinement from a start, as a function of its seed and the remaining arguments."""
         from ep2sindy.refinement.problem import RefinementSettings
         from ep2sindy.refinement.refine import refine  # PyTorch takes seconds to load
 
@@ -213,10 +213,10 @@ class Study:
 
 
 def refine_and_judge(
-    refinement: Callable[..., Refinement], held: Trajectory, *, rng: np.random.Generator
+    refinement: Callable[..., Refinement], held: Trajectory, *, seed: np.random.Generator
 ) -> Evaluation:
     begun = process_time()
-    found = refinement(rng=rng)
+    found = refinement(seed=seed)
     cpu_s = process_time() - begun
     return evaluate(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
 

@@ -388,7 +388,7 @@ class Outcome:
         for name, result in self.results.items():
             found = result.discovery
             front = partial(front_figure, found.fronts, label=result.label)
-            has_rows = any(each.problem is not None for each in found.fronts.values())
+            has_rows = any(each.has_errors for each in found.fronts.values())
             drawn[f"front_{name}"] = Captioned(front, FRONT if has_rows else SCORED)
         for name, living in self.living.items():
             drawn |= living.figures(name)

@@ -12,8 +12,8 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import LeftOver, NoiseTest
-from ep2sindy.discovery.discover import Discovery
 from ep2sindy.discovery.method import AnyMethod, Regression
+from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.estimate import Estimate, Rival
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.equations import equation_text
@@ -117,7 +117,7 @@ class LibraryResult:
 
     def _front_table(self, front: ParetoFront) -> pd.DataFrame:
         table = ResultTable(candidate_rows(front), candidate_metrics(self.label)).csv()
-        without = ["r2_test", "r2_train"] if front.problem is None else []
+        without = [] if front.has_errors else ["r2_test", "r2_train"]
         return table.drop(columns=without)  # a search of trajectories has no regression rows
 
     def sections(self, name: str, data: Trajectory) -> list[Section]:

@@ -17,8 +17,9 @@ import pandas as pd
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
+from ep2sindy.discovery.result import Discovery
 from ep2sindy.figures import living as figures
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, polynomial
@@ -428,5 +429,5 @@ def _refined(
     """Refine a model on windows of two periods, if the data have a period."""
     from ep2sindy.refinement.refine import refine  # loads torch, only for a refinement
 
-    found = refine(model, [train], window=two_periods(train), rng=0, progress=progress)
+    found = refine(model, [train], window=two_periods(train), seed=0, progress=progress)
     return Refined(found.status, free_run(found.model, held, initial=start_of(held, model)))

@@ -19,9 +19,10 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.data.conversion import to_si
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
-from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.fitted_functions import FITTED, fit_functions
 from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
+from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.explanation import FIRST_MAX_TERMS
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.skill import forecast_skill

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import TrajectorySearch
+from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.forecasting.tracking import Tracker, track
 from ep2sindy.library.library import Library

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import Discovery
+from ep2sindy.discovery.result import Discovery
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.figures.living import (
     cycle_figure,
@@ -241,7 +241,7 @@ class Outcome:
 
     def _front(self, state: str) -> ResultTable[CandidateRow]:
         front = self.found.fronts[state]
-        metrics = [m for m in CANDIDATES if m.key != "r2" or front.problem is not None]
+        metrics = [m for m in CANDIDATES if m.key != "r2" or front.has_errors]
         return ResultTable(candidate_rows(front), metrics)
 
     def figures(self) -> dict[str, Captioned]:

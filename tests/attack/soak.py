@@ -50,7 +50,7 @@ def refine() -> None:
     import ep2sindy as ep
 
     system = ep.lotka_volterra()
-    ep.refine(system.model, [system.trajectory(noise=0.02, rng=0)], n_windows=4, rng=0)
+    ep.refine(system.model, [system.trajectory(noise=0.02, rng=0)], n_windows=4, seed=0)
 
 
 def run_freely() -> None:

@@ -1,0 +1,269 @@
+"""The result of a discovery: what was found, what was weighed, and how it is shown and stored."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ep2sindy._stubs import dotted_names, place_of
+from ep2sindy.data.coerce import Run
+from ep2sindy.discovery.choice import LeftOver, NoiseTest
+from ep2sindy.discovery.method import DiscoveryMethod
+from ep2sindy.estimation.estimate import Estimate
+from ep2sindy.forecasting.bands import Forecast
+from ep2sindy.forecasting.forecast import forecast
+from ep2sindy.library.functions import UnknownFunctionError
+from ep2sindy.library.relations import Constraint, Process
+from ep2sindy.model.display import model_html, model_lines
+from ep2sindy.model.model import SparseModel
+from ep2sindy.model.rollout import Rollout
+from ep2sindy.model.storage import read_stored
+from ep2sindy.regression.ambiguity import Ambiguity
+from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
+from ep2sindy.runtime.files import read_json, write_text
+from ep2sindy.runtime.screen import N_LINES, one_screen
+
+FORMAT = "ep2sindy.Discovery/1"
+
+MAX_NOTES = 6  # shown in the repr
+
+# What a file may hold beside the values that configs may name.
+STORED = {
+    kind.__name__: kind
+    for kind in (Ambiguity, Candidate, Cloud, Constraint, LeftOver, NoiseTest, ParetoFront, Process)
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Discovery:
+    """Result of a discovery: the candidates of every state, and the model of the selected ones.
+
+    fronts: for each state, candidates with their scores, the lowest selected. chosen: for each
+    state, the selected candidate with its coefficients in the model. If the noise of the samples is
+    propagated into the rows, these come from a weighted refit. Their covariance is in the model.
+    method: that found the model. noise_test: test of the residuals against the noise.
+    ambiguities: terms that these data cannot tell apart, and warnings of too few rows for the
+    terms. note: how a rule for whole systems decided, how certain a trajectory search is, or that
+    the residuals exceed the noise; else empty. remarks: sentences on where the samples deviate from
+    the assumptions (`Estimate.remarks`). estimate: of states and coefficients together, after a
+    trajectory search. constraint: that the model's coefficients obey under relations or roles, to
+    be handed to `refine`; None without.
+
+    >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
+    >>> found = ep.discover(run)
+    >>> found.model.terms("x")
+    {'x': 0.66..., 'x*y': -0.99...}
+    >>> found.fronts["y"].candidates[2].terms
+    ('y', 'x*y')
+    """
+
+    fronts: Mapping[str, ParetoFront] = field(repr=False)
+    chosen: Mapping[str, Candidate]
+    model: SparseModel = field(repr=False)
+    method: DiscoveryMethod
+    ambiguities: Sequence[Ambiguity]
+    noise_test: NoiseTest = field(default_factory=NoiseTest)
+    note: str = ""
+    remarks: Sequence[str] = ()
+    estimate: Estimate | None = field(default=None, repr=False)
+    constraint: Constraint | None = field(default=None, repr=False)
+
+    @property
+    def scores(self) -> dict[str, Float[np.ndarray, " _candidates"]]:
+        """For each state, one score per candidate of its front, the lowest selected."""
+        return {state: front.scores for state, front in self.fronts.items()}
+
+    @property
+    def misfit(self) -> str:
+        """The reason why the model does not explain the data to within their noise.
+
+        Empty if it does, or if the model was not tested: `noise_test.tested` is then False.
+        """
+        return self.noise_test.misfit
+
+    def simulate(
+        self,
+        t: ArrayLike,
+        x0: ArrayLike,
+        inputs: ArrayLike | Mapping[str, Any] | None = None,
+        *,
+        draws: int = 0,
+        seed: int = 0,
+    ) -> Rollout:
+        """Integrate the model freely from the state x0 at t[0]; see `SparseModel.simulate`."""
+        return self.model.simulate(t, x0, inputs, draws=draws, seed=seed)
+
+    def score(
+        self, run: Run, *, x_dot: Float[np.ndarray, "samples n_states"] | None = None
+    ) -> float:
+        """R2 of the model's derivative over a run; see `SparseModel.score`."""
+        return self.model.score(run, x_dot=x_dot)
+
+    def forecast(
+        self,
+        history: Run,
+        horizon: float | ArrayLike,
+        *,
+        fitted_to: Run | None = None,
+        inputs: ArrayLike | Mapping[str, Any] | None = None,
+        n_draws: int = 200,
+        seed: int = 0,
+    ) -> Forecast:
+        """Forecast from the end of a record, with bands; see `ep.forecast`.
+
+        history: the samples before the forecast. horizon: a duration or times, in s.
+        """
+        return forecast(
+            self.model, history, horizon, fitted_to=fitted_to, inputs=inputs, n_draws=n_draws,
+            seed=seed,
+        )  # fmt: skip
+
+    def to_json(self) -> str:
+        """JSON text of all but the samples; floats in their shortest exact form.
+
+        Not stored are the rows behind `fronts`, and `estimate`, which holds every sample.
+        Raises ValueError if the method, or a part of it, is a class of your own.
+        """
+        without_rows = {state: replace(f, problem=None) for state, f in self.fronts.items()}
+        parts = replace(self, fronts=without_rows)
+        content = {"format": FORMAT, "model": json.loads(self.model.to_json())}
+        content |= {name: _stored(getattr(parts, name)) for name in _PARTS}
+        return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+    @staticmethod
+    def from_json(text: str) -> Discovery:
+        """Inverse of `to_json`, exact; fronts have no rows then, and `estimate` is None.
+
+        No code from the text runs, and functions of your own must be registered before.
+        Raises ValueError for anything else.
+        """
+        try:
+            content = read_json(text)
+            if content["format"] != FORMAT:
+                raise ValueError(f"format {content['format']!r}")
+            model = SparseModel.from_json(json.dumps(content["model"]))
+            found = Discovery(model=model, **{name: _restored(content[name]) for name in _PARTS})
+            _check_parts(found)
+            return found
+        except UnknownFunctionError:
+            raise  # the text is sound: a function must be registered before it is read
+        except KeyError as error:
+            raise ValueError(f"a discovery must be {FORMAT} JSON: {error} is missing") from error
+        except (TypeError, ValueError, AttributeError, AssertionError, RecursionError) as error:
+            raise ValueError(f"a discovery must be {FORMAT} JSON: {error}") from error
+
+    def save(self, path: str | Path) -> None:
+        """Write the discovery as JSON, completely or not at all; see `to_json`."""
+        write_text(Path(path), self.to_json())
+
+    @staticmethod
+    def load(path: str | Path) -> Discovery:
+        """Read what `save` has written; see `from_json`."""
+        return read_stored(Path(path), Discovery.from_json)
+
+    def __repr__(self) -> str:
+        notes = [f"note: {each}" for each in self._notes()[:MAX_NOTES]]
+        left = len(self._notes()) - len(notes)
+        tail = [*notes, *([f"... {left} more notes"] if left else [])]
+        head = [self._headline(), *([self.note] if self.note else [])]
+        body = model_lines(self.model, n_lines=N_LINES - len(head) - len(tail))
+        return one_screen([*head, *body, *tail])
+
+    def _repr_html_(self) -> str:
+        notes = "".join(f"<li>{html.escape(each)}</li>" for each in self._notes())
+        lines = [self._headline(), *([self.note] if self.note else [])]
+        head = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
+        return head + model_html(self.model) + (f"<ul>{notes}</ul>" if notes else "")
+
+    def _notes(self) -> list[str]:
+        return [*self.remarks, *(each.message for each in self.ambiguities)]
+
+    def _headline(self) -> str:
+        return f"Discovery of {len(self.chosen)} equations, chosen by {self.method.selection!r}"
+
+
+# Fields of a Discovery that are stored beside the model.
+_PARTS = (
+    "fronts", "chosen", "method", "ambiguities", "noise_test", "note", "remarks", "constraint",
+)  # fmt: skip
+
+
+def _stored(value: Any) -> Any:
+    """A value as JSON that `_restored` reads: arrays, mappings and dataclasses say what they are.
+
+    Raises ValueError for a value that is neither in `STORED` nor one that configs may name.
+    """
+    if isinstance(value, float) and not np.isfinite(value):
+        return {"number": repr(float(value))}
+    if value is None or isinstance(value, str | int | float):
+        return value
+    if isinstance(value, np.ndarray):
+        numbers = [_stored(number) for number in value.ravel().tolist()]
+        return {"array": numbers, "shape": list(value.shape), "type": value.dtype.name}
+    if isinstance(value, Mapping):
+        return {"mapping": [[_stored(key), _stored(each)] for key, each in value.items()]}
+    if isinstance(value, list | tuple):
+        return [_stored(each) for each in value]
+    name = type(value).__name__ if type(value) in STORED.values() else place_of(type(value))
+    if name is None or not is_dataclass(value):
+        raise ValueError(
+            f"a discovery is stored with its method, of classes of this package alone: {value!r} "
+            "came; store its model, found.model.save(path)"
+        )
+    return {"class": name, **{f.name: _stored(getattr(value, f.name)) for f in fields(value)}}
+
+
+def _restored(content: Any) -> Any:
+    """Inverse of `_stored`; lists become tuples. Raises ValueError for a class of another kind."""
+    if isinstance(content, list):
+        return tuple(_restored(each) for each in content)
+    if not isinstance(content, dict):
+        return content
+    if "number" in content:
+        return float(content["number"])
+    if "mapping" in content:
+        return {_restored(key): _restored(each) for key, each in content["mapping"]}
+    if "array" in content:
+        if content["type"] not in ("float64", "int64", "bool"):
+            raise ValueError(f"an array of type {content['type']!r:.80}")
+        numbers = [_restored(number) for number in content["array"]]
+        return np.array(numbers, dtype=content["type"]).reshape(content["shape"])
+    kind = _class_named(content["class"])
+    return kind(**{name: _restored(each) for name, each in content.items() if name != "class"})
+
+
+def _class_named(name: str) -> type:
+    """One of `STORED`, or a dataclass of the face that configs, of anybody, may name as well."""
+    entry = dotted_names().get(name)
+    kind = STORED.get(name) or (entry.load() if entry is not None and entry.for_configs else None)
+    if not (isinstance(kind, type) and is_dataclass(kind)):
+        raise ValueError(f"no class {name!r:.80} may stand in such a file")
+    return kind
+
+
+def _check_parts(found: Discovery) -> None:
+    """Raise ValueError for parts of other kinds, or not of the model's states and terms."""
+    if not isinstance(found.method, DiscoveryMethod):
+        raise ValueError(f"a method that finds nothing: {found.method!r:.80}")
+    kinds = (found.noise_test, NoiseTest), (found.constraint, Constraint | None)
+    if not all(isinstance(value, kind) for value, kind in kinds):
+        raise ValueError("noise_test or constraint of another kind")
+    if not all(isinstance(each, Ambiguity) for each in found.ambiguities):
+        raise ValueError("ambiguities of another kind")
+    if not all(isinstance(text, str) for text in (found.note, *found.remarks)):
+        raise ValueError("a note and remarks that are no texts")
+    if {*found.fronts, *found.chosen} != set(found.model.states):
+        raise ValueError(f"fronts and candidates of other states than {found.model.states}")
+    for state, front in found.fronts.items():
+        for each in (*front.candidates, found.chosen[state]):
+            known = set(each.terms) <= set(found.model.library.names)
+            if each.equation != state or not known or each.coef.shape != (len(each.terms),):
+                raise ValueError(f"a candidate that is no equation of {state}: {each!r:.80}")
