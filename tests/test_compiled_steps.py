@@ -52,7 +52,8 @@ def test_starts_that_a_kernel_brings_near_the_end_reach_what_a_loop_reaches(
     """van der Pol with a second, repelling cycle far out: some starts leave."""
     model = model_of({"x": {"y": 1.0}, "y": {"x": -1.0, "y": 1.0, "x^2*y": -1.0, "x^4*y": 0.05}})
     t = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
-    cycle = LimitCycle(6.6, 2.0 * np.stack([np.sin(t), np.cos(t)], axis=1), np.array([1.0, 0.001]))
+    states = 2.0 * np.stack([np.sin(t), np.cos(t)], axis=1)
+    cycle = LimitCycle(6.6, states, np.array([1.0, 0.001]), model)
     found = share_reaching(model, cycle, n_starts=32, n_periods=8.0)
 
     def as_they_are(self: ScaledModel, y: np.ndarray, *_: object, **__: object) -> tuple:

@@ -7,11 +7,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ep2sindy.library.library import polynomial
+from ep2sindy.model.draws import halton
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import (
     CycleStability,
     LimitCycle,
-    _halton,
     _starts,
     limit_cycle,
     share_reaching,
@@ -250,12 +250,13 @@ def test_fast_relaxation_is_resolved() -> None:
 )
 def test_stability_is_that_of_the_largest_multiplier(modulus: float, stability: str) -> None:
     multipliers = np.array([1.0, modulus * np.exp(2.0j), 0.0])
-    assert LimitCycle(1.0, np.zeros((8, 3)), multipliers).stability == stability
+    model = model_of({name: {name: 1.0} for name in "xyz"})
+    assert LimitCycle(1.0, np.zeros((8, 3)), multipliers, model).stability == stability
 
 
 def test_a_model_with_inputs_has_no_cycle_of_its_own() -> None:
     model = model_of({"x": {"y": 1.0}, "y": {"u": 1.0}}, inputs=["u"])
-    cycle = LimitCycle(1.0, np.zeros((8, 2)), np.array([1.0 + 0j, 0.5]))
+    cycle = LimitCycle(1.0, np.zeros((8, 2)), np.array([1.0 + 0j, 0.5]), model)
     with pytest.raises(ValueError, match=r"without inputs: this one has \['u'\]"):
         limit_cycle(model, np.ones(2), period_s=1.0)
     with pytest.raises(ValueError, match="without inputs"):
@@ -305,4 +306,4 @@ def test_starts_are_spread_as_by_haltons_sequence(n_dimensions: int) -> None:
     from scipy.stats import qmc
 
     scipys = qmc.Halton(n_dimensions, scramble=False).fast_forward(1).random(64)
-    np.testing.assert_array_equal(_halton(64, n_dimensions), scipys)
+    np.testing.assert_array_equal(halton(64, n_dimensions), scipys)

@@ -35,30 +35,37 @@ def front_figure(
 
     The supports that the search proposed are drawn light behind the front. Errors below FLOOR are
     drawn on a line at FLOOR, and errors above TOP as marks at the upper edge.
-    label: name of the scores, of which the lowest is selected.
+    label: name of the scores, of which the lowest is selected; without scores none is marked.
     """
     figure, axes = make_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
-    for ax, (state, front) in zip(axes, fronts.items(), strict=True):
-        index = front.candidates.index(front.best)
+    for ax, front in zip(axes, fronts.values(), strict=True):
+        chosen = None if np.isnan(front.scores).all() else front.candidates.index(front.best)
         if front.has_errors:
-            _draw_front(ax, front, index)
+            _draw_front(ax, front, chosen)
         else:
-            _draw_scores(ax, front, index, label)
+            _draw_scores(ax, front, chosen, label)
         _add_hovers(ax, front, label)
-        score = f"{_score_label(label)} = {front.best.score:.4g}"
-        terms = _write_terms(front.best)
-        ax.set_title(f"${latex_derivative(state)}$: {terms}\n{score}", fontsize=TITLE)
+        ax.set_title(_title(front, label, chosen=chosen is not None), fontsize=TITLE)
     entries = {line.get_label(): line for ax in axes for line in ax.lines if _has_label(line)}
     shown = [entries[name] for name in _LAYERS if name in entries]
     legend_above(figure, shown)
     return figure
 
 
+def _title(front: ParetoFront, label: str, *, chosen: bool) -> str:
+    """The state, and the terms and the score of the selected candidate if a rule has selected."""
+    state = f"${latex_derivative(front.equation)}$"
+    if not chosen:
+        return state
+    score = f"{_score_label(label)} = {front.best.score:.4g}"
+    return f"{state}: {_write_terms(front.best)}\n{score}"
+
+
 # Legend entries, from the back to the front.
 _LAYERS = ("all supports fitted", "runners-up", "best of size", "selected")
 
 
-def _draw_front(ax: Axes, front: ParetoFront, chosen: int) -> None:
+def _draw_front(ax: Axes, front: ParetoFront, chosen: int | None) -> None:
     """Draw all supports, runners-up, the best of every size (line) and the selected (star)."""
     lowest = front.errors.min()
     if front.cloud is not None:
@@ -76,7 +83,7 @@ def _draw_front(ax: Axes, front: ParetoFront, chosen: int) -> None:
         )  # fmt: skip
 
 
-def _draw_scores(ax: Axes, front: ParetoFront, chosen: int, label: str) -> None:
+def _draw_scores(ax: Axes, front: ParetoFront, chosen: int | None, label: str) -> None:
     """Draw the scores of runners-up, of the best of every size (line) and of the selected (star).
 
     The axis is linear near zero, where the best scores are. A candidate that cannot be run, such as
@@ -87,7 +94,7 @@ def _draw_scores(ax: Axes, front: ParetoFront, chosen: int, label: str) -> None:
     ax.set_yscale("symlog", linthresh=1.0)
 
 
-def _draw_candidates(ax: Axes, front: ParetoFront, heights: np.ndarray, chosen: int) -> None:
+def _draw_candidates(ax: Axes, front: ParetoFront, heights: np.ndarray, chosen: int | None) -> None:
     """Draw runners-up, the best of every size as a line, and the selected candidate as a star."""
     _, runners_up, best_of_size, star = _LAYERS
     best = front.leading
@@ -98,10 +105,11 @@ def _draw_candidates(ax: Axes, front: ParetoFront, heights: np.ndarray, chosen: 
         front.sizes[best], heights[best], "o-", c=COLOURS[0], ms=5, lw=1, zorder=4,
         label=best_of_size,
     )  # fmt: skip
-    ax.plot(
-        front.sizes[chosen], heights[chosen], "*", ms=14, color=COLOURS[1], mec="white", mew=0.5,
-        zorder=5, label=star,
-    )  # fmt: skip
+    if chosen is not None:
+        ax.plot(
+            front.sizes[chosen], heights[chosen], "*", ms=14, color=COLOURS[1], mec="white",
+            mew=0.5, zorder=5, label=star,
+        )  # fmt: skip
     ax.set(xlabel="number of terms")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.margins(x=0.06)

@@ -26,9 +26,13 @@ from ep2sindy.figures.style import (
 from ep2sindy.library.units import Clock
 from ep2sindy.model.comparison import LONG
 from ep2sindy.model.rollout import Rollout
+from ep2sindy.model.stability import LimitCycle
 from ep2sindy.signals.attractor import Cycle, best_shift, find_cycle
 
 PERIODS = 6.0  # periods shown at either end of a record
+
+STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distance from the cycle's middle, relative to its states
+N_PERIODS = 12.0  # duration of a run from such a start, in periods
 
 PHASES = np.linspace(0.0, 2.0, 257)  # two periods, in periods
 
@@ -65,38 +69,60 @@ def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Fi
 
 
 def cycle_figure(
-    run: Trajectory,
-    cycle: Float[np.ndarray, "samples n_states"],
-    paths: Sequence[Rollout],
-    *,
-    plane: Sequence[str],
+    run: Trajectory | None, cycle: LimitCycle, paths: Sequence[Rollout], *, plane: Sequence[str]
 ) -> Figure:
-    """The model's limit cycle over the data in the plane of two states; runs from other starts.
+    """A model's limit cycle over data in the plane of two states; runs from other starts.
 
-    cycle: one period of the model, with states in the order of the run's. Dots mark the starts. A
-    run that leaves the panel is not drawn again.
+    run: the data; None leaves them out. Dots mark the starts. A run that leaves the panel is not
+    drawn again.
     """
-    pair = [run.state_names.index(name) for name in plane]
     figure, (ax,) = make_grid(1, width=4.4, height=3.8, extra=0.5)
-    ax.plot(*run.states[:, pair].T, color=GREY, lw=0.6)
-    for path in paths:
-        x, y = (path.states[:, path.state_names.index(name)] for name in plane)
-        ax.plot(x, y, color=COLOURS[5], lw=0.7)
-        ax.plot(x[0], y[0], "o", color=COLOURS[5], ms=4)
-    closed = np.concatenate([cycle, cycle[:1]])[:, pair]
-    ax.plot(*closed.T, color=COLOURS[1], lw=2.0)
-    for set_limits, k in ((ax.set_xlim, 0), (ax.set_ylim, 1)):
-        starts = np.array([path.states[0, path.state_names.index(plane[k])] for path in paths])
-        set_limits(frame_limits(run.states[:, pair[k]], np.concatenate([closed[:, k], starts])))
-    ax.set_xlabel(axis_label(plane[0], run.units[plane[0]]))
-    ax.set_ylabel(axis_label(plane[1], run.units[plane[1]]))
     handles = [
-        Line2D([], [], color=GREY, lw=2.0, label="data"),
         Line2D([], [], color=COLOURS[1], lw=2.0, label="the model's cycle"),
         Line2D([], [], color=COLOURS[5], marker="o", ms=4, lw=0.8, label="from other starts"),
     ]
+    closed = _columns(np.concatenate([cycle.states, cycle.states[:1]]), cycle.model.states, plane)
+    data = closed
+    if run is not None:
+        data = _columns(run.states, run.state_names, plane)
+        ax.plot(*data.T, color=GREY, lw=0.6)
+        handles.insert(0, Line2D([], [], color=GREY, lw=2.0, label="data"))
+    for path in paths:
+        x, y = _columns(path.states, path.state_names, plane).T
+        ax.plot(x, y, color=COLOURS[5], lw=0.7)
+        ax.plot(x[0], y[0], "o", color=COLOURS[5], ms=4)
+    ax.plot(*closed.T, color=COLOURS[1], lw=2.0)
+    starts = [_columns(path.states[:1], path.state_names, plane) for path in paths]
+    shown = np.concatenate([closed, *starts])
+    ax.set(
+        xlim=frame_limits(data[:, 0], shown[:, 0]),
+        ylim=frame_limits(data[:, 1], shown[:, 1]),
+        xlabel=axis_label(plane[0], cycle.model.units[plane[0]]),
+        ylabel=axis_label(plane[1], cycle.model.units[plane[1]]),
+    )
     legend_above(figure, handles)
     return figure
+
+
+def _columns(
+    states: Float[np.ndarray, "samples n_states"], names: Sequence[str], plane: Sequence[str]
+) -> Float[np.ndarray, "samples 2"]:
+    return states[:, [names.index(name) for name in plane]]
+
+
+def paths_off(cycle: LimitCycle) -> list[Rollout]:
+    """Runs of a cycle's model from states off it, some nearer to its middle and some farther."""
+    middle = cycle.states.mean(axis=0)
+    places = np.arange(len(STARTS)) * len(cycle.states) // len(STARTS)
+    starts = middle + np.array(STARTS)[:, None] * (cycle.states[places] - middle)
+    lowest = cycle.states.min(axis=0)  # of a state that is positive, no start may be below zero
+    starts = np.where(lowest > 0.0, np.maximum(starts, 0.5 * lowest), starts)
+    t = np.linspace(0.0, N_PERIODS * cycle.period_s, 1200)
+    # A run may go 30 times as far as the cycle; `simulate` counts in initial values.
+    reach = np.abs(cycle.states).max(axis=0)
+    factors = 30.0 * (reach / np.maximum(np.abs(starts), 1e-12 * reach)).max(axis=1)
+    pairs = zip(starts, factors.tolist(), strict=True)
+    return [cycle.model.simulate(t, start, blow_up=factor) for start, factor in pairs]
 
 
 def has_waveform(run: Trajectory, rollout: Rollout) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import count
 
 import numpy as np
 from jaxtyping import Float
@@ -158,3 +159,20 @@ def _step(
         four = rates(now + h, x + h * three, coef)
         x = x + h / 6.0 * (one + 2.0 * two + 2.0 * three + four)
     return x
+
+
+def halton(n: int, n_dimensions: int) -> np.ndarray:
+    """First points of Halton's sequence, without the one at zero, (n, n_dimensions).
+
+    They equal those of `scipy.stats.qmc` to the last digit; its import takes half a second.
+    Source: Halton 1960, doi:10.1007/BF01386213.
+    """
+    points = np.zeros((n, n_dimensions))
+    bases = (k for k in count(2) if all(k % j for j in range(2, k)))
+    for column, base in zip(points.T, bases, strict=False):
+        digits, place = np.arange(1, n + 1), 1.0
+        while digits.any():
+            place /= base
+            digits, digit = np.divmod(digits, base)
+            column += place * digit
+    return points

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -14,9 +15,13 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Verdict, record_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
+from ep2sindy.runtime.drawing import draw
 from ep2sindy.signals.attractor import phase_along
 from ep2sindy.signals.oscillation import DIED_OUT
 from ep2sindy.signals.spectrum import dominant_frequency
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +31,10 @@ class FreeRun:
     Only the second halves are compared, after transients. If the record does not repeat one
     waveform, or has fewer than eight periods, all of it is compared.
 
-    f_error: relative error of the frequency. amplitude_ratio, waveform_error, distribution: by
-    state, the last two in standard deviations. They are NaN for a run that diverged; frequency and
-    waveform errors are also NaN if the record or the run has no period.
+    record: the samples that it was run over. f_error: relative error of the frequency.
+    amplitude_ratio, waveform_error, distribution: by state, the last two in standard deviations.
+    They are NaN for a run that diverged; frequency and waveform errors are also NaN if the record
+    or the run has no period.
     periods: number of periods until the model's phase has slipped by a quarter of a period, or
     those of the record if it does not.
     excursion: largest distance from the data's mean, in standard deviations.
@@ -37,6 +43,7 @@ class FreeRun:
     """
 
     model: SparseModel
+    record: Trajectory = field(repr=False)
     rollout: Rollout
     verdict: Verdict
     f_error: float
@@ -56,6 +63,10 @@ class FreeRun:
         lasted = self.rollout.lasted_text if self.rollout.diverged else ""
         return f"{self.verdict}{of} after {lasted}" if lasted else str(self.verdict)
 
+    def plot(self) -> Figure:
+        """Figure of the model over the record: its first periods and its last, a row per state."""
+        return draw("free_run_plot", self)
+
 
 def free_run(
     model: SparseModel,
@@ -74,12 +85,13 @@ def free_run(
     """
     n_samples = run.n_samples if n_samples is None else min(n_samples, run.n_samples)
     rollout = model.rollout(run, n_samples=n_samples, initial=initial)
-    record = record_of(run.window(0, n_samples), model.states)
+    part = run.window(0, n_samples)
+    record = record_of(part, model.states)
     bounds = bounds or FreeRunBounds()
     likeness = ours = record.likeness(rollout.states, bounds)
     if judged is not None:
         columns = columns_of(model.states, judged)
-        some = record_of(run.window(0, n_samples), judged)
+        some = record_of(part, judged)
         ours = some.likeness(rollout.states[:, columns], bounds)
     by_state = {
         name: MappingProxyType(dict(zip(model.states, values.tolist(), strict=True)))
@@ -87,6 +99,7 @@ def free_run(
     }
     return FreeRun(
         model=model,
+        record=part,
         rollout=rollout,
         verdict=Verdict.LEAVES_DOMAIN if rollout.outside else ours.verdict,
         f_error=ours.f_error,

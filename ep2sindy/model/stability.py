@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from itertools import count
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.integrate import DOP853, OdeSolution
 
+from ep2sindy.model.draws import halton
 from ep2sindy.model.many import rk4_step
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scaled import ScaledModel
+from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.values import read_only
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ep2sindy.data.trajectory import Trajectory
 
 # A multiplier whose modulus is this close to one counts as neutral: a departure then takes at least
 # a thousand periods to change e-fold, longer than any record. The multipliers themselves are exact
@@ -50,12 +57,13 @@ class LimitCycle:
 
     states: over one period, evenly spaced, the first not repeated, in SI. multipliers: Floquet
     multipliers, by which a small departure grows in every period; that of the flow itself (1)
-    first, the others by decreasing modulus.
+    first, the others by decreasing modulus. model: whose orbit it is.
     """
 
     period_s: float
     states: Float[np.ndarray, "samples n_states"]
     multipliers: Complex[np.ndarray, " n_states"]
+    model: SparseModel = field(repr=False)
 
     def __post_init__(self) -> None:
         multipliers = np.array(self.multipliers, dtype=np.complex128)
@@ -80,6 +88,13 @@ class LimitCycle:
         if abs(largest - 1.0) <= NEUTRAL_WITHIN:
             return CycleStability.NEUTRAL
         return CycleStability.ATTRACTING if largest < 1.0 else CycleStability.REPELLING
+
+    def plot(self, run: Trajectory | None = None) -> Figure:
+        """Figure of the cycle in the plane of the first two states, with runs from other starts.
+
+        run: samples to draw behind it, of at least these two states.
+        """
+        return draw("cycle_plot", self, run)
 
 
 def limit_cycle(
@@ -128,7 +143,7 @@ def _cycle(
     orbit = find_closed_orbit(model, run, period_s=period_s, n_samples=n_samples)
     if orbit is None:
         return None
-    return LimitCycle(orbit.period * period_s, orbit.states * orbit.scale, orbit.multipliers)
+    return LimitCycle(orbit.period * period_s, orbit.states * orbit.scale, orbit.multipliers, model)
 
 
 def _backwards(
@@ -142,7 +157,7 @@ def _backwards(
         return None
     inverse = 1.0 / cycle.multipliers
     states = np.roll(cycle.states[::-1], 1, axis=0)  # reversed, with the same first state
-    return LimitCycle(cycle.period_s, states, np.append(inverse[0], inverse[:0:-1]))
+    return LimitCycle(cycle.period_s, states, np.append(inverse[0], inverse[:0:-1]), model)
 
 
 def share_reaching(
@@ -221,30 +236,13 @@ def _interpolate(curve: np.ndarray) -> np.ndarray:
 
 def _starts(states: np.ndarray, n_starts: int, spread: tuple[float, float]) -> np.ndarray:
     """Starts (starts, n_states); see `share_reaching`."""
-    share = _halton(n_starts, states.shape[1])
+    share = halton(n_starts, states.shape[1])
     mean = states.mean(axis=0)
     reach = spread[1] * 0.5 * np.ptp(states, axis=0)
     low, high = np.log(spread)
     one_sign = (states > 0.0).all(axis=0) | (states < 0.0).all(axis=0)
     around = mean * np.exp(low + (high - low) * share)
     return np.where(one_sign, around, mean + reach * (2.0 * share - 1.0))
-
-
-def _halton(n: int, n_dimensions: int) -> np.ndarray:
-    """First points of Halton's sequence, without the one at zero, (n, n_dimensions).
-
-    They equal those of `scipy.stats.qmc` to the last digit; its import takes half a second.
-    Source: Halton 1960, doi:10.1007/BF01386213.
-    """
-    points = np.zeros((n, n_dimensions))
-    bases = (k for k in count(2) if all(k % j for j in range(2, k)))
-    for column, base in zip(points.T, bases, strict=False):
-        digits, place = np.arange(1, n + 1), 1.0
-        while digits.any():
-            place /= base
-            digits, digit = np.divmod(digits, base)
-            column += place * digit
-    return points
 
 
 def _check_search(

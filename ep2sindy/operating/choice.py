@@ -21,7 +21,7 @@ from ep2sindy.operating.fit import (
     operating_fit,
 )
 from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.operating.map import MapPoint, law_map
+from ep2sindy.operating.map import MapPoint, law_map, map_points
 from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
@@ -36,7 +36,6 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
 
-MAX_PARAMETERS = 2  # most parameters of a map that can be drawn
 N_TOGETHER = 24  # points of a map computed as one piece: the records are sent with each piece
 CLOSE = 0.05  # deviation, as a share of its bound, that does not justify another term
 
@@ -270,19 +269,6 @@ def find_branch(
         at_points=_follow(law, records, points, workers, progress),
         map=_follow(law, records, grid, workers, progress),
     )
-
-
-def map_points(points: Sequence[Mapping[str, float]], n: int) -> list[dict[str, float]]:
-    """A grid over the ranges of the points, the last parameter varying fastest."""
-    names = list(points[0])
-    if len(names) > MAX_PARAMETERS:
-        return []
-    values = np.array([[point[name] for name in names] for point in points])
-    axes = [
-        np.linspace(low, high, n).tolist()
-        for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
-    ]
-    return [dict(zip(names, each, strict=True)) for each in product(*axes)]
 
 
 def _follow(

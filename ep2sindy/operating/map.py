@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
@@ -26,6 +27,8 @@ STILL = SIMULATED.spread  # of the mean: a smaller spread is no cycle (the simul
 N_PERIODS = 40  # length of a run, in which it may settle
 
 RESTING = 1e-8  # rates at a fixed point, relative to those half a standard deviation away
+
+MAX_PARAMETERS = 2  # most parameters of a map that can be drawn
 
 STEP = 1e-6  # of central differences, in units of the states
 
@@ -57,6 +60,32 @@ class MapPoint:
     relative_amplitude: float
     growth_per_s: float
     second: float
+
+    @property
+    def row(self) -> dict[str, object]:
+        """The point as a row of a table, its frequency in kHz."""
+        return {
+            **self.parameters,
+            "inside": self.inside,
+            "fate": str(self.fate),
+            "f_kHz": 1e-3 * self.frequency_Hz,
+            "relative_amplitude": self.relative_amplitude,
+            "growth_per_s": self.growth_per_s,
+            "second_multiplier": self.second,
+        }
+
+
+def map_points(points: Sequence[Mapping[str, float]], n: int) -> list[dict[str, float]]:
+    """A grid over the ranges of the points, the last parameter varying fastest."""
+    names = list(points[0])
+    if len(names) > MAX_PARAMETERS:
+        return []
+    values = np.array([[point[name] for name in names] for point in points])
+    axes = [
+        np.linspace(low, high, n).tolist()
+        for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
+    ]
+    return [dict(zip(names, each, strict=True)) for each in product(*axes)]
 
 
 def law_map(

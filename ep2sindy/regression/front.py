@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,8 +15,12 @@ from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, solve_masks
 from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Correction of coefficients, as a share of them, after which another one would be rounding.
 REFINED = 1e-9
@@ -142,6 +147,10 @@ class ParetoFront:
     def leading(self) -> Bool[np.ndarray, " candidates"]:
         """True for the best candidate of each size."""
         return np.diff(self.sizes, prepend=-1.0) > 0
+
+    def plot(self) -> Figure:
+        """Figure of the candidates' errors, or scores if there are none, by number of terms."""
+        return draw("front_plot", self)
 
     def __repr__(self) -> str:
         rows = [

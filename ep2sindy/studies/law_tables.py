@@ -231,18 +231,7 @@ def map_table(branches: Mapping[str, Branch], which: str) -> pd.DataFrame:
     for name, branch in branches.items():
         points: Sequence[MapPoint] = branch.map if which == "map" else branch.at_points
         for point in points:
-            rows.append(
-                {
-                    "branch": name,
-                    **point.parameters,
-                    "inside": point.inside,
-                    "fate": str(point.fate),
-                    "f_kHz": 1e-3 * point.frequency_Hz,
-                    "relative_amplitude": point.relative_amplitude,
-                    "growth_per_s": point.growth_per_s,
-                    "second_multiplier": point.second,
-                }
-            )
+            rows.append({"branch": name, **point.row})
     return pd.DataFrame(rows)
 
 

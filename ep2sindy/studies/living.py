@@ -6,7 +6,7 @@ tables, figures and summary for the studies that show such a model.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -27,7 +27,6 @@ from ep2sindy.library.roles import Roles
 from ep2sindy.model.comparison import FreeRunBounds, Verdict
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import LimitCycle, limit_cycle, share_reaching
 from ep2sindy.regression.searches import Search
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
@@ -47,7 +46,7 @@ from ep2sindy.studies.views import (
 )
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 WAVEFORM = "One period by phase, shown twice: samples, their waveform, and the model's."
 CAPTIONS = {
@@ -58,8 +57,6 @@ CAPTIONS = {
     "waveform": WAVEFORM,
 }
 NO_SIZES: Mapping[str, float] = MappingProxyType({})
-STARTS = ((0.5, 0.5), (0.5, 2.0), (1.0, 1.0), (2.0, 0.5), (2.0, 2.0))  # times the cycle's mean
-N_PERIODS = 12.0  # duration of a run from another start, in periods
 
 
 @dataclass(frozen=True)
@@ -229,7 +226,8 @@ class Living:
                 figures.free_run_figure, held, run.rollout, period_s=period_s
             )
             if len(self.model.states) > 1:
-                drawn["cycle"] = partial(_cycle_figure, self)
+                plane, paths = held.state_names[:2], figures.paths_off(self.cycle)
+                drawn["cycle"] = partial(figures.cycle_figure, held, self.cycle, paths, plane=plane)
             if figures.has_waveform(held, run.rollout):
                 drawn["waveform"] = partial(figures.waveform_figure, held, run.rollout)
         return {f"{key}_{name}": Captioned(draw, CAPTIONS[key]) for key, draw in drawn.items()}
@@ -344,30 +342,6 @@ def _by_derivatives(living: Living) -> str:
         f"The equations selected by their derivatives, refined as they are ({refined.status}): "
         f"{refined.run.text} ({text})."
     )
-
-
-def _cycle_figure(living: Living) -> Figure:
-    assert living.cycle is not None
-    model, cycle, held = living.model, living.cycle, living.held
-    order = [model.states.index(name) for name in held.state_names]
-    return figures.cycle_figure(
-        held, cycle.states[:, order], _paths(living), plane=held.state_names[:2]
-    )
-
-
-def _paths(living: Living) -> list[Rollout]:
-    """Runs from starts around the cycle's mean, in the plane of the first two states."""
-    assert living.cycle is not None
-    mean = living.cycle.states.mean(axis=0)
-    factors = np.ones((len(STARTS), len(mean)))
-    factors[:, :2] = STARTS
-    return runs_from(mean * factors, living.model, living.cycle)
-
-
-def runs_from(starts: Iterable[np.ndarray], model: SparseModel, cycle: LimitCycle) -> list[Rollout]:
-    """Runs from other initial states, over twelve periods of a cycle."""
-    t = np.linspace(0.0, N_PERIODS * cycle.period_s, 1200)
-    return [model.simulate(t, start, blow_up=30.0) for start in starts]
 
 
 def living_model(

@@ -17,6 +17,7 @@ from ep2sindy.figures.living import (
     cycle_figure,
     free_run_figure,
     has_waveform,
+    paths_off,
     waveform_figure,
 )
 from ep2sindy.forecasting.rolling import RollingStarts
@@ -26,7 +27,6 @@ from ep2sindy.library.equations import equation_text
 from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.document import (
     Block,
@@ -57,7 +57,7 @@ from ep2sindy.studies.library_result import (
     column_note,
     estimate_section,
 )
-from ep2sindy.studies.living import WAVEFORM, FreeCycle, runs_from
+from ep2sindy.studies.living import WAVEFORM, FreeCycle
 from ep2sindy.studies.source import data_summary
 from ep2sindy.studies.trace_hidden import HiddenStates, alone
 from ep2sindy.studies.views import (
@@ -79,7 +79,6 @@ SCORED = (
     "selected."
 )
 
-STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distance from the cycle's middle, relative to its states
 
 CAPTIONS = {
     "free_run": "The model run freely from one sample (colour) over the record that it never saw "
@@ -251,10 +250,8 @@ class Outcome:
             "free_run": partial(free_run_figure, held, rollout, period_s=period_s)
         }
         if self.cycle is not None:
-            plane, paths = held.state_names[:2], paths_off(self.model, self.cycle)
-            drawn["plane"] = partial(
-                cycle_figure, self.states, self.cycle.states, paths, plane=plane
-            )
+            plane, paths = held.state_names[:2], paths_off(self.cycle)
+            drawn["plane"] = partial(cycle_figure, self.states, self.cycle, paths, plane=plane)
         if has_waveform(held, rollout) and self.signal.cycle is not None:
             drawn["waveform"] = partial(waveform_figure, held, rollout)
         fronts = {state: self.found.fronts[state] for state in self.searched}
@@ -428,17 +425,3 @@ def _best_of_sizes(table: pd.DataFrame, most: int = 3) -> list[int]:
     """The best rows of every size, ordered by score and then by position."""
     order = table.sort_values(["terms", "score"], kind="stable")
     return sorted(order.groupby("terms").head(most).index.tolist())
-
-
-def paths_off(model: SparseModel, cycle: LimitCycle) -> list[Rollout]:
-    """Runs from states off the cycle, some nearer to its middle and some farther."""
-    middle = cycle.states.mean(axis=0)
-    places = np.arange(len(STARTS)) * len(cycle.states) // len(STARTS)
-    starts = middle + np.array(STARTS)[:, None] * (cycle.states[places] - middle)
-    starts[:, 0] = [_inside(start, cycle.states[:, 0]) for start in starts[:, 0]]
-    return runs_from(starts, model, cycle)
-
-
-def _inside(value: float, states: np.ndarray) -> float:
-    """A start value with the sign that the signal has on the cycle, if that is fixed."""
-    return max(value, 0.5 * float(states.min())) if (states > 0.0).all() else value

@@ -1,0 +1,144 @@
+"""The figures of `plot` methods: what stands on their axes, and what their curves are."""
+
+import warnings
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import ep2sindy as ep
+from tests.models import model_of
+
+UNITS = {"x": "A", "y": "m"}
+
+
+def labels(figure: Figure) -> list[str]:
+    """Labels of the ordinates from left to right and down; nothing may collapse in the layout."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure.draw_without_rendering()
+    return [ax.get_ylabel() for ax in figure.axes if ax.get_ylabel()]
+
+
+def oscillator(w: float, mu: float = 0.0) -> ep.SparseModel:
+    equations = {"x": {"y": 1.0}, "y": {"x": -w * w, "y": mu, "x^2*y": -mu}}
+    return replace(model_of(equations), units=UNITS)
+
+
+@cache
+def record(w: float = 3.0, mu: float = 0.4, *, n: int = 1500) -> ep.Trajectory:
+    t = np.linspace(0.0, 0.02 * n, n + 1)
+    return oscillator(w, mu).simulate(t, [2.0, 0.0]).trajectory()
+
+
+def test_a_record_is_drawn_with_its_units_and_its_frequency() -> None:
+    run = record()
+    figure = run.plot()
+    assert labels(figure)[0] == "$x$ (A)"
+    assert figure.axes[2].get_xlabel() == "time (s)"
+    shown = figure.axes[0].lines[0]
+    assert np.array_equal(shown.get_ydata(), run.states[: len(shown.get_xdata()), 0])
+    frequency = ep.signals.dominant_frequency(run.t, run.states[:, 0])
+    assert shown.get_xdata()[-1] == pytest.approx(min(20.0 / frequency, run.t[-1]), rel=0.01)
+    assert figure.axes[3].get_xlabel() == "frequency (Hz)"
+    assert figure.axes[1].lines[1].get_xdata()[0] == pytest.approx(frequency)
+    part = run.plot(duration_s=1.0, f_max_Hz=2.0)
+    assert part.axes[0].lines[0].get_xdata()[-1] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("method", "label"),
+    [(ep.TrajectorySearch(max_terms=3), "deviance"), (ep.Regression(), "error, $1 - R^2$ (train")],
+)
+def test_a_discovery_is_drawn_with_its_selected_candidates(
+    method: ep.TrajectorySearch | ep.Regression, label: str
+) -> None:
+    found = ep.discover(ep.lotka_volterra().trajectory(noise=0.02, rng=0), method=method)
+    for each, n in ((found, 2), (ep.Discovery.from_json(found.to_json()), 2)):
+        figure = each.plot()
+        assert [text[: len(label)] for text in labels(figure)] == [label] * n
+    (ax,) = found.fronts["x"].plot().axes
+    (star,) = (line for line in ax.lines if line.get_label() == "selected")
+    assert star.get_xdata() == found.chosen["x"].n_terms
+
+
+def test_a_front_that_no_rule_has_scored_marks_no_candidate() -> None:
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    front = ep.discover(run, method=ep.Regression()).fronts["x"]
+    (ax,) = front.with_scores(np.full(len(front.candidates), np.nan)).plot().axes
+    assert "selected" not in [line.get_label() for line in ax.lines]
+    assert ax.get_title() == r"$\dot{x}$"
+
+
+def test_a_free_run_is_drawn_over_its_record_whatever_their_order() -> None:
+    run = record()
+    turned = replace(run, states=run.states[:, ::-1], state_names=["y", "x"])
+    figure = ep.free_run(oscillator(3.0, 0.4), turned).plot()
+    assert labels(figure) == ["$x$ (A)", "$y$ (m)"]
+    data, model = figure.axes[0].lines
+    n = len(data.get_ydata())
+    assert np.array_equal(data.get_ydata(), run.states[:n, 0])
+    assert model.get_ydata() == pytest.approx(data.get_ydata(), abs=1e-5)
+
+
+def test_a_free_run_that_diverges_leaves_the_panels_as_the_data_are() -> None:
+    away = model_of({"x": {"x": 5.0}, "y": {"y": 5.0}})
+    figure = ep.free_run(away, record()).plot()
+    labels(figure)
+    low, high = figure.axes[0].get_ylim()
+    assert high - low < 3.0 * np.ptp(record().states[:, 0])
+
+
+def test_a_cycle_is_drawn_closed_with_runs_that_reach_it() -> None:
+    cycle = ep.limit_cycle(oscillator(3.0, 0.4), np.array([2.0, 0.0]), period_s=2.1)
+    assert cycle is not None
+    (ax,) = cycle.plot(record()).axes
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$x$ (A)", "$y$ (m)")
+    curve = ax.lines[-1].get_xydata()
+    assert np.array_equal(curve[0], curve[-1])
+    assert np.array_equal(curve[:-1], cycle.states)
+    assert len(cycle.plot().axes[0].lines) == len(ax.lines) - 1  # without the data
+    runs = [line.get_xydata() for line in ax.lines[1:-1] if len(line.get_xdata()) > 1]
+    assert len(runs) == 5
+    for run in runs:  # none stops before it has come near
+        assert np.linalg.norm(cycle.states - run[-1], axis=1).min() < 0.2
+
+
+def law(names: list[str], points: list[list[float]]) -> ep.operating.OperatingLaw:
+    """x'' = -w^2 x + mu (1 - x^2) x', w the first parameter."""
+    known = oscillator(1.0, 0.4)
+    terms = [("x", "y"), ("y", "x"), ("y", "y"), ("y", "x^2*y")]
+    coef = np.array([[1.0, 0.0], [0.0, -1.0], [0.4, 0.0], [-0.4, 0.0]])
+    functions = ep.named_terms(names, ["1", f"{names[0]}^2"])
+    return ep.operating.OperatingLaw(
+        functions, known.library, ("x", "y"), tuple(terms), coef, np.array(points), units=UNITS
+    )
+
+
+def point(*values: float) -> ep.operating.OperatingRecord:
+    names = ("w", "b", "c")[: len(values)]
+    return ep.operating.OperatingRecord.of(
+        dict(zip(names, values, strict=True)), record(values[0], n=2000)
+    )
+
+
+def test_a_law_of_one_parameter_is_drawn_as_a_line_of_its_frequency() -> None:
+    records = [point(3.0), point(3.5)]
+    figure = law(["w"], [[3.0], [3.5]]).plot_map(records, n_points=3, labels={"w": "w (rad/s)"})
+    assert labels(figure)[0].startswith("frequency (")
+    assert figure.axes[0].get_xlabel() == "w (rad/s)"
+    line, dots = figure.axes[0].lines[:2]
+    assert line.get_ydata()[[0, -1]] == pytest.approx(dots.get_ydata(), rel=1e-3)
+
+
+def test_a_law_of_two_parameters_is_drawn_as_a_map_and_of_three_not_at_all() -> None:
+    places = [[3.0, 0.0], [3.5, 0.0], [3.0, 1.0]]
+    figure = law(["w", "b"], places).plot_map([point(*place) for place in places], n_points=2)
+    labels(figure)
+    assert figure.axes[0].get_ylabel() == "$b$"
+    (grid,) = [each for each in figure.axes[0].collections if each.get_array() is not None][:1]
+    assert grid.get_array().size == 4
+    with pytest.raises(ValueError, match="one or two parameters: this law has"):
+        law(["w", "b", "c"], [[3.0, 0.0, 0.0]]).plot_map([point(3.0, 0.0, 0.0)])
