@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from ep2sindy.library import code
 from ep2sindy.library import functions as registry
-from ep2sindy.library.equations import SYMPY_NAMES
+from ep2sindy.library.functions import SYMPY_NAMES
 from ep2sindy.library.library import named_terms
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")

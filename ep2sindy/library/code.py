@@ -23,8 +23,8 @@ from sympy.printing.julia import JuliaCodePrinter
 from sympy.printing.numpy import NumPyPrinter
 
 from ep2sindy import __version__
-from ep2sindy.library.equations import equation_text, factor_sympy, formula
-from ep2sindy.library.functions import REAL_LINE, Function, Kind
+from ep2sindy.library.equations import equation_text, factor_sympy
+from ep2sindy.library.functions import REAL_LINE, Function, Kind, formula
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import split_term
 from ep2sindy.runtime.screen import in_line

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import html
-import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from html.entities import name2codepoint
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from ep2sindy.library.functions import Kind, points_inside
+from ep2sindy.library.functions import number_sympy
 from ep2sindy.library.names import RECIPROCAL, Part, split_term
 
 if TYPE_CHECKING:
@@ -177,7 +174,7 @@ def factor_sympy(part: Part) -> sympy.Expr:
 
     argument = sympy.Symbol(part.variable)
     if not part.is_bare:
-        argument = _number_sympy(part.scale) * argument + _number_sympy(part.shift)
+        argument = number_sympy(part.scale) * argument + number_sympy(part.shift)
     if not part.function:
         return argument
     if part.function == RECIPROCAL:
@@ -185,80 +182,6 @@ def factor_sympy(part: Part) -> sympy.Expr:
     known = {"sin": sympy.sin, "cos": sympy.cos, "exp": sympy.exp, "log": sympy.log}
     known |= {"sqrt": sympy.sqrt, "abs": sympy.Abs, "sign": sympy.tanh}
     return known.get(part.function, sympy.Function(part.function))(argument)
-
-
-def _number_sympy(value: float) -> sympy.Expr:
-    """A number as sympy keeps it: whole ones as integers, so that x^2 stays a square."""
-    import sympy
-
-    return sympy.Integer(int(value)) if value.is_integer() else sympy.Float(value)
-
-
-# A registered function as a formula: what it computes is recorded while it is called once.
-
-
-def formula(kind: Kind, argument: sympy.Expr) -> sympy.Expr:
-    """What a user's function computes, as a sympy expression of its argument.
-
-    Raises ValueError for a function that is no formula of NumPy's arithmetic and functions.
-    """
-    import sympy
-
-    x = sympy.Dummy()
-    try:
-        found = _recorded(kind.value(Recorded(x)))
-        points = points_inside(*kind.domain[0])
-        numbers = [float(found.subs(x, point)) for point in points.tolist()]
-        if not np.allclose(numbers, kind.value(points), rtol=1e-9, atol=0.0):
-            raise ValueError(f"as a formula it has other values, {numbers}")
-    except (TypeError, ValueError, AttributeError, ArithmeticError, IndexError) as error:
-        allowed = ", ".join(f"np.{name}" for name in SYMPY_NAMES)
-        raise ValueError(
-            f"a function of your own leaves the package as a formula of + - * / ** and {allowed}: "
-            f"{kind.name!r} came, which is none ({error!s:.150}); register it again, written so, "
-            "and load the model again, or leave the function out of the library"
-        ) from error
-    return found.xreplace({x: argument})
-
-
-class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
-    """A sympy expression in the place of an array: NumPy's functions of it give expressions."""
-
-    def __init__(self, expression: sympy.Expr) -> None:
-        self.expression = expression
-
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *args: Any, **settings: Any) -> Any:
-        import sympy
-
-        name = ufunc.__name__
-        if method != "__call__" or settings or name not in {**ARITHMETIC, **SYMPY_NAMES}:
-            return NotImplemented
-        of = ARITHMETIC[name] if name in ARITHMETIC else getattr(sympy, SYMPY_NAMES[name])
-        return Recorded(of(*map(_recorded, args)))
-
-
-# NumPy's names of functions, and what does the same with sympy's expressions.
-ARITHMETIC: Mapping[str, Callable[..., Any]] = MappingProxyType(
-    {
-        "add": operator.add,
-        "subtract": operator.sub,
-        "multiply": operator.mul,
-        "divide": operator.truediv,
-        "power": operator.pow,
-        "negative": operator.neg,
-        "positive": operator.pos,
-        "square": lambda x: x**2,
-        "reciprocal": lambda x: 1 / x,
-    }
-)
-SYMPY_NAMES: Mapping[str, str] = MappingProxyType(
-    {name: name for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh")}
-    | {"arcsin": "asin", "arccos": "acos", "arctan": "atan", "absolute": "Abs"}
-)
-
-
-def _recorded(value: Any) -> sympy.Expr:
-    return value.expression if isinstance(value, Recorded) else _number_sympy(float(value))
 
 
 def _number(coef: float, digits: int) -> tuple[str, int | None]:

@@ -6,11 +6,14 @@ log(n_i / 1 m^-3).
 
 from __future__ import annotations
 
+import operator
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from math import isfinite
-from typing import Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from array_api_compat import array_namespace, is_numpy_array
@@ -18,6 +21,9 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.library.names import RECIPROCAL, Part, number_text
 from ep2sindy.library.units import unit_product
+
+if TYPE_CHECKING:
+    import sympy
 
 Values = Callable[[Any], Any]
 Interval = tuple[float, float]
@@ -218,18 +224,24 @@ def function_of(part: Part) -> Function:
 
 
 def register_function(
-    name: str, value: Values, derivative: Values, *, domain: Interval = (-np.inf, np.inf)
+    name: str,
+    value: Values,
+    derivative: Values | None = None,
+    *,
+    domain: Interval = (-np.inf, np.inf),
 ) -> None:
     """Register a function of your own, so that terms can use it: `tanh(x)` or `tanh(2*x)`.
 
     value, derivative: take a NumPy array and return an array of the same shape, element by element;
-    PyTorch needs nothing more. domain: an open interval in which both are finite.
+    PyTorch needs nothing more. None derives a formula of NumPy's arithmetic and functions by sympy.
+    domain: an open interval in which both are finite.
     Models store only the name, so register the function before you load one. Registering a name
     again replaces the function from then on.
     Raises ValueError for a name that is not a plain word or is built in, a domain that is not an
-    interval, values of another shape or not finite, or a wrong derivative.
+    interval, values of another shape or not finite, a wrong derivative, or none of what is no
+    formula.
 
-    >>> ep.register_function("tanh", np.tanh, lambda x: 1.0 - np.tanh(x) ** 2)
+    >>> ep.register_function("tanh", np.tanh)
     >>> ep.polynomial(["x"], degree=1, functions=["tanh"]).names
     ('1', 'x', 'tanh(x)')
     """
@@ -240,8 +252,23 @@ def register_function(
     low, high = map(float, domain)
     if not low < high:
         raise ValueError(f"a domain must be an interval (low, high): {domain} came")
+    if derivative is None:
+        derivative = _derived(name, value, (low, high))
     _check_derivative(name, value, derivative, low, high)
     _kinds[name] = Kind(name, value, derivative, ((low, high),), own=True)
+
+
+def _derived(name: str, value: Values, domain: Interval) -> Values:
+    """The derivative of a formula. Raises ValueError, with the way out, for what is none."""
+    try:
+        slope = DerivedSlope(value, domain)
+        slope(points_inside(*domain))
+    except NoFormulaError as error:
+        raise ValueError(
+            f"a derivative is found by itself for {FORMULA}: {name!r} is none ({error}); give it, "
+            f"as in ep.register_function({name!r}, value, derivative)"
+        ) from error
+    return slope
 
 
 def _check_derivative(
@@ -285,6 +312,123 @@ def points_inside(low: float, high: float) -> Float[np.ndarray, " points"]:
     if np.isfinite(low):
         return low + away
     return high - away if np.isfinite(high) else away - 1.5
+
+
+# A registered function as a formula: what it computes is recorded while it is called once.
+
+
+def formula(kind: Kind, argument: sympy.Expr) -> sympy.Expr:
+    """What a user's function computes, as a sympy expression of its argument.
+
+    Raises ValueError for a function that is no formula of NumPy's arithmetic and functions.
+    """
+    try:
+        x, found = _recorded_formula(kind.value, kind.domain[0])
+    except NoFormulaError as error:
+        raise ValueError(
+            f"a function of your own leaves the package as {FORMULA}: {kind.name!r} came, which is "
+            f"none ({error}); register it again, written so, and load the model again, or leave "
+            "the function out of the library"
+        ) from error
+    return found.xreplace({x: argument})
+
+
+class NoFormulaError(ValueError):
+    """A function that cannot be recorded as a formula."""
+
+
+def _recorded_formula(value: Values, domain: Interval) -> tuple[sympy.Symbol, sympy.Expr]:
+    """A symbol, and what a function computes of it, checked at a few points of its domain.
+
+    Raises NoFormulaError with the reason if it is none.
+    """
+    import sympy  # imported here because it takes half a second and most runs do not need it
+
+    x = sympy.Dummy("x", real=True)
+    try:
+        found = _recorded(value(Recorded(x)))
+        points = points_inside(*domain)
+        numbers = [float(found.subs(x, point)) for point in points.tolist()]
+        if not np.allclose(numbers, value(points), rtol=1e-9, atol=0.0):
+            raise ValueError(f"as a formula it has other values, {numbers}")
+    except (TypeError, ValueError, AttributeError, ArithmeticError, IndexError) as error:
+        raise NoFormulaError(f"{error!s:.150}") from error
+    return x, found
+
+
+@dataclass(frozen=True)
+class DerivedSlope:
+    """The derivative of a formula, as a function of an array; it is pickled by the formula."""
+
+    value: Values
+    domain: Interval
+
+    @cached_property
+    def _slope(self) -> Values:
+        import sympy
+
+        x, found = _recorded_formula(self.value, self.domain)
+        slope: Values = sympy.lambdify(x, sympy.diff(found, x), "numpy")
+        return slope
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        return np.zeros(x.shape) + self._slope(x)  # that of x is one, whatever the shape
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return DerivedSlope, (self.value, self.domain)
+
+
+class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
+    """A sympy expression in the place of an array: NumPy's functions of it give expressions."""
+
+    def __init__(self, expression: sympy.Expr) -> None:
+        self.expression = expression
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *args: Any, **settings: Any) -> Any:
+        import sympy
+
+        name = ufunc.__name__
+        if method != "__call__" or settings or name not in {**ARITHMETIC, **SYMPY_NAMES}:
+            return NotImplemented
+        of = ARITHMETIC[name] if name in ARITHMETIC else getattr(sympy, SYMPY_NAMES[name])
+        return Recorded(of(*map(_recorded, args)))
+
+
+# NumPy's names of functions, and what does the same with sympy's expressions.
+ARITHMETIC: Mapping[str, Callable[..., Any]] = MappingProxyType(
+    {
+        "add": operator.add,
+        "subtract": operator.sub,
+        "multiply": operator.mul,
+        "divide": operator.truediv,
+        "power": operator.pow,
+        "negative": operator.neg,
+        "positive": operator.pos,
+        "square": lambda x: x**2,
+        "reciprocal": lambda x: 1 / x,
+    }
+)
+SYMPY_NAMES: Mapping[str, str] = MappingProxyType(
+    {name: name for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh")}
+    | {"arcsin": "asin", "arccos": "acos", "arctan": "atan", "absolute": "Abs"}
+)
+
+
+FORMULA = (
+    "a formula of + - * / ** and "  # what can be recorded, in words
+    + ", ".join(f"np.{name}" for name in SYMPY_NAMES)
+)
+
+
+def _recorded(value: Any) -> sympy.Expr:
+    return value.expression if isinstance(value, Recorded) else number_sympy(float(value))
+
+
+def number_sympy(value: float) -> sympy.Expr:
+    """A number as sympy keeps it: whole ones as integers, so that x^2 stays a square."""
+    import sympy
+
+    return sympy.Integer(int(value)) if value.is_integer() else sympy.Float(value)
 
 
 def _built_in(name: str) -> Kind:
