@@ -188,7 +188,7 @@ def test_pysindys_examples_take_no_more_lines_here() -> None:
     page = (ROOT / "docs" / "pysindy.md").read_text("utf-8")
     pairs = [re.findall(r"```python\n(.*?)```", row, re.DOTALL) for row in page.split("<tr>")]
     compared = [pair for pair in pairs if len(pair) == 2]
-    assert len(compared) == 6
+    assert len(compared) == 7
     for theirs, ours in compared:
         assert "ps." in theirs or "model." in theirs
         assert "ps." not in ours

@@ -14,10 +14,11 @@ PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
 ROOMS = [
     "_old_names",
     "_stubs",
-    "prepare",  # this and the next three are stubs alone
+    "prepare",  # this and the next four are stubs alone
     "parallel",
     "warnings",
     "benchmark",
+    "sklearn",
     "trust",
     "runtime",
     "library",

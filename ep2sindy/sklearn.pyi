@@ -1,0 +1,2 @@
+# For scikit-learn
+from ep2sindy.discovery.estimator import SINDy as SINDy
