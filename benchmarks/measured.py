@@ -27,9 +27,9 @@ import numpy as np
 import pandas as pd
 
 import ep2sindy as ep
+from ep2sindy.discovery.signal_unknowns import fit_offset
 from ep2sindy.runtime.progress import SILENT
 from ep2sindy.signals.spectrum import crossing_frequency
-from ep2sindy.studies.trace_hidden import fit_offset
 
 FOLDER = Path(os.environ.get("EP2SINDY_DATA", "."))
 N_DRAWS, N_PUSHED, N_SIMULATED = 10, 20, 3
@@ -335,7 +335,7 @@ def offset() -> None:
         for seed in range(N_DRAWS):
             run = system.trajectory(noise=noise, rng=seed)
             x = run.columns([name])
-            signal = ep.signals.from_one_signal(ep.Trajectory(run.t, x - x.mean(), [name]))
+            signal = ep.signals.prepare_signal(ep.Trajectory(run.t, x - x.mean(), [name]))
             library = ep.polynomial([name, "g"], degree=2)
             try:
                 found = fit_offset(signal, library, ep.TrajectorySearch(), SILENT)

@@ -28,7 +28,7 @@ from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.signals.embedding import embed
-from ep2sindy.signals.trace import from_one_signal
+from ep2sindy.signals.trace import prepare_signal
 from ep2sindy.studies.living import cycle_of
 
 POINTS = ("300/4", "300/5", "300/6", "400/5")
@@ -57,7 +57,7 @@ def as_measured(run: Trajectory, seed: int) -> Trajectory:
 
 def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]:
     begin = time.process_time()
-    signal = from_one_signal(measured)
+    signal = prepare_signal(measured)
     n = round(0.75 * measured.n_samples)
     chosen = embed(signal.window(0, n))
     states = embed(signal, chosen.embedding).embedded.run  # starts of other runs, and figures

@@ -29,6 +29,7 @@ from ep2sindy.operating.shared_support import discover_shared as discover_shared
 from ep2sindy.operating.shared_support import SharedDiscovery as SharedDiscovery
 from ep2sindy.discovery.pointwise import pointwise as pointwise
 from ep2sindy.estimation.estimate import estimate as estimate
+from ep2sindy.discovery.one_signal import from_one_signal as from_one_signal
 
 # Searches
 from ep2sindy.discovery.method import TrajectorySearch as TrajectorySearch  # for configs

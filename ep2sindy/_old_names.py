@@ -58,7 +58,7 @@ RENAMED = {
     "point": "point_samples",
     "regimes": "discovery.find_regimes",
     "tied_fit": "operating.fit_law",
-    "trace": "signals.from_one_signal",
+    "trace": "signals.prepare_signal",
     "Joint": "TrajectorySearch",
     "JointDiscovery": "SharedDiscovery",
     "discover_jointly": "discover_shared",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.discovery.fitted_functions import fit_functions
+from ep2sindy.discovery.signal_unknowns import fit_functions
 
 
 def test_the_records_are_as_published() -> None:

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.app.schema import study_of
+from ep2sindy.discovery.one_signal import SignalSearch, method_by_runs
 from ep2sindy.signals.embedding import DROWNED, unexplained
 from ep2sindy.signals.kalman import ratio_bounds
 from ep2sindy.signals.spectrum import signal_memory_s
+from ep2sindy.studies.trace import Study
+from tests.programs import composed
 
 A, B = 2.0, 1.0  # of the Toda oscillator: g' = A - B x
 
@@ -33,7 +37,7 @@ def sine(n_periods=20.0, *, per_period=60, mean=0.0):
 
 
 def chosen_for(run):
-    return ep.signals.embed(ep.signals.from_one_signal(run))
+    return ep.signals.embed(ep.signals.prepare_signal(run))
 
 
 def discovered(states, *, degree, max_terms):
@@ -78,7 +82,7 @@ def test_a_sine_of_either_sign_is_a_harmonic_oscillator():
 
 
 def test_delays_are_the_signal_a_part_of_a_period_before():
-    embedded = ep.signals.Delays().embed(ep.signals.from_one_signal(sine()))
+    embedded = ep.signals.Delays().embed(ep.signals.prepare_signal(sine()))
     x, before = embedded.run.states[40:-40].T
     phase = 2e3 * np.pi * embedded.run.t[40:-40]
     np.testing.assert_allclose(x, np.sin(phase), atol=0.01)
@@ -131,16 +135,16 @@ def test_what_is_faster_than_asked_counts_as_noise():
     assert ratio_bounds(10.0, 1.0, 1.0, (-14.0, 4.0)) == pytest.approx((0.0, 0.0))
     clean = sine(40.0, mean=3.0)
     x = clean.states[:, 0] + 0.1 * np.sin(25 * 2e3 * np.pi * clean.t)
-    fine = ep.signals.LogRate(harmonics=7.0).embed(ep.signals.from_one_signal(recorded(clean.t, x)))
+    fine = ep.signals.LogRate(harmonics=7.0).embed(ep.signals.prepare_signal(recorded(clean.t, x)))
     assert fine.noise_std > 0.05  # 0.1 / sqrt(2) of it
     assert np.abs(fine.run.states[20:-20, 0] - clean.states[20:-20, 0]).max() < 0.03
 
 
 def test_fine_samples_are_averaged_unless_told_not_to():
     fine = sine(10.0, per_period=1000)
-    kept = ep.signals.from_one_signal(fine, decimate=None)
+    kept = ep.signals.prepare_signal(fine, decimate=None)
     assert len(kept.x) == fine.n_samples
-    few = ep.signals.from_one_signal(fine)
+    few = ep.signals.prepare_signal(fine)
     assert few.done == ("means over 10 samples: 1000 are left",)
     assert few.per_period == pytest.approx(100.0, rel=1e-3)
     assert few.x[0] == pytest.approx(fine.states[:10, 0].mean())
@@ -150,7 +154,7 @@ def test_fine_samples_are_averaged_unless_told_not_to():
 def test_a_long_record_is_averaged_after_a_look_at_its_means():
     n, per_period = 200_000, 4000
     x = 2.0 + np.sin(2 * np.pi * np.arange(n) / per_period)
-    found = ep.signals.from_one_signal(recorded(1e-6 * np.arange(n), x))
+    found = ep.signals.prepare_signal(recorded(1e-6 * np.arange(n), x))
     assert found.per_period == pytest.approx(100.0, rel=0.01)
 
 
@@ -159,24 +163,24 @@ def test_a_drift_is_taken_out_and_nothing_else(mean):
     run = sine(20.0, mean=mean)
     line = 0.6 * (run.t / run.t[-1] - 0.5)
     drifting = recorded(run.t, run.states[:, 0] + line)
-    straight = ep.signals.from_one_signal(drifting)
+    straight = ep.signals.prepare_signal(drifting)
     assert "a straight line taken out, which rises by 0." in straight.done[0]
     np.testing.assert_allclose(straight.x, run.states[:, 0], atol=2e-3)
-    kept = ep.signals.from_one_signal(drifting, detrend=False)
+    kept = ep.signals.prepare_signal(drifting, detrend=False)
     assert re.search(r"x drifts by 0\.\d+ over the record", kept.advice[0])
     np.testing.assert_array_equal(kept.x, drifting.states[:, 0])
-    assert ep.signals.from_one_signal(run).done == ()
+    assert ep.signals.prepare_signal(run).done == ()
 
 
 def test_times_rounded_to_a_few_digits_are_taken_as_equal_steps():
     exact = 1.3e-6 * np.arange(80, 700)
     rounded = np.array([float(f"{t:.2E}") for t in exact])
     x = np.sin(2 * np.pi * exact / 5e-5)
-    found = ep.signals.from_one_signal(recorded(rounded, x))
+    found = ep.signals.prepare_signal(recorded(rounded, x))
     assert found.done == ("times rounded to 3 digits taken as equal steps",)
     np.testing.assert_allclose(np.diff(found.t), 1.3e-6, rtol=2e-3)
     uneven = exact + 4e-7 * np.random.default_rng(0).random(len(exact))
-    np.testing.assert_array_equal(ep.signals.from_one_signal(recorded(uneven, x)).t, uneven)
+    np.testing.assert_array_equal(ep.signals.prepare_signal(recorded(uneven, x)).t, uneven)
 
 
 def test_a_smoother_follows_pulses_and_few_samples_to_a_period():
@@ -210,7 +214,7 @@ def test_a_gap_does_not_change_the_frequency(share):
 def test_three_states_of_a_signal_are_a_chain_of_derivatives():
     t = np.linspace(0.0, 60.0, 3001)
     two_lines = recorded(t, np.sin(t) + 0.5 * np.sin(2 * t))
-    signal = ep.signals.from_one_signal(two_lines, decimate=None)
+    signal = ep.signals.prepare_signal(two_lines, decimate=None)
     chosen = ep.signals.embed(signal, n_states=3)
     states = chosen.embedded
     assert states.run.state_names == ("x", "v", "w")
@@ -221,7 +225,7 @@ def test_three_states_of_a_signal_are_a_chain_of_derivatives():
     bend = -np.sin(t) - 2.0 * np.sin(2 * t)
     assert np.abs(states.run.states[:, 2] - bend)[inner].max() < 0.1
     log = ep.signals.LogRate(n_states=3)
-    positive = ep.signals.from_one_signal(recorded(t, np.exp(np.sin(t))), decimate=None)
+    positive = ep.signals.prepare_signal(recorded(t, np.exp(np.sin(t))), decimate=None)
     found = log.embed(positive)
     assert found.run.state_names == ("x", "g", "h")
     assert found.relations == ("x: x*g == 1", "g: h == 1")
@@ -232,11 +236,11 @@ def test_three_states_of_a_signal_are_a_chain_of_derivatives():
 
 def test_neighbours_tell_how_many_states_there_are():
     lorenz = ep.lorenz().trajectory()
-    signal = ep.signals.from_one_signal(recorded(lorenz.t, lorenz.states[:, 0]))
+    signal = ep.signals.prepare_signal(recorded(lorenz.t, lorenz.states[:, 0]))
     assert signal.cycle is None
     assert signal.frequency_Hz == pytest.approx(0.9, rel=0.3)  # turns of either wing
     two, three = (unexplained(signal, ep.signals.Rate(n_states=n)) for n in (2, 3))
-    loop = ep.signals.from_one_signal(sine())
+    loop = ep.signals.prepare_signal(sine())
     assert unexplained(loop, ep.signals.Rate()) < 1e-3 < 0.5 * three < two
 
 
@@ -263,12 +267,12 @@ def test_a_signal_named_as_the_rate_keeps_its_name():
 )
 def test_what_does_not_oscillate_is_refused(run, message):
     with pytest.raises(ValueError, match=message):
-        ep.signals.from_one_signal(run)
+        ep.signals.prepare_signal(run)
 
 
 @pytest.mark.parametrize("mean", [0.0, 0.9])
 def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
-    signal = ep.signals.from_one_signal(sine(mean=mean))
+    signal = ep.signals.prepare_signal(sine(mean=mean))
     message = r"needs a positive signal: x falls to .* \(embedding=rate"
     with pytest.raises(ValueError, match=message):
         ep.signals.LogRate().embed(signal)
@@ -284,16 +288,16 @@ def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
         (lambda: ep.signals.KalmanSmoother(coarsest_s=-1.0), "coarsest_s must be a positive time"),
         (lambda: ep.signals.Rate(n_states=6), "n_states must be 2 to 5: 6 came"),
         (
-            lambda: ep.signals.from_one_signal(sine(), detrend="yes"),
+            lambda: ep.signals.prepare_signal(sine(), detrend="yes"),
             "detrend must be auto, true or false: 'yes' came",
         ),
         (
-            lambda: ep.signals.from_one_signal(sine(), decimate=0),
+            lambda: ep.signals.prepare_signal(sine(), decimate=0),
             "decimate must be auto, null or a whole number",
         ),
-        (lambda: ep.signals.from_one_signal(sine(), "y"), "unknown variable 'y'"),
+        (lambda: ep.signals.prepare_signal(sine(), "y"), "unknown variable 'y'"),
         (
-            lambda: ep.signals.from_one_signal(ep.lotka_volterra().trajectory()),
+            lambda: ep.signals.prepare_signal(ep.lotka_volterra().trajectory()),
             "one signal must be named",
         ),
         (
@@ -306,3 +310,57 @@ def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
 def test_settings_that_cannot_be_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+# One call from signal to tested model
+
+
+def test_one_call_finds_the_law_of_a_signal_and_the_state_that_nobody_measured() -> None:
+    """With g = 2/3 - y, x' = x (2/3 - y) and y' = y (x - 1/3) are these two equations."""
+    prey = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    found = ep.from_one_signal(prey, "x", degree=2, decimate=4)
+    assert found.model.terms("x") == pytest.approx({"x*g": 1.0}, rel=1e-12)
+    exact = {"1": 2 / 9, "x": -2 / 3, "g": -1 / 3, "x*g": 1.0}
+    assert found.model.terms("g") == pytest.approx(exact, rel=0.05)
+    assert found.free.run.verdict == "follows"
+    assert found.measured.t[0] == found.signal.t[round(0.75 * len(found.signal.t)) - 1]
+    assert found.skill is not None
+    text = repr(found)
+    assert "x: the signal and 1 that nobody measured" in text
+    assert "its end, which was not fitted: follows" in text
+    assert found.discovery.model == found.model
+
+
+def test_one_call_makes_states_by_smoothing_where_it_is_asked_to() -> None:
+    run = sine(mean=0.0)
+    found = ep.from_one_signal(
+        run, embedding="rate", degree=1, method=ep.Regression(), held_out=0.0
+    )
+    (x,) = run.state_names
+    rate = 2.0 * np.pi * found.signal.frequency_Hz
+    assert found.model.terms(x) == {"v": 1.0}
+    assert found.model.terms("v") == pytest.approx({x: -(rate**2)}, rel=1e-2)
+    assert found.skill is None
+    assert "run freely over all of it" in repr(found)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"embedding": "lags"}, "embedding must be auto, hidden or log_rate or rate or delays"),
+        ({"n_states": "few"}, "n_states must be auto or a number: 'few' came"),
+        ({"n_states": 6}, "n_states must be 2 to 5: 6 came"),
+        ({"held_out": 1.0}, "held_out must be a share, 0 or more and below 1: 1.0 came"),
+        ({"signal": "y"}, "unknown variable 'y'"),
+        ({"decimate": 0}, "decimate must be auto, null or a whole number"),
+    ],
+)
+def test_settings_of_one_call_are_checked(setting: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ep.from_one_signal(sine(), **setting)
+
+
+def test_the_method_of_one_call_is_that_of_the_experiment() -> None:
+    study = study_of(Study, composed("+exp=trace"))
+    assert study.method == method_by_runs()
+    assert study._search == SignalSearch(method_by_runs(), functions=study.functions)

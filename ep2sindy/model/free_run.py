@@ -15,6 +15,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Verdict, record_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
+from ep2sindy.model.stability import LimitCycle, limit_cycle, share_reaching
 from ep2sindy.runtime.drawing import draw
 from ep2sindy.signals.attractor import phase_along
 from ep2sindy.signals.oscillation import DIED_OUT
@@ -68,6 +69,43 @@ class FreeRun:
         return draw("free_run_plot", self)
 
 
+@dataclass(frozen=True, eq=False)
+class FreeCycle:
+    """A free run and the limit cycle of its model.
+
+    cycle: None if the run ends on none. share: the share of starts around the cycle that reach it;
+    NaN without a cycle.
+    """
+
+    run: FreeRun
+    cycle: LimitCycle | None
+    share: float
+
+    @staticmethod
+    def of(run: FreeRun) -> FreeCycle:
+        """The cycle on which a free run ends, and how many starts reach it."""
+        cycle = _cycle_of(run)
+        return FreeCycle(run, cycle, np.nan if cycle is None else share_reaching(run.model, cycle))
+
+    @property
+    def multiplier(self) -> float:
+        """Largest modulus of the nontrivial Floquet multipliers; NaN without a cycle."""
+        if self.cycle is None:
+            return float("nan")
+        return float(np.abs(self.cycle.multipliers[1:]).max(initial=0.0))
+
+    @property
+    def text(self) -> str:
+        """The stability of the cycle, in a sentence; empty without a cycle."""
+        if self.cycle is None:
+            return ""
+        return (
+            f"The cycle is {self.cycle.stability}: of a departure {self.multiplier:.3g} is left "
+            f"after a period (Floquet multiplier); {100.0 * self.share:.0f} % of starts from 0.3 "
+            "to 3 times the cycle's mean reach it."
+        )
+
+
 def free_run(
     model: SparseModel,
     run: Trajectory,
@@ -110,6 +148,16 @@ def free_run(
         nrmse=_nrmse(rollout, record),
         **by_state,
     )
+
+
+def _cycle_of(run: FreeRun) -> LimitCycle | None:
+    """The closed orbit on which a free run ends."""
+    if run.model.inputs or run.rollout.diverged or run.verdict is Verdict.DIES_OUT:
+        return None
+    frequency_Hz = np.nanmax(list(run.frequency_Hz.values()), initial=0.0)
+    if not frequency_Hz > 0.0:
+        return None
+    return limit_cycle(run.model, run.rollout.states[-1], period_s=1.0 / frequency_Hz)
 
 
 def columns_of(states: Sequence[str], judged: Sequence[str] | None) -> list[int]:

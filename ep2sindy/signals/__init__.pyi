@@ -8,7 +8,7 @@ from ep2sindy.signals.spectrum import dominant_frequency as dominant_frequency
 from ep2sindy.signals.attractor import Cycle as Cycle
 from ep2sindy.signals.attractor import find_cycle as find_cycle
 from ep2sindy.signals.attractor import mean_cycle as mean_cycle
-from ep2sindy.signals.trace import from_one_signal as from_one_signal
+from ep2sindy.signals.trace import prepare_signal as prepare_signal
 from ep2sindy.signals.trace import Trace as Trace
 from ep2sindy.signals.embedding import Rate as Rate  # for configs
 from ep2sindy.signals.embedding import LogRate as LogRate  # for configs

@@ -98,7 +98,7 @@ class Trace:
         return is_positive(self.t, self.x)
 
 
-def from_one_signal(
+def prepare_signal(
     run: Trajectory,
     signal: str | None = None,
     *,
@@ -116,7 +116,7 @@ def from_one_signal(
     period, or a wrong setting.
 
     >>> t = np.linspace(0.0, 1e-3, 2001)
-    >>> ep.signals.from_one_signal(ep.Trajectory(t, 3 + np.sin(6e4*t)[:, None], ["I"])).is_positive
+    >>> ep.signals.prepare_signal(ep.Trajectory(t, 3 + np.sin(6e4*t)[:, None], ["I"])).is_positive
     True
     """
     name = run.state_names[0] if signal is None and len(run.state_names) == 1 else signal

@@ -24,10 +24,10 @@ from ep2sindy.figures import living as figures
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
-from ep2sindy.model.comparison import FreeRunBounds, Verdict
-from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.comparison import FreeRunBounds
+from ep2sindy.model.free_run import FreeCycle, FreeRun, free_run
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.stability import LimitCycle, limit_cycle, share_reaching
+from ep2sindy.model.stability import LimitCycle
 from ep2sindy.regression.searches import Search
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
@@ -126,43 +126,6 @@ class LivingSearch:
 
         rule = self.selection
         return rule.bounds if isinstance(rule, FreeRunScore) else FreeRunBounds()
-
-
-@dataclass(frozen=True, eq=False)
-class FreeCycle:
-    """A free run and the limit cycle of its model.
-
-    cycle: None if the run ends on none. share: the share of starts around the cycle that reach it;
-    NaN without a cycle.
-    """
-
-    run: FreeRun
-    cycle: LimitCycle | None
-    share: float
-
-    @staticmethod
-    def of(run: FreeRun) -> FreeCycle:
-        """The cycle on which a free run ends, and how many starts reach it."""
-        cycle = cycle_of(run)
-        return FreeCycle(run, cycle, np.nan if cycle is None else share_reaching(run.model, cycle))
-
-    @property
-    def multiplier(self) -> float:
-        """Largest modulus of the nontrivial Floquet multipliers; NaN without a cycle."""
-        if self.cycle is None:
-            return float("nan")
-        return float(np.abs(self.cycle.multipliers[1:]).max(initial=0.0))
-
-    @property
-    def text(self) -> str:
-        """The stability of the cycle, in a sentence; empty without a cycle."""
-        if self.cycle is None:
-            return ""
-        return (
-            f"The cycle is {self.cycle.stability}: of a departure {self.multiplier:.3g} is left "
-            f"after a period (Floquet multiplier); {100.0 * self.share:.0f} % of starts from 0.3 "
-            "to 3 times the cycle's mean reach it."
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,16 +340,6 @@ def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:
     first = run.window(0, min(run.n_samples, 200))
     smoothed: np.ndarray = KalmanSmoother().smooth(first.t, first.columns(model.states))
     return smoothed[0]
-
-
-def cycle_of(run: FreeRun) -> LimitCycle | None:
-    """The closed orbit on which a free run ends."""
-    if run.model.inputs or run.rollout.diverged or run.verdict is Verdict.DIES_OUT:
-        return None
-    frequency_Hz = np.nanmax(list(run.frequency_Hz.values()), initial=0.0)
-    if not frequency_Hz > 0.0:
-        return None
-    return limit_cycle(run.model, run.rollout.states[-1], period_s=1.0 / frequency_Hz)
 
 
 def two_periods(run: Trajectory) -> int | None:

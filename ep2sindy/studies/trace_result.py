@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -11,7 +11,9 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.one_signal import Attempt, SignalDiscovery
 from ep2sindy.discovery.result import Discovery
+from ep2sindy.discovery.signal_unknowns import HiddenStates
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.figures.living import (
     cycle_figure,
@@ -20,12 +22,10 @@ from ep2sindy.figures.living import (
     paths_off,
     waveform_figure,
 )
-from ep2sindy.forecasting.rolling import RollingStarts
-from ep2sindy.forecasting.skill import ForecastSkill, horizon_errors
-from ep2sindy.forecasting.tracking import Tracker
+from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.equations import equation_text
 from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeRun
+from ep2sindy.model.free_run import FreeCycle, FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.document import (
@@ -43,7 +43,6 @@ from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import (
     Chosen,
-    Embedding,
 )
 from ep2sindy.signals.trace import Trace
 from ep2sindy.studies.forecasts import (
@@ -57,9 +56,8 @@ from ep2sindy.studies.library_result import (
     column_note,
     estimate_section,
 )
-from ep2sindy.studies.living import WAVEFORM, FreeCycle
+from ep2sindy.studies.living import WAVEFORM
 from ep2sindy.studies.source import data_summary
-from ep2sindy.studies.trace_hidden import HiddenStates, alone
 from ep2sindy.studies.views import (
     coefficients,
     display_equation,
@@ -69,10 +67,6 @@ from ep2sindy.studies.views import (
     model_summary,
     rollout_tables,
 )
-
-# Error of forecasts, as a share of that of fewer states, from which more states are taken; starts
-# from which it is counted, and draws of each.
-CLEARLY, N_TRIED, N_DRAWS_TRIED = 0.8, 20, 20
 
 SCORED = (
     "Score against number of terms: the supports that were weighed against each other; the star is "
@@ -92,101 +86,42 @@ CAPTIONS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Attempt:
-    """A model in a number of states.
-
-    tracker: of its states along the fitted part. error: of its forecasts up to a period there, in
-    standard deviations. share: of the next state's variance that neighbours in these states do not
-    explain; None for hidden states, of which there is no next one.
-    """
-
-    chosen: Chosen
-    found: Discovery
-    tracker: Tracker
-    error: float
-    share: float | None
-
-    @property
-    def n_states(self) -> int:
-        return self.chosen.embedding.n_states
-
-    @property
-    def text(self) -> str:
-        errors = (
-            f"{self.n_states} states: forecasts up to a period err by {self.error:.3f} standard "
-            "deviations where fitted"
-        )
-        if self.share is None:
-            return errors
-        left = f"neighbours leave {100.0 * self.share:.2g} % of the next derivative unexplained"
-        return f"{errors}; {left}"
-
-
-def choose_attempt(attempts: Sequence[Attempt]) -> Attempt:
-    """The fewest states, unless more forecast clearly better where they were fitted."""
-    best = attempts[0]
-    for each in attempts[1:]:
-        if each.error < CLEARLY * best.error:
-            best = each
-    return best
-
-
-def error_where_fitted(past: Trace, chosen: Chosen, tracker: Tracker) -> float:
-    """Error of forecasts up to a period from starts in the last half of the fitted part."""
-    record, longest = with_all_states(past, chosen), max(2, round(past.per_period))
-    n = record.n_samples
-    first = np.unique(np.linspace(n // 2, n - longest, N_TRIED).round().astype(np.int64))
-    rolling = RollingStarts(tracker, record, [past.name], first, longest)
-    ahead = rolling.forecasts(partial(states_before, past, chosen.embedding), N_DRAWS_TRIED, seed=0)
-    scale = past.x[n // 2 :].std()
-    return float(horizon_errors(rolling.measured(ahead), rolling.truth, scale).mean())
-
-
-def with_all_states(signal: Trace, chosen: Chosen) -> Trajectory:
-    """Samples of the signal as measured, with the other states beside it as far as they are known.
-
-    Where a state is not known, at the beginning or beyond the fitted part, the nearest is taken;
-    forecasts there make their own.
-    """
-    known = chosen.embedded.run
-    nearest = np.clip(np.searchsorted(known.t, signal.t), 0, known.n_samples - 1)
-    states = known.states[nearest].copy()
-    states[:, 0] = signal.x
-    return replace(known, t=signal.t, states=states, inputs=np.empty((len(signal.t), 0)))
-
-
-def states_before(signal: Trace, embedding: Embedding, past: Trajectory) -> Trajectory:
-    """The states at a time, made from samples before it alone."""
-    if isinstance(embedding, HiddenStates):  # the tracker fits them itself
-        return alone(signal.with_samples(past.t, past.states[:, 0]))
-    return embedding.embed(signal.with_samples(past.t, past.states[:, 0])).run
-
-
-@dataclass(frozen=True, eq=False)
 class Outcome:
-    """The model found from one signal, and its tests.
+    """The model found from one signal, and its tests."""
 
-    best: the attempt that was chosen among `attempts`. states: all of the record, the signal as
-    measured. measured: the test data. free: the run of the model over them, from a start that was
-    fitted to the samples before, and its cycle. skill: of forecasts of the test data; None without
-    any.
-    """
+    tested: SignalDiscovery
 
-    signal: Trace
-    best: Attempt
-    attempts: Sequence[Attempt]
-    states: Trajectory
-    measured: Trajectory
-    free: FreeCycle
-    skill: ForecastSkill | None
+    @property
+    def signal(self) -> Trace:
+        return self.tested.signal
+
+    @property
+    def attempts(self) -> Sequence[Attempt]:
+        return self.tested.attempts
+
+    @property
+    def states(self) -> Trajectory:
+        return self.tested.states
+
+    @property
+    def measured(self) -> Trajectory:
+        return self.tested.measured
+
+    @property
+    def free(self) -> FreeCycle:
+        return self.tested.free
+
+    @property
+    def skill(self) -> ForecastSkill | None:
+        return self.tested.skill
 
     @property
     def chosen(self) -> Chosen:
-        return self.best.chosen
+        return self.tested.best.chosen
 
     @property
     def found(self) -> Discovery:
-        return self.best.found
+        return self.tested.discovery
 
     @property
     def label(self) -> str:
@@ -359,7 +294,7 @@ class Outcome:
                 "unit": self.signal.unit,
                 "done": list(self.signal.done),
                 "embedding": type(self.chosen.embedding).__name__,
-                "n_states": self.best.n_states,
+                "n_states": self.tested.best.n_states,
                 "reason": self.chosen.reason,
                 "noise_std": self.chosen.embedded.noise_std,
                 "period_s": self.signal.period_s,
