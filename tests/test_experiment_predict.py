@@ -17,8 +17,8 @@ from ep2sindy.operating.choice import map_points
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import Fate
 from ep2sindy.report.document import Text
+from ep2sindy.studies.points import expand
 from ep2sindy.studies.predict import Outcome, Study
-from ep2sindy.studies.source import expand
 from tests import programs
 
 POINTS = "points=[{V_D_V: [280.0, 320.0], mdot_mg_s: [5.0, 5.5]}, {V_D_V: 150.0, mdot_mg_s: 2.0}]"

@@ -43,7 +43,8 @@ from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.law_tables import published_table
-from ep2sindy.studies.source import Source, open_points, point_sources
+from ep2sindy.studies.points import open_points, point_sources
+from ep2sindy.studies.source import Source
 from ep2sindy.studies.study import Check, Count
 from ep2sindy.studies.views import coefficients, with_error
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -57,9 +57,16 @@ from ep2sindy.studies.law_tables import (
     structure_metrics,
     structures_table,
 )
+from ep2sindy.studies.points import (
+    Points,
+    expand,
+    open_points,
+    oscillating_records,
+    point_sources,
+)
 from ep2sindy.studies.simulated import compile_kernels
-from ep2sindy.studies.source import Source, expand, open_points, point_sources
-from ep2sindy.studies.study import Check, Count, Counts, Positive
+from ep2sindy.studies.source import Source
+from ep2sindy.studies.study import Count, Counts, Positive
 
 INTERVALS = (
     "In SI units, and the parameters in theirs. ±: half the 95 % interval, from a sandwich with "
@@ -143,15 +150,6 @@ class SearchSettings:
     max_terms: Count
 
 
-Points = Annotated[
-    Sequence[Mapping[str, Any]],
-    Check(
-        "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}], every combination being a point",
-        lambda value: isinstance(value, list) and bool(value),
-    ),
-]
-
-
 @dataclass(frozen=True, eq=False)
 class Study:
     """Fit one law to all operating points that oscillate, and test it at points left out.
@@ -198,7 +196,7 @@ class Study:
         with run.progress(None, "", "kernels, compiled once"):
             compile_kernels([source.source.data for source in sources])
         opened = open_points(sources, (), workers=self.parallel, run=run)
-        records, statuses = _records(opened, run)
+        records, statuses = oscillating_records(opened, run)
         if not records:
             raise ValueError("a law needs operating points that oscillate: none of these does")
         found: dict[str, Branch] = {}
@@ -240,23 +238,6 @@ class Study:
             n_map=self.map_points,
             seed=seed,
         )
-
-
-def _records(
-    opened: Sequence[OperatingRecord], run: Run
-) -> tuple[list[OperatingRecord], dict[str, str]]:
-    """The records that hold enough periods, and the status of every point by its label."""
-    records, statuses = [], {}
-    for point in opened:
-        statuses[point.label] = point.status
-        if point.trajectory is None:
-            continue
-        try:
-            records.append(OperatingRecord.of(point.parameters, point.trajectory))
-        except ValueError as error:
-            statuses[point.label] = Oscillation.NO_PERIOD
-            run.warn(str(error))
-    return records, statuses
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,12 +1,10 @@
-"""Data of a study: the field, its preparation, its trajectory; also several operating points."""
+"""Data of a study: the field, its preparation and its trajectory."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import product
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import xarray as xr
@@ -16,30 +14,20 @@ from ep2sindy.data.gaps import describe_gaps
 from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.sampling import ZoneAverage
-from ep2sindy.data.trajectory import ConstantStateError, Trajectory
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone, describe_zone
 from ep2sindy.library.library import Library
-from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run
-from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.runtime.screen import in_line
-from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.simulated import (
-    DivergedError,
-    amiss,
     check_recorded,
-    is_simulation,
-    quiet,
     say_simulation,
 )
 from ep2sindy.studies.study import Deferred
 from ep2sindy.thruster.balance import zone_balance
 
 Step = Callable[[xr.Dataset], xr.Dataset]
-WITHOUT_BREATHING = (  # attributes of a simulation
-    Oscillation.STEADY, Oscillation.DECAYING, Oscillation.TRANSIT, Oscillation.DIVERGED,
-)  # fmt: skip
 
 
 def open_prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
@@ -212,129 +200,3 @@ def data_summary(data: Trajectory) -> dict[str, Any]:
         "variables": list(data.names),
         "units": dict(data.units),
     }
-
-
-@dataclass(frozen=True, eq=False)
-class PointSource:
-    """One operating point and the source of its data. It can be sent to another process."""
-
-    parameters: Mapping[str, float]
-    source: Source
-
-    @property
-    def label(self) -> str:
-        return point_label(self.parameters)
-
-    def open(self, inputs: Sequence[str]) -> OperatingRecord:
-        """Open or simulate the point; a point that does not breathe comes without a trajectory.
-
-        A state that stays exactly constant makes a point steady, as no trajectory may hold it.
-        """
-        with naming(self.parameters):
-            try:
-                field = self.source.field()
-                if (status := field.attrs.get("status")) in WITHOUT_BREATHING:
-                    return OperatingRecord(self.parameters, None, status)
-                sampling = self.source.trajectory
-                run = sampling.trajectory(field, inputs=inputs, label=self.label)
-                notes = amiss(field.attrs) if is_simulation(field.attrs) else unit_doubts(field)
-                words = [field.attrs.get("file", ""), sampling.place(field)]
-                used = "; ".join(word for word in words if word)
-                return OperatingRecord(self.parameters, run, notes=notes, used=used)
-            except DivergedError:
-                return OperatingRecord(self.parameters, None, Oscillation.DIVERGED)
-            except ConstantStateError:
-                return OperatingRecord(self.parameters, None, Oscillation.STEADY)
-
-
-def expand(blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]) -> list[dict[str, Any]]:
-    """Every combination of the values in each block; repeated points count once.
-
-    Points are repeated if they have the same values and the same data. 300 and 300.0 are equal, and
-    the order of parameters in a block does not matter.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    for block in blocks:
-        lists = {
-            name: value if isinstance(value, list) else [value]
-            for name, value in block.items()
-            if name in parameters
-        }
-        rest = {name: value for name, value in block.items() if name not in lists}
-        for values in product(*lists.values()):
-            point = {**dict(zip(lists, values, strict=True)), **rest}
-            same = {name: float(v) if type(v) is int else v for name, v in point.items()}
-            found.setdefault(str(sorted(same.items(), key=lambda item: item[0])), point)
-    return list(found.values())
-
-
-def point_sources(
-    source: Source, places: Mapping[str, str | None], points: Sequence[Mapping[str, Any]]
-) -> list[PointSource]:
-    """The source once per operating point, with its parameters and data in the data group.
-
-    places: parameter -> its place in the data group; None if it has none.
-    Raises ValueError for points without all parameters, or that would open the same data twice.
-    """
-    names = list(places)
-    if not points:
-        raise ValueError(f"points must be a list with all of {names} each: {points!r} came")
-    found, seen = [], dict[str, str]()
-    for given in points:
-        parameters = _parameters(given, names)
-        changes = {place: parameters[name] for name, place in places.items() if place is not None}
-        data = _changed(source.data, changes, given.get("data", {}))
-        point = PointSource(parameters, replace(source, data=data))
-        if point.label in seen.values():
-            raise ValueError(f"an operating point may come once: {point.label} comes again")
-        if (same := str(data)) in seen:
-            raise ValueError(
-                f"operating points must differ in their data: {point.label} has that of "
-                f"{seen[same]}; say in parameters where the data group takes them, or give each "
-                "point its data"
-            )
-        seen[same] = point.label
-        found.append(point)
-    return found
-
-
-def open_points(
-    sources: Sequence[PointSource], inputs: Sequence[str], *, workers: Workers, run: Run
-) -> list[OperatingRecord]:
-    """Open or simulate all points, and report their data and warnings."""
-    stage = run.progress(len(sources), "point opened")
-    points = collect(workers, partial(PointSource.open, inputs=inputs), sources, stage)
-    _say_used(run, points)
-    for point in points:
-        for note in point.notes:
-            run.warn(f"{point.label}: {note}")
-    return points
-
-
-def _say_used(run: Run, points: Sequence[OperatingRecord]) -> None:
-    """Report which data are used: one line if all points are averaged alike, else one line each."""
-    used = {point.label: point.used for point in points if point.used}
-    if len({*used.values()}) == 1:
-        run.say(f"data: {next(iter(used.values()))}")
-        return
-    for label, words in used.items():
-        run.say(f"data: {label}: {words}")
-
-
-def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:
-    if set(given) - {"data"} != set(names) or not isinstance(given.get("data", {}), Mapping):
-        raise ValueError(f"a point must have {names}, and data where they differ: {given!r} came")
-    for name in names:
-        if type(given[name]) not in (int, float):
-            raise ValueError(f"points must give {name} as a number: {given[name]!r} came")
-    return {name: float(given[name]) for name in names}
-
-
-def _changed(data: Deferred, places: Mapping[str, float], more: Mapping[str, Any]) -> Deferred:
-    try:
-        data = data.changed(places)
-    except ValueError as error:
-        raise ValueError(
-            f"parameters must name numbers of the data group, or be null: {error}"
-        ) from error
-    return quiet(data.changed({}, more))
