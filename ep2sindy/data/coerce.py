@@ -299,10 +299,11 @@ class Task:
     runs: trajectories of the same states, which agree in the units of the library's variables.
     relations: between coefficients. terms: for each state whose equation is known but for its
     coefficients, all terms of that equation; it is not searched. roles: of terms, for equations
-    that conserve what states exchange. hidden: states that nobody measured.
+    that conserve what states exchange. hidden: states that nobody measured. exclude: for each state
+    that is named, terms of the library that its equation may not have.
     Raises ValueError for runs that do not agree or that share samples, a state that repeats
-    another, a variable that a run lacks, a relation, term or role of unknown names, or roles beside
-    relations or terms.
+    another, a variable that a run lacks, a relation, term or role of unknown names, roles beside
+    relations, terms or exclude, or a term that is excluded and named elsewhere.
     """
 
     runs: Sequence[Trajectory]
@@ -311,18 +312,17 @@ class Task:
     terms: Mapping[str, Sequence[str]] = field(default_factory=dict)
     roles: Roles | None = None
     hidden: Sequence[str] = ()
+    exclude: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_kind("library", self.library, Library, "ep.polynomial(['x', 'y'], degree=2)")
         check_list("hidden", self.hidden)
-        for state, names in self.terms.items():
-            check_list(f"the terms of {state!r}", names)
-        terms = {state: tuple(names) for state, names in self.terms.items()}
         for name, value in {
             "runs": tuple(trajectories_of(self.runs, partial=True)),
             "relations": relations_of(self.relations),
-            "terms": read_only_mapping(terms),
+            "terms": read_only_mapping(_names_by_state("terms", self.terms)),
             "hidden": tuple(self.hidden),
+            "exclude": read_only_mapping(_names_by_state("exclude", self.exclude)),
         }.items():
             object.__setattr__(self, name, value)
         self._check_hidden()
@@ -335,6 +335,12 @@ class Task:
     def states(self) -> tuple[str, ...]:
         """Names of the states, one equation each; hidden ones last."""
         return (*self.runs[0].state_names, *self.hidden)
+
+    def allowed(self, equation: str) -> Bool[np.ndarray, " terms"]:
+        """Mask of the library's terms that an equation may have."""
+        mask = np.ones(len(self.library), dtype=np.bool_)
+        mask[[self.library.index(name) for name in self.exclude.get(equation, ())]] = False
+        return mask
 
     def complete(
         self, equation: str, found: Sequence[Bool[np.ndarray, "_ terms"]]
@@ -364,18 +370,56 @@ class Task:
         """Raise ValueError for an unknown state or term, or an equation without terms."""
         if self.roles is not None:
             check_kind("roles", self.roles, Roles, "ep.Roles(exchange=[('n_n', 'n_i')])")
-            if self.relations or self.terms:
+            if self.relations or self.terms or self.exclude:
                 raise ValueError(
-                    "roles say which terms the equations may have and how they are tied: relations "
-                    "and terms came as well; give roles alone, or leave them out"
+                    "roles say which terms the equations may have and how they are tied: "
+                    "relations, terms or exclude came as well; give roles alone, or leave them out"
                 )
             self.roles.processes(self.library, self.states)
         named = [(state, term) for r in self.relations for _, state, term in r.factors]
         named += [(state, term) for state, terms in self.terms.items() for term in terms]
-        for state in (*self.terms, *(state for state, _ in named)):
+        for state in (*self.terms, *self.exclude, *(state for state, _ in named)):
             if state not in self.states:
                 raise ValueError(f"unknown state {state!r}; there are {list(self.states)}")
         for _, term in named:
             self.library.index(term)
         if empty := [state for state, terms in self.terms.items() if not terms]:
             raise ValueError(f"an equation whose terms are given must have some: {empty} has none")
+        for state in self.exclude:
+            if not self.allowed(state).any():
+                raise ValueError(
+                    f"exclude must leave terms to every equation: all {len(self.library)} of the "
+                    f"library came for {state!r}; leave some of them out of exclude"
+                )
+        for state, term in named:
+            if not self.allowed(state)[self.library.index(term)]:
+                raise ValueError(
+                    f"a term is excluded, or it is named in terms and relations: {term!r} of "
+                    f"{state!r} came in both; leave it out of one of them"
+                )
+
+
+def _names_by_state(key: str, given: object) -> dict[str, tuple[str, ...]]:
+    """The terms of every state that are named. Raises ValueError for what are no lists of names."""
+    example = f"{key}={{'x': ['x', 'x*y']}}"
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{key} must be lists of terms by state, like {example}: {given!r} came")
+    found = {}
+    for state, names in given.items():
+        check_list(f"the {key} of {state!r}", names)
+        if isinstance(names, Mapping) and names:
+            term, value = next(iter(names.items()))
+            raise ValueError(
+                f"{key} names terms, without coefficients, like {example}: {dict(names)!r} came "
+                f"for {state!r}; a coefficient that is known is a relation, "
+                f"relations=['{state}: {term} == {value}']"
+            )
+        if not isinstance(names, Sequence):
+            raise ValueError(f"{key} must be a list for every state: {names!r} came for {state!r}")
+        if wrong := [name for name in names if not isinstance(name, str)]:
+            raise ValueError(
+                f"{key} must hold names of terms, like {example}: {wrong[0]!r} came for "
+                f"{state!r}; the constant term is '1'"
+            )
+        found[state] = tuple(names)
+    return found

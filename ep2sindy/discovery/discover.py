@@ -37,6 +37,7 @@ def discover(
     terms: Mapping[str, Sequence[str]] | None = None,
     roles: Roles | None = None,
     hidden: Sequence[str] = (),
+    exclude: Mapping[str, Sequence[str]] | None = None,
     seed: int | np.random.Generator = 0,
     progress: Progress | bool = False,
 ) -> Discovery:
@@ -52,7 +53,8 @@ def discover(
     coefficients, all terms of that equation. roles: of terms, for equations that conserve what
     states exchange (`Roles`); for a `Regression` by FreeRunScore or RefinedScore. hidden: names of
     states that nobody measured; they and their equations are found with the others', by a
-    `TrajectorySearch`. progress: True shows bars.
+    `TrajectorySearch`. exclude: for each state that is named, terms of the library that its
+    equation may not have, such as {"x": ["x^2"]}. progress: True shows bars.
     Raises ValueError for a relation, term or role that the library or the states do not have, roles
     that the method cannot keep, runs whose states or units differ, states or samples that repeat.
     """
@@ -61,7 +63,8 @@ def discover(
     names = dict.fromkeys([*trajectories[0].names, *hidden])
     library = polynomial(list(names)) if library is None else library
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")
-    task = Task(trajectories, library, relations_of(relations), terms or {}, roles, hidden)
+    terms, exclude = ({} if given is None else given for given in (terms, exclude))
+    task = Task(trajectories, library, relations_of(relations), terms, roles, hidden, exclude)
     rng, watch = np.random.default_rng(seed), as_progress(progress)
     return _discovery(method.identify(task, rng=rng, progress=watch), method, trajectories)
 

@@ -341,7 +341,8 @@ class Regression:
                 draws = draw_resamples(problem, self.bootstraps, rng=rng)
             for k, equation in enumerate(problem.equations):
                 with progress.stage(len(draws.xx), "draw", f"search for {equation}'") as advance:
-                    proposed = draws.search(self.search, k, advance)
+                    allowed = task.allowed(equation)
+                    proposed = draws.search(self.search, k, advance, allowed=allowed)
                 found = task.complete(equation, proposed)
                 supports = pool(draws, k, found)
                 front = pareto_front(problem, supports, depth=self.depth)

@@ -126,6 +126,7 @@ def estimate(
     relations: Sequence[Relation | str] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
     hidden: Sequence[str] = (),
+    exclude: Mapping[str, Sequence[str]] | None = None,
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
     limit_s: float | None = None,
@@ -140,14 +141,22 @@ def estimate(
     delays are reported.
     relations: between coefficients, held in fit and search. terms: for each state whose equation is
     known but for its coefficients, all terms of that equation. hidden: states that nobody measured,
-    which the library has; all ways in which they may enter are compared. limit_s: wall time after
+    which the library has; all ways in which they may enter are compared. exclude: for each state
+    that is named, terms of the library that its equation may not have. limit_s: wall time after
     which the search ends with the best that it has, and says so. progress: True shows bars, see
     `Progress`; an interruption (Ctrl-C) then ends the search in the same way.
     Raises ValueError for fewer than one term, a limit that is not positive, a library that needs
     more samples than there are or more memory, or whatever a `Task` refuses.
     """
     known = trajectories_of(runs, partial=True)
-    task = Task(known, library, relations_of(relations), terms or {}, hidden=hidden)
+    task = Task(
+        known,
+        library,
+        relations_of(relations),
+        {} if terms is None else terms,
+        hidden=hidden,
+        exclude={} if exclude is None else exclude,
+    )
     return estimate_task(
         task,
         max_terms=max_terms,
@@ -202,9 +211,11 @@ def _try(
 ) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task by one way in which its hidden states may enter."""
     check_runs(known)
-    given = known.runs, known.library, known.relations, known.terms
     measured = task.runs[0].state_names
-    problem = scale_problem(*given, measured=measured, watch=watch)
+    problem = scale_problem(
+        known.runs, known.library, known.relations, known.terms, measured=measured,
+        exclude=known.exclude, watch=watch,
+    )  # fmt: skip
     found = explain(problem, max_terms=max_terms, align=align)
     return replace(found, said=(*(way.words for way in ways), *found.said)), known.runs
 

@@ -8,7 +8,7 @@ different equations, so all that a library allows are tried.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
 
@@ -61,14 +61,19 @@ class Entrance:
 
 
 def entrances(
-    library: Library, measured: Sequence[str], hidden: Sequence[str], relations: Sequence[Relation]
+    library: Library,
+    measured: Sequence[str],
+    hidden: Sequence[str],
+    relations: Sequence[Relation],
+    allowed: Callable[[str], Bool[np.ndarray, " terms"]] | None = None,
 ) -> list[tuple[Entrance, ...]]:
     """All ways in which hidden states may enter, one entrance for each of them.
 
     A hidden state enters the equation of a state before it, alone or times one of these. The first
     one of a single measured state is its rate or its growth rate, and the next one enters the
     equation of that. A relation that fixes the coefficient of such a term leaves no choice.
-    Raises ValueError if the library has no term for a hidden state.
+    allowed: mask of the terms that the equation of a state may have; None if it may have all.
+    Raises ValueError if there is no term for a hidden state.
     """
     choices, before = [], list(measured)
     for name in hidden:
@@ -80,12 +85,14 @@ def entrances(
             Entrance(name, state, library.names[k])
             for state in shown
             for k in np.flatnonzero(own & (library.degrees <= 2)).tolist()
+            if allowed is None or allowed(state)[k]
         ]
         given = [e for r in relations if (e := _fixed_by(r, name, library, own, before))]
         if not (given or offered):
             raise ValueError(
-                f"a hidden state must have a term in the library, alone or times one of {before}: "
-                f"{name!r} has none in {list(library.names)}; add one, or leave the state out"
+                f"a hidden state must have a term in the library, alone or times one of {before}, "
+                f"that is not excluded: {name!r} has none in {list(library.names)}; add one, or "
+                "leave the state out"
             )
         choices.append(given[:1] or offered)
         before.append(name)
@@ -100,7 +107,7 @@ def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]
     that takes either sign has a rate.
     """
     measured = task.runs[0].state_names
-    found = entrances(task.library, measured, task.hidden, task.relations)
+    found = entrances(task.library, measured, task.hidden, task.relations, task.allowed)
     groups = [list(ways) for _, ways in groupby(found, key=lambda ways: ways[0])]
     if len(measured) > 1:
         groups = [found]

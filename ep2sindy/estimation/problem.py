@@ -291,14 +291,15 @@ def scale_problem(
     terms: Mapping[str, Sequence[str]] | None = None,
     *,
     measured: Sequence[str] = (),
+    exclude: Mapping[str, Sequence[str]] | None = None,
     watch: Watch | None = None,
 ) -> EstimationProblem:
     """Scale records and library, and collect the coefficients that may be in the model.
 
     relations: hold between coefficients. terms: for each state whose equation is known but for its
-    coefficients, all terms of that equation. measured: names of states; empty means all. Inputs
-    that the library does not have are left out; the others are taken by name, in the order of the
-    first run.
+    coefficients, all terms of that equation. measured: names of states; empty means all. exclude:
+    for each state that is named, terms that its equation may not have. Inputs that the library does
+    not have are left out; the others are taken by name, in the order of the first run.
     """
     states = runs[0].state_names
     inputs = [name for name in runs[0].input_names if name in library.variables]
@@ -308,7 +309,7 @@ def scale_problem(
     size = zero_to_one(np.sqrt(np.square(values).mean(axis=0)))
     step_s = float(np.mean(np.concatenate([np.diff(run.t) for run in runs])))
     scaled, numbers = over.scaled(size)
-    asked = {state: (terms or {}).get(state, over.names) for state in states}
+    asked = _asked(over, states, terms or {}, exclude or {})
     held = constraint(over, asked, relations) if relations else None
     equation, column = _coefficients(over, asked)  # in the order of the constraint's
     to_SI = size[equation] / (numbers[column] * step_s)
@@ -333,6 +334,22 @@ def scale_problem(
         watch=watch or Watch(),
     )
     return replace(problem, records=tuple(problem.record(run) for run in runs))
+
+
+def _asked(
+    library: Library,
+    states: Sequence[str],
+    terms: Mapping[str, Sequence[str]],
+    exclude: Mapping[str, Sequence[str]],
+) -> dict[str, Sequence[str]]:
+    """Terms that may be in each equation: those that are known, or all that are not excluded."""
+    barred = {state: {*map(library.index, names)} for state, names in exclude.items()}
+    return {
+        state: terms[state]
+        if state in terms
+        else [name for k, name in enumerate(library.names) if k not in barred.get(state, ())]
+        for state in states
+    }
 
 
 def _coefficients(

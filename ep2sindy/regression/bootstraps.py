@@ -121,13 +121,24 @@ class Resamples:
     largest: int
 
     def search(
-        self, search: Search, equation: int, advance: Advance = nothing
+        self,
+        search: Search,
+        equation: int,
+        advance: Advance = nothing,
+        *,
+        allowed: Bool[np.ndarray, " terms"] | None = None,
     ) -> list[Bool[np.ndarray, "_ terms"]]:
-        """Supports that a search proposes in every draw, without those that are too large."""
+        """Supports that a search proposes in every draw, without those that are too large.
+
+        allowed: terms that the equation may have; None for all. The others are searched as culled
+        ones are, as columns of zeros.
+        """
         draws = zip(self.xx, self.xy[:, equation], self.yy[:, equation].tolist(), strict=True)
         found = []
-        for draw in draws:
-            found.append(search.supports(*draw))
+        for xx, xy, yy in draws:
+            if allowed is not None and not allowed.all():
+                xx, xy = xx * (allowed[:, None] & allowed), xy * allowed
+            found.append(search.supports(xx, xy, yy))
             advance(1)
         if self.largest >= self.kept.shape[1]:
             return found

@@ -13,7 +13,7 @@ import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.forecasting.skill import ForecastSkill
@@ -31,7 +31,7 @@ from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.studies.balance import ModelBalance, inflows_of, model_balance
-from ep2sindy.studies.fits import split_in_time
+from ep2sindy.studies.fits import Terms, split_in_time
 from ep2sindy.studies.forecasts import (
     forecast_errors,
     forecast_picture,
@@ -133,8 +133,8 @@ class Study:
     without inputs are searched for a model that lives; None leaves that out. held_out: the last
     share of the record, on which such a model is tested; None means a quarter. forecasts: number of
     starts of forecasts, over the held-out part of a living model, or else over the last quarter of
-    the record; zero leaves them out. hidden: states that nobody measured, and relations between
-    coefficients, as for `discover`.
+    the record; zero leaves them out. hidden: states that nobody measured, relations between
+    coefficients, and terms that an equation may not have (exclude), as for `discover`.
     Raises ValueError for held_out without living, as it would do nothing, and for hidden states
     with several libraries or with living, which need samples of all states.
     """
@@ -152,12 +152,18 @@ class Study:
     forecasts: int = 0
     hidden: Sequence[str] = ()
     relations: Sequence[str] = ()
+    exclude: Terms | None = None
 
     def __post_init__(self) -> None:
         if self.hidden and (self.living is not None or len(self.libraries) > 1):
             raise ValueError(
                 f"hidden states go with one library and without living: hidden={list(self.hidden)} "
                 f"came with {len(self.libraries)} libraries; take +exp=discover"
+            )
+        if self.exclude and self.living is not None:
+            raise ValueError(
+                "exclude goes without living, whose roles say which terms there are: "
+                f"exclude={dict(self.exclude)} came; take +exp=discover"
             )
         if self.forecasts < 0:
             raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
@@ -166,6 +172,16 @@ class Study:
                 "held_out would do nothing: it is for a model that lives, and living is null; give "
                 "held_out=null as well, or say in living how it is searched for"
             )
+
+    def idle(self) -> dict[str, str]:
+        found = {}
+        for name, case in self.libraries.items():
+            if not case.functions:
+                found[f"libraries.{name}.function_degree"] = "the library has no functions"
+            if not isinstance(self.method.selection, Knee):
+                rule = type(self.method.selection).__name__
+                found[f"libraries.{name}.n_norm"] = f"{rule} selects, and not the knee"
+        return found
 
     def compute(self, run: Run) -> Outcome:
         methods = {name: case.method(self.method) for name, case in self.libraries.items()}
@@ -215,8 +231,7 @@ class Study:
         lives is searched for in the first one.
         """
         s, measured = self.rollout_s, runs[0]
-        ask = partial(discover, hidden=self.hidden, relations=self.relations, progress=progress)
-        found = ask(list(runs), library, method, seed=rng)
+        found = self._ask(list(runs), library, method, seed=rng, progress=progress)
         runs = runs if found.estimate is None else found.estimate.runs
         first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
         data, n_samples = first
@@ -246,6 +261,11 @@ class Study:
                 elsewhere=[free_run(found.model, run, n_samples=n) for run, n in others],
                 skill=skill,
             )
+
+    @property
+    def _ask(self) -> partial[Discovery]:
+        barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
+        return partial(discover, hidden=self.hidden, relations=self.relations, exclude=barred)
 
     def _lives(
         self,
