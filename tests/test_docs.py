@@ -19,7 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import ep2sindy as ep
 from ep2sindy._stubs import dotted_names
-from ep2sindy.app.runner import check_overrides, study_class
+from ep2sindy.app.runner import check_effects, check_overrides, study_class
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.systems.regions import three_regions
@@ -131,7 +131,7 @@ def check_program(given: list[str]) -> None:
     study = study_class(config.study)
     check_overrides(overrides, used=keys_of(study), experiment=config.experiment)
     if is_whole:
-        study_of(study, config)
+        check_effects(overrides, study_of(study, config), config)
 
 
 def single(text: str) -> str:

@@ -29,6 +29,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from ep2sindy.app.arguments import COMMANDS, listed, near_words, options_first
 from ep2sindy.app.safety import check_places, checked_loader, resolved
 from ep2sindy.runtime.screen import plain, say
 from ep2sindy.runtime.threads import start_on_one_thread
@@ -124,7 +125,7 @@ def command(arguments: Sequence[str], conf: Path) -> bool:
         from ep2sindy.app.warm import main as compile_kernels
 
         compile_kernels(rest)
-    return name in ("compare", "inspect", "warm")
+    return name in COMMANDS
 
 
 def conf_folder() -> Path:
@@ -140,9 +141,8 @@ def conf_folder() -> Path:
 
 
 def prepare_arguments(conf: Path) -> None:
-    """Allow flags anywhere, and add ./conf to the configs as `--config-dir ./conf` would."""
-    flags = [text for text in sys.argv[1:] if text in ("-m", "--multirun")]
-    sys.argv[1:] = [*flags, *(text for text in sys.argv[1:] if text not in flags)]
+    """Sort and mend the arguments, and add ./conf to the configs as `--config-dir` would."""
+    sys.argv[1:] = options_first(sys.argv[1:])
     primary = ("--config-path", "-cp", "--config-name", "-cn")
     if other := [text for text in sys.argv[1:] if text.startswith(primary)]:
         raise ValueError(
@@ -160,11 +160,7 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
     with note_job() as (done, ended_early):
         try:
             if config.experiment is None:
-                raise ValueError(
-                    "choose an experiment with +exp=NAME; there are "
-                    f"{list_experiments(conf)}. A config of "
-                    "your own begins with the line '# @package _global_'"
-                )
+                raise ValueError(no_experiment(HydraConfig.get().overrides.task, conf))
             typed = HydraConfig.get().overrides.task
             check_places(resolved(config), typed)
             say(first_word(config))  # the imports below take seconds
@@ -219,7 +215,15 @@ def first_word(config: DictConfig) -> str:
     return f"{config.experiment}: loading study={config.get('study')}; writes below {folder}/"
 
 
-def list_experiments(conf: Path) -> str:
-    """Text that lists the available experiments."""
+def no_experiment(typed: Sequence[str], conf: Path) -> str:
+    """Words for a command that names no experiment, with all that there are."""
     folders = {conf, Path.cwd() / "conf"}
-    return ", ".join(sorted({path.stem for each in folders for path in each.glob("exp/*.yaml")}))
+    names = sorted({path.stem for each in folders for path in each.glob("exp/*.yaml")})
+    for text in typed:
+        key, _, value = text.lstrip("+").partition("=")
+        if value in names and near_words(key, ["exp", "experiment"]):
+            return f"an experiment is chosen with +exp={value}: {text!r} came"
+    return (
+        f"choose an experiment with +exp=NAME; there are {listed(names)}. A config of your own "
+        "begins with the line '# @package _global_'"
+    )

@@ -31,7 +31,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.report.screen import PAGE, Screen
 from ep2sindy.report.tensorboard import Board
 from ep2sindy.runtime.progress import Bars, count_pieces
-from ep2sindy.studies.study import Experiment, Outcome
+from ep2sindy.studies.study import Experiment, Outcome, Selective
 from ep2sindy.trust.user_code import load_user_module
 
 
@@ -58,6 +58,7 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
         advance(1)
         check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
         study: Experiment = study_of(kind, config)  # an invalid setting leaves no run folder
+        check_effects(overrides, study, config)
         advance(1)
     warm()
     with start_run(config) as run:
@@ -144,6 +145,31 @@ def check_overrides(overrides: Iterable[str], *, used: Collection[str], experime
             raise ValueError(
                 f"{text!r} would do nothing: {experiment} does not use {key!r}; leave it out"
             )
+
+
+def check_effects(overrides: Iterable[str], study: Experiment, config: DictConfig) -> None:
+    """Raise ValueError for a typed setting that has no effect beside the others."""
+    idle = dict(study.idle()) if isinstance(study, Selective) else {}
+    for text in overrides:
+        key = text.lstrip("+~").partition("=")[0].replace("/", ".")
+        reasons = {place: why for place, why in idle.items() if f"{key}.".startswith(f"{place}.")}
+        if why := "".join([*reasons.values()][:1]) or _idle_beside(key, config):
+            raise ValueError(f"{text!r} would do nothing: {why}; leave it out, or change that")
+
+
+def _idle_beside(key: str, config: DictConfig) -> str:
+    """Why a setting has no effect beside others of its group; empty if it has one."""
+    place, _, name = key.rpartition(".")
+    if place == "bootstraps" and name != "n" and OmegaConf.select(config, "bootstraps.n") == 0:
+        return "bootstraps.n is 0, and no bootstrap is drawn"
+    beside = OmegaConf.select(config, place) if place.startswith("data.") else None
+    if (
+        name in ("unit", "dims")
+        and isinstance(beside, DictConfig)
+        and OmegaConf.select(beside, "name", default="") is None
+    ):
+        return f"{place}.name is null, so nothing of the file is taken for it"
+    return ""
 
 
 def unused_rows(overrides: Iterable[str], study: Any) -> str:

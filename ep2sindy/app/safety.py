@@ -28,6 +28,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from ep2sindy.app.arguments import explained
+
 FOLDERS = ("output", "keep", "cache")  # keys, at any depth, of folders that a run writes to
 SERVERS = ("address",)
 # Hydra's own notes on a run, which have no effect.
@@ -68,7 +70,9 @@ class CheckedLoader(ConfigLoaderImpl):
         typed = partial(self._typed, config_name, hydras, run_mode, from_shell)
         if not validate_sweep_overrides:  # Hydra asks for the mode only, before composing
             return typed() if hydras else OmegaConf.create({"hydra": {"mode": None}})
-        found = super().load_configuration(config_name, overrides, run_mode, from_shell)
+        compose = partial(self._composed, config_name, run_mode, from_shell)
+        with explained(overrides, compose):
+            found = compose(overrides)
         tasks = [text for text in overrides if text not in hydras]
         check_hydra(_settings(found), _settings(typed()) | {"overrides.task": tasks})
         check_references(_written(found))
@@ -76,6 +80,11 @@ class CheckedLoader(ConfigLoaderImpl):
             check_output(found)  # only once it begins can the whole config be resolved
             check_places([("output", found.output)], overrides)
         return found
+
+    def _composed(
+        self, config_name: str | None, run_mode: RunMode, from_shell: bool, overrides: list[str]
+    ) -> DictConfig:
+        return super().load_configuration(config_name, overrides, run_mode, from_shell)
 
     def _typed(
         self, config_name: str | None, hydras: list[str], run_mode: RunMode, from_shell: bool

@@ -18,6 +18,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from ep2sindy._stubs import place_of
+from ep2sindy.app.arguments import near_words
 from ep2sindy.app.targets import target_of
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.recipe import Recipe, method_of
@@ -58,7 +59,8 @@ def study_of(study: type, config: DictConfig) -> Any:
         hint = ""
         if "thruster" in unknown:  # a file of ./conf/thruster that lacks its first line
             hint = "; a file of conf/thruster begins with the line '# @package data.thruster'"
-        raise ValueError(f"unknown keys {sorted(unknown)}; there are {sorted(known)}{hint}")
+        near = "".join(near_words(name, known) for name in sorted(unknown))
+        raise ValueError(f"unknown keys {sorted(unknown)}{near}; there are {sorted(known)}{hint}")
     return _fill(study, _without_formats(config, has_own="figures" in keys_of(study)))
 
 
@@ -205,10 +207,11 @@ def _dataclass(kind: type, node: Any, place: str) -> Any:
     given = set(map(str, node)) if isinstance(node, DictConfig) else None
     if given is None or given - set(names) or set(needed) - given:
         came = sorted(given) if given is not None else contents(node)
+        near = "".join(near_words(each, names) for each in sorted((given or set()) - set(names)))
         if len(needed) == len(names):
-            raise ValueError(f"{place} must have {_listed(needed)}: {came} came")
+            raise ValueError(f"{place} must have {_listed(needed)}: {came} came{near}")
         raise ValueError(
-            f"{place} may have {sorted(names)} and needs {_listed(needed)}: {came} came"
+            f"{place} may have {sorted(names)} and needs {_listed(needed)}: {came} came{near}"
         )
     hints = hints_of(kind)
     return kind(
@@ -291,7 +294,8 @@ def bind(node: DictConfig, place: str, *first: Any) -> partial[Any]:
     except TypeError as error:
         name = getattr(target, "__name__", target)
         names = list(takes.parameters)[len(first) :]
-        raise ValueError(f"{place}, {name}: {error}; it takes {names}") from error
+        near = "".join(near_words(each, names) for each in {*call.keywords} - {*names})
+        raise ValueError(f"{place}, {name}: {error}{near}; it takes {names}") from error
     return call
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.discovery.method import AnyMethod
+from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.figures.trends import PUBLISHED, rows_at, trends_figure
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import constraint
@@ -29,6 +29,7 @@ from ep2sindy.operating.quantities import REFINED, Fitted, PointResult, Quantity
 from ep2sindy.operating.quantity_law import ControlLaw, exponent, laws, trends
 from ep2sindy.operating.records import point_label
 from ep2sindy.regression.rows import Formulation
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.report.document import (
     Block,
     Captioned,
@@ -173,6 +174,12 @@ class Study:
                 raise ValueError(
                     f"a trend goes along one parameter and holds the others of {names}: {each} came"
                 )
+
+    def idle(self) -> dict[str, str]:
+        own = self.method
+        if isinstance(own, Regression) and isinstance(own.search, BestSubset):
+            return {}
+        return {"law.tied_degree": "only search=best_subset finds a support for all points"}
 
     def compute(self, run: Run) -> Outcome:
         # Everything but the data is built first: a misspelt setting must not cost a simulation.

@@ -15,6 +15,7 @@ from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.choice import (
+    MAX_PARAMETERS,
     Branch,
     BranchSettings,
     StructureCase,
@@ -188,6 +189,14 @@ class Study:
             n_spare=1,
             remedy="give it more values, or leave it out (~parameters.{name})",
         )
+
+    def idle(self) -> dict[str, str]:
+        found = {}
+        if self.models is not None:
+            found["structures"] = "models are given, and models=null alone searches for terms"
+        if len(self.parameters) > MAX_PARAMETERS:
+            found["map_points"] = f"a map is drawn over {MAX_PARAMETERS} parameters or fewer"
+        return found
 
     def compute(self, run: Run) -> Outcome:
         how = self._how(run.seed)

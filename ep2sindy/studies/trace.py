@@ -75,6 +75,19 @@ class Study:
             self.functions, self.function_degree,
         )  # fmt: skip
 
+    def idle(self) -> dict[str, str]:
+        found = {}
+        if not self.functions:
+            found["function_degree"] = "functions are none"
+        if self.embedding == "hidden":
+            why = "embedding=hidden finds states and equations together, by search=trajectory"
+            found |= dict.fromkeys(("formulation", "bootstraps", "selection", "depth"), why)
+            if not isinstance(self.method, TrajectorySearch):
+                found["search"] = why
+            if not any(FITTED in text for text in self.functions):
+                found["harmonics"] = f"{why}, without smoothing"
+        return found
+
     def compute(self, run: Run) -> Outcome:
         data = self._sampled(run)
         signal = self._with_offset(self._signal(data), data, run)

@@ -1,0 +1,186 @@
+"""Arguments of the command line: mended before Hydra reads them, its errors in our words.
+
+Only Hydra is imported here: a command must not wait for the numerics.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from difflib import get_close_matches
+from typing import Any
+
+from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+
+COMMANDS = ("compare", "inspect", "warm")  # that stand first, without +exp=NAME
+QUOTED_KEY = re.compile(r"""(?<=[{,])\s*(?P<quote>["'])(?P<name>\w+)(?P=quote)\s*(?=:)""")
+
+Compose = Callable[[list[str]], DictConfig]
+
+
+def options_first(arguments: Sequence[str]) -> list[str]:
+    """The arguments with options before settings, as Hydra takes them, each mended.
+
+    Raises ValueError for an option that there is not, naming the nearest one, and as `mend` does.
+    """
+    parser = get_args_parser()
+    known = [name for action in parser._actions for name in action.option_strings]
+    for text in arguments:
+        name = text.partition("=")[0]
+        if name.startswith("--") and not any(each.startswith(name) for each in known):
+            raise ValueError(f"unknown option {name!r}{near_words(name, known)}; see --help")
+
+    def refuse(message: str) -> None:
+        raise ValueError(f"options must be those of --help: {message}")
+
+    parser.error = refuse  # type: ignore[assignment,method-assign]
+    settings = list(parser.parse_intermixed_args(list(arguments)).overrides)
+    options = [text for text in arguments if text not in settings]
+    return [*options, *map(mend, settings)]
+
+
+def mend(text: str) -> str:
+    """A setting as Hydra's grammar takes it: names of a mapping may come in quotes.
+
+    Raises ValueError for an argument that is no setting.
+    """
+    without = QUOTED_KEY.sub(lambda found: found["name"], text)
+    try:
+        OverridesParser.create().parse_overrides([without])
+    except OverrideParseException as error:
+        raise ValueError(_unreadable(text, error.message.strip().partition("\n")[0])) from error
+    return without
+
+
+def near_words(name: str, names: Iterable[str], *, form: str = "{}") -> str:
+    """`; near it is NAME` for the similar ones among some names; empty if there are none.
+
+    form: how a name is written.
+    """
+    near = get_close_matches(name, sorted(set(names)), n=3)
+    return f"; near it {'is' if len(near) == 1 else 'are'} {listed(near, form)}" if near else ""
+
+
+def listed(names: Iterable[str], form: str = "{}") -> str:
+    return ", ".join(form.format(name) for name in names)
+
+
+@contextmanager
+def explained(overrides: Sequence[str], compose: Compose) -> Iterator[None]:
+    """Turn errors of Hydra into a ValueError that names the nearest key, choice or form.
+
+    overrides: that are being composed. compose: makes a config of some of them.
+    """
+    try:
+        yield
+    except MissingConfigException as error:
+        raise ValueError(_no_choice(error)) from error
+    except ConfigCompositionException as error:
+        raise ValueError(_not_set(error, overrides, compose)) from error
+
+
+def _no_choice(error: MissingConfigException) -> str:
+    """Words for a choice of a group, or an experiment, that there is not."""
+    group, _, name = str(error.missing_cfg_file or "").rpartition("/")
+    options = sorted(error.options or ())
+    if not group or not options:
+        return str(error).partition("\nConfig search path")[0]
+    what = "experiment" if group == "exp" else f"choice of {group}"
+    form = "+exp={}" if group == "exp" else f"{group}={{}}"
+    near = near_words(name, options, form=form)
+    return f"there is no {what} {name!r}{near}; there are {listed(options)}"
+
+
+def _unreadable(text: str, reason: str) -> str:
+    """Words for an argument that is no setting."""
+    if "=" in text or text.startswith("~"):
+        return (
+            f"{text!r} cannot be read as KEY=VALUE ({reason}); text that holds signs such as "
+            """^ ( { : , must stand in double quotes inside single ones: 'KEY="TEXT"', """
+            """'KEY={NAME: ["TEXT"]}'"""
+        )
+    return (
+        f"an argument must be KEY=VALUE, such as +exp=discover or seed=1: {text!r} came"
+        f"{near_words(text, COMMANDS, form='the command {}, which stands first')}; "
+        f"+exp={text} is the form for an experiment"
+    )
+
+
+def _not_set(error: ConfigCompositionException, overrides: Sequence[str], compose: Compose) -> str:
+    """Words for a setting that does not fit the config."""
+    said = str(error)
+    found = re.match(r"Could not (override|delete from config\.) '?([^'\s]+?)'(?:\.| does)", said)
+    if found is None:
+        cause = str(error.__cause__ or "").strip().partition("\n")[0]
+        merged = re.match(r"Error merging override (.*)", said, re.DOTALL)
+        if merged and cause:
+            return (
+                f"{merged[1]!r} cannot be set, for the config has another kind of value there: "
+                f"{cause}; --cfg job shows what it has"
+            )
+        return said.partition("\nSee https")[0]
+    key = found[2]
+    typed = next((text for text in overrides if _key(text) == key), key)
+    if "No match in the defaults list" in said:
+        return f"{typed!r} adds to the config, which needs a plus: write +{typed}"
+    others = [text for text in overrides if _key(text) != key]
+    try:
+        return _no_key(key, compose(others))
+    except Exception:  # another setting cannot be composed either: no names to compare with
+        return f"unknown key {key!r}; --cfg job shows those that there are"
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
+
+
+def _no_key(key: str, config: DictConfig) -> str:
+    """Words for a key that a config does not have, with the names at its place."""
+    node: Any = config
+    place = ""
+    for name in key.split("."):
+        if not isinstance(node, DictConfig) or name not in set(map(str, node)):
+            break
+        node, place = node[name], f"{place}.{name}" if place else name
+    if not isinstance(node, DictConfig):
+        return f"unknown key {key!r}: {place} is {node!r}, and has no keys"
+    names = sorted(set(map(str, node)) - {"_target_", "hydra"})
+    taken = _arguments(node, place)
+    prefix = f"{place}." if place else ""
+    if name in taken:
+        return f"{key!r} is left to its default here: a plus sets it, +{key}=VALUE"
+    near = near_words(name, {*names, *taken}, form=f"{prefix}{{}}")
+    if not near:
+        elsewhere = list(_places(config))
+        alike = get_close_matches(name, {place.rpartition(".")[2] for place in elsewhere}, n=1)
+        found = [place for place in elsewhere if place.rpartition(".")[2] in alike]
+        near = f"; near it is {' or '.join(found)}" if found else ""
+    whose = f"{place} has" if place else "there are"
+    free = "" if taken or not place else f"; a new one, where any may stand, takes a plus: +{key}"
+    return f"unknown key {key!r}{near}; {whose} {listed(sorted({*names, *taken}))}{free}"
+
+
+def _arguments(node: DictConfig, place: str) -> set[str]:
+    """Names of the arguments that a node's target takes; none for a node without one."""
+    if "_target_" not in node:
+        return set()
+    import inspect
+
+    from ep2sindy.app.targets import target_of
+
+    return set(inspect.signature(target_of(node, place)).parameters)
+
+
+def _places(config: DictConfig) -> Iterator[str]:
+    """Dotted places of all keys of a config, those of lists left out."""
+    plain: Any = OmegaConf.to_container(config, resolve=False)
+    waiting = [(str(key), value) for key, value in plain.items() if key != "hydra"]
+    while waiting:
+        place, value = waiting.pop(0)
+        yield place
+        if isinstance(value, dict):
+            waiting += [(f"{place}.{key}", inner) for key, inner in value.items()]

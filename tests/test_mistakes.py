@@ -1,0 +1,188 @@
+"""Mistakes on the command line end in our words: misspelt names, and settings without effect."""
+
+import re
+from pathlib import Path
+
+import pytest
+from omegaconf import DictConfig
+
+import ep2sindy as ep
+from ep2sindy.app.arguments import mend, options_first
+from ep2sindy.app.runner import check_effects, study_class
+from ep2sindy.app.schema import bind_step, study_of
+from ep2sindy.data.fields import check_field
+from ep2sindy.systems.regions import three_regions
+from tests import programs
+from tests.programs import composed, ended
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        (["+exp=breathin"], "there is no experiment 'breathin'; near it is +exp=breathing; there"),
+        (["+ex=breathing"], "an experiment is chosen with +exp=breathing: '+ex=breathing' came"),
+        (["exp=breathing"], "'exp=breathing' adds to the config, which needs a plus: write +exp="),
+        (["breathing"], "must be KEY=VALUE, such as +exp=discover or seed=1: 'breathing' came; +e"),
+        (["inspct", "run.csv"], "'inspct' came; near it is the command inspect, which stands fi"),
+        (["+exp=discover", "search=joined"], "no choice of search 'joined'; near it is search=jo"),
+        (["+exp=discover", "data=recogn"], "near it is data=recognised; there are file, hallthr"),
+        (["+exp=discover", "serch=joint"], "unknown key 'serch'; near it is search; there are"),
+        (["+exp=discover", "~serch"], "unknown key 'serch'; near it is search; there are"),
+        (["+exp=discover", "+serch=joint"], "unknown keys ['serch']; near it is search; there"),
+        (["+exp=discover", "search.alphaa=3"], "unknown key 'search.alphaa'; search has align, d"),
+        (
+            ["+exp=weak", "search.max_trms=3"],
+            "near it is search.max_terms; search has gamma, max",
+        ),
+        (["+exp=discover", "max_terms=3"], "unknown key 'max_terms'; near it is search.max_terms"),
+        (["+exp=breathing", "data.voltge=3"], "near it is data.operating_point.voltage; data has"),
+        (["+exp=breathing", "seed.x=3"], "unknown key 'seed.x': seed is 0, and has no keys"),
+        (
+            ["+exp=discover", "data=file", "data.variables.x.name=x"],
+            "a new one, where any may stand, takes a plus: +data.variables.x.name",
+        ),
+        (
+            ["+exp=discover", "search=best_subset", "bootstraps=none", "bootstraps.block=3"],
+            "'bootstraps.block' is left to its default here: a plus sets it, +bootstraps.block=VAL",
+        ),
+        (["+exp=breathing", "prepare={a: b}"], "another kind of value there: Cannot merge"),
+        (["+exp=discover", "exclude={x: [x^2]}"], "must stand in double quotes inside single ones"),
+        (["+exp=discover", "--confg", "job"], "unknown option '--confg'; near it are --cfg, --con"),
+        (["+exp=discover", "--cfg", "jbo"], "options must be those of --help: argument --cfg"),
+        (["-m", "+exp=breathin,breathing"], "there is no experiment 'breathin'; near it is"),
+        (["+exp=breathin", "serch=joint"], "there is no experiment 'breathin'; near it is"),
+        (["+exp=discover", "serch=joint", "sede=1"], "unknown key 'serch'; --cfg job shows those"),
+    ],
+)
+def test_a_misspelt_name_ends_in_our_words_with_the_nearest(
+    typed: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    error = ended(*typed)
+    assert message in error
+    assert error.startswith("error: ")
+    assert "hydra.cc" not in error
+    assert "Traceback" not in capsys.readouterr().err
+    assert not list(tmp_path.glob("outputs/*/*/config.yaml"))
+
+
+def test_names_of_a_mapping_may_come_in_quotes() -> None:
+    assert mend('exclude={"x": ["x^2"], \'y\': [x]}') == 'exclude={x: ["x^2"],y: [x]}'
+    assert mend("relations=['x: x == 1']") == "relations=['x: x == 1']"
+    assert mend("~search") == "~search"
+
+
+def test_options_may_stand_anywhere_and_keep_their_values() -> None:
+    typed = ["-m", "+exp=discover", "--config-dir", "own", "seed=0,1", "--cfg=job", "~search"]
+    sorted_out = options_first(typed)
+    assert sorted_out[:4] == ["-m", "--config-dir", "own", "--cfg=job"]
+    assert sorted_out[4:] == ["+exp=discover", "seed=0,1", "~search"]
+
+
+@pytest.mark.parametrize(
+    ("typed", "reason"),
+    [
+        (["+exp=predict", "structures.degree=3"], "models are given"),
+        (["+exp=trace", "embedding=hidden", "harmonics=3"], "embedding=hidden finds states"),
+        (
+            ["+exp=trace", "embedding=hidden", "selection.n_starts=4"],
+            "embedding=hidden finds states",
+        ),
+        (["+exp=trace", "embedding=hidden", "search.n_best=2"], "embedding=hidden finds states"),
+        (["+exp=trace", "function_degree=2"], "functions are none"),
+        (["+exp=discover", "libraries.model.function_degree=2"], "the library has no functions"),
+        (["+exp=discover", "+libraries.model.n_norm=library"], "Evidence selects, and not the kn"),
+        (["+exp=breathing", "selection=ebic", "libraries.simple.n_norm=library"], "EBIC selects"),
+        (["+exp=benchmark", "variants=[ours]", "definitions.STLSQ.depth=2"], "has no STLSQ"),
+        (["+exp=parametric", "search=stlsq", "law.tied_degree=2"], "only search=best_subset"),
+        (["+exp=trace", "bootstraps.block=5"], "bootstraps.n is 0, and no bootstrap is drawn"),
+        (["+exp=trace", "data=file", "data.path=x", "data.r.unit=mm"], "data.r.name is null"),
+    ],
+)
+def test_a_setting_without_effect_is_refused(typed: list[str], reason: str) -> None:
+    config, needed = built(typed)
+    with pytest.raises(ValueError, match=re.escape(reason)) as refused:
+        check_effects(typed, needed, config)
+    assert typed[-1] in str(refused.value)
+    assert "would do nothing" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "typed",
+    [
+        ["+exp=predict", "models=null", "structures.degree=3"],
+        ["+exp=trace", "embedding=rate", "harmonics=3", "selection.n_starts=4"],
+        ["+exp=trace", "embedding=hidden", "degree=2", "n_states=2"],
+        ["+exp=trace", "functions=[sin]", "function_degree=2"],
+        ["+exp=trace", "bootstraps.n=4", "bootstraps.block=5"],
+        ["+exp=trace", "data=file", "data.path=x", "data.r.name=r", "data.r.unit=mm"],
+        ["+exp=breathing", "selection=knee", "libraries.simple.n_norm=library"],
+    ],
+)
+def test_a_setting_with_an_effect_is_taken(typed: list[str]) -> None:
+    config, study = built(typed)
+    check_effects(typed, study, config)
+
+
+def built(typed: list[str]) -> tuple[DictConfig, object]:
+    states = ["trajectory.states=[x,y]"] if "+exp=discover" in typed else []
+    config = composed(*typed, *states)
+    return config, study_of(study_class(config.study), config)
+
+
+# Settings with which each step of the table in docs/data.md is called, on a small field.
+STEPS = {
+    "crop": "start_s: 1.0e-5, stop_s: 1.0e-4",
+    "low_pass": "cutoff_Hz: 1.0e5, order: 2",
+    "decimate": "factor: 2",
+    "resample": "dt_s: 1.0e-6",
+    "interpolate": "max_gap_s: 1.0e-5",
+    "delay": "variable: n_i, delay_s: 1.0e-5, name: past",
+    "derivative": "variable: n_i, name: rate",
+    "detrend": "variables: [n_i], degree: 1",
+    "derive": 'name: flux, expression: "n_i*u_iz", units: "m^-2/s"',
+    "radial_from_middle": "middle_m: 0.04",
+    "keep_where": 'condition: "(z > 0.002)"',
+    "ionization_rate": "gas: xenon",
+}
+
+
+def steps_of_the_page() -> dict[str, list[str]]:
+    """Every step that the table of docs/data.md names, with its arguments."""
+    page = (ROOT / "docs" / "data.md").read_text("utf-8")
+    table = page.partition("## Preparation")[2].partition("## Zones")[0]
+    return {
+        name: re.findall(r"(\w+)(?:=|,|$)", arguments)
+        for name, arguments in re.findall(r"^\| `(\w+)\((.*?)\)` \|", table, re.M)
+    }
+
+
+def test_the_page_names_every_step() -> None:
+    assert set(steps_of_the_page()) == set(STEPS) == {*dir(ep.prepare), "ionization_rate"}
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_a_step_that_the_page_names_is_composed_and_called(name: str) -> None:
+    room = "thruster" if name == "ionization_rate" else "prepare"
+    text = f"prepare=[{{_target_: ep2sindy.{room}.{name}, {STEPS[name]}}}]"
+    step = bind_step(composed("+exp=breathing", mend(text)).prepare[0], "prepare[0]")
+    arguments = steps_of_the_page()[name]
+    assert set(step.keywords) <= set(arguments)
+    field = three_regions(n_z=6, n_r=5, n_samples=64).field
+    if "T_e_eV" not in field:
+        field = field.assign(T_e_eV=(10.0 + 0.0 * field["n_i"]).assign_attrs(units="eV"))
+    if name == "ionization_rate":
+        field = field.drop_vars("R_ion", errors="ignore")
+    check_field(step(field))
+
+
+def test_a_step_that_is_misspelt_names_the_nearest() -> None:
+    config = composed("+exp=breathing", "prepare=[{_target_: ep2sindy.prepare.crp, start_s: 0}]")
+    with pytest.raises(ValueError, match=r"near it is ep2sindy\.prepare\.crop"):
+        programs.computed(config)
+    config = composed("+exp=breathing", "prepare=[{_target_: ep2sindy.prepare.crop, strt_s: 0}]")
+    with pytest.raises(ValueError, match="near it are start_s, stop_s; it takes"):
+        study_of(study_class(config.study), config)
