@@ -17,6 +17,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 import ep2sindy as ep
+from ep2sindy.app.arguments import mend
 from ep2sindy.app.main import main
 from ep2sindy.app.runner import about, start_run, study_class
 from ep2sindy.app.schema import study_of
@@ -32,7 +33,7 @@ def composed(*overrides: str) -> DictConfig:
 
     Hydra composes each choice of groups once, which takes long, and sets the values as it would.
     """
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    parsed = OverridesParser.create().parse_overrides(list(map(mend, overrides)))
     chosen = [o for o in parsed if (ROOT / "conf" / o.key_or_group).is_dir()]
     config = deepcopy(composed_of(tuple(str(o.input_line) for o in chosen)))
     ConfigLoaderImpl._apply_overrides_to_config([o for o in parsed if o not in chosen], config)

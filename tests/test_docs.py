@@ -19,6 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import ep2sindy as ep
 from ep2sindy._stubs import dotted_names
+from ep2sindy.app.arguments import mend
 from ep2sindy.app.runner import check_effects, check_overrides, study_class
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.data.open import write_field
@@ -130,12 +131,13 @@ def check_program(given: list[str]) -> None:
     config = composed(*overrides)
     study = study_class(config.study)
     check_overrides(overrides, used=keys_of(study), experiment=config.experiment)
-    if is_whole:
+    if is_whole and not isinstance(config.get("points"), str):  # files that are not there
         check_effects(overrides, study_of(study, config), config)
 
 
 def single(text: str) -> str:
     """The first job of a sweep."""
+    text = mend(text)
     (override,) = OverridesParser.create().parse_overrides([text])
     if not override.is_sweep_override():
         return text

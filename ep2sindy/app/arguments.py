@@ -18,6 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 
 COMMANDS = ("compare", "inspect", "warm")  # that stand first, without +exp=NAME
 QUOTED_KEY = re.compile(r"""(?<=[{,])\s*(?P<quote>["'])(?P<name>\w+)(?P=quote)\s*(?=:)""")
+# `points.files=PATTERN`, whose braces would be a mapping to Hydra; or the same as `points=PATTERN`.
+FILES = re.compile(r"points(?:\.files=|=(?=[^\[{]*\{\w+\}))(?P<value>.+)", re.DOTALL)
 
 Compose = Callable[[list[str]], DictConfig]
 
@@ -44,10 +46,15 @@ def options_first(arguments: Sequence[str]) -> list[str]:
 
 
 def mend(text: str) -> str:
-    """A setting as Hydra's grammar takes it: names of a mapping may come in quotes.
+    """A setting as Hydra's grammar takes it.
+
+    Names of a mapping may come in quotes, and the files of points in any form.
 
     Raises ValueError for an argument that is no setting.
     """
+    if pattern := FILES.fullmatch(text):
+        quoted = pattern["value"].strip("'\"").replace("\\", "\\\\").replace('"', '\\"')
+        text = f'points="{quoted}"'
     without = QUOTED_KEY.sub(lambda found: found["name"], text)
     try:
         OverridesParser.create().parse_overrides([without])

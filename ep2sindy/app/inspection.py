@@ -15,12 +15,14 @@ from ep2sindy.data.conversion import KNOWN_UNITS
 from ep2sindy.data.inspection import Inspection, check_alike, inspect_file
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import files_of
+from ep2sindy.operating.file_names import FilePattern, propose_pattern
+from ep2sindy.operating.records import point_label
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.screen import in_line, say
 
 ABOUT = """Says what files hold: variables, shapes, units, ranges, what looks like time, z and r,
 and what is missing for which experiment. Several files, or a pattern in quotes, are several
-records of one kind."""
+records of one kind; if their names differ in numbers, they may be operating points."""
 
 # Variables that experiments on files need besides time; generic experiments need none.
 NEEDS: Mapping[str, tuple[str, ...]] = {
@@ -57,14 +59,57 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     for each in found:
         say("\n".join(each.lines(experiments(each))) + "\n")
     name = re.sub(r"\W+", "_", given.write or Path(paths[0]).stem).strip("_")
+    pattern = propose_pattern(paths)
+    if pattern:
+        say("\n".join(point_lines(pattern)))
     if given.write is None:
         say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
+        if pattern and not any(each.found.doubts for each in found):
+            say_next(point_commands(found[0], "recognised", pattern))
         return
     check_alike(found)
     path = own_config(name, conf)
     write_text(path, config_text(found, paths))
-    say(f"written: {path}; next, for example:")
-    say("\n".join(f"  {command}" for command in commands(found[0], name)))
+    say(f"written: {path}")
+    of_points = point_commands(found[0], name, pattern) if pattern else []
+    say_next([*commands(found[0], name), *of_points])
+
+
+def say_next(commands: Sequence[str]) -> None:
+    if commands:
+        say("\n".join(["next, for example:", *(f"  {command}" for command in commands)]))
+
+
+def point_lines(pattern: FilePattern) -> list[str]:
+    """The operating points that the names of files tell, and their pattern."""
+    points, _ = pattern.points()
+    rows = [f"  {point_label(values)}: {file}" for file, values in points.items()]
+    return [
+        f"{len(points)} operating points, if the numbers in the names are such "
+        f"({', '.join(pattern.names)}; V_D_V in V, mdot_mg_s in mg/s):",
+        *map(in_line, rows),
+        in_line(f"their pattern: points.files={pattern.text}"),
+        "",
+    ]
+
+
+def point_commands(found: Inspection, name: str, pattern: FilePattern) -> list[str]:
+    """Commands that study the files as operating points. name: of the data group."""
+    more = [f"data={name}", f"points.files={pattern.text}"]
+    lines = []
+    if not found.lacking(NEEDS["parametric"]):
+        both = {"V_D_V", "mdot_mg_s"} == set(pattern.names)
+        aside = ["thesis=null", *([] if both else ["trends=[]"])]
+        lines.append(["+exp=parametric", *more, *aside, *preparation(found)])
+    elif not found.lacking(NEEDS["predict"]):
+        lines.append(["+exp=predict", *more])
+    return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]
+
+
+def preparation(found: Inspection) -> list[str]:
+    """The setting that makes what a file lacks, if there is any."""
+    steps = ",".join(f"{{_target_:{step}}}" for step in found.prepare.values())
+    return [f"prepare=[{steps}]"] if steps else []
 
 
 def experiments(found: Inspection) -> list[str]:
@@ -148,10 +193,8 @@ def commands(found: Inspection, name: str) -> list[str]:
         data.append("data.dt_s=STEP")
     lines = []
     if not found.lacking(NEEDS["breathing"]):
-        steps = ",".join(f"{{_target_:{step}}}" for step in found.prepare.values())
-        prepare = [f"prepare=[{steps}]"] if steps else []
         zone = [] if found.z is None or found.channel_m else ["data.channel_m=LENGTH"]
-        lines.append(["+exp=breathing", *data, *zone, *prepare])
+        lines.append(["+exp=breathing", *data, *zone, *preparation(found)])
     traces = [n for n, v in found.variables.items() if found.is_trace(v)]
     if traces:
         signal = "I_d" if "I_d" in traces else traces[0]

@@ -61,7 +61,15 @@ def study_of(study: type, config: DictConfig) -> Any:
             hint = "; a file of conf/thruster begins with the line '# @package data.thruster'"
         near = "".join(near_words(name, known) for name in sorted(unknown))
         raise ValueError(f"unknown keys {sorted(unknown)}{near}; there are {sorted(known)}{hint}")
+    _open_by_points(config)
     return _fill(study, _without_formats(config, has_own="figures" in keys_of(study)))
+
+
+def _open_by_points(config: DictConfig) -> None:
+    """A path of the data that is to be set need not be, where the points name the files."""
+    by_files = isinstance(config.get("points"), str)
+    if by_files and "data" in config and OmegaConf.is_missing(config.data, "path"):
+        config.data.path = None
 
 
 def _without_formats(config: DictConfig, *, has_own: bool) -> DictConfig:

@@ -51,16 +51,21 @@ class Recognised:
     questions: Sequence[str] = ()
     n_samples: int | None = None
 
-    def check(self, source: FileSource) -> None:
-        """Raise ValueError unless this mapping gives a field without any doubt."""
+    @property
+    def doubts(self) -> list[str]:
+        """What keeps this mapping from giving a field without any doubt."""
         problems = [each.problem for each in self.held if each.problem not in ("", TEXT)]
         problems += self.guesses.values()
         if "time" not in self.axes and self.dt_s is None:
             problems.insert(0, "a field needs time: give its step dt_s, or name the file's time")
         if not self.variables:
             problems.append("no array of the file fits its axes")
-        if problems:
-            text = "; ".join([*problems, *self.questions])
+        return problems
+
+    def check(self, source: FileSource) -> None:
+        """Raise ValueError unless this mapping gives a field without any doubt."""
+        if self.doubts:
+            text = "; ".join([*self.doubts, *self.questions])
             raise ValueError(
                 f"{source.path} cannot be opened without a mapping: {text}; ep2sindy.inspect_file "
                 "shows what it holds"

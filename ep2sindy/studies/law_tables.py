@@ -1,9 +1,10 @@
-"""Tables of `+exp=predict`: points, laws, structures tried, points left out, and maps."""
+"""Models of laws, and tables: of `+exp=predict`, and the control laws of `+exp=parametric`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,18 +12,47 @@ from scipy.special import ndtri
 
 from ep2sindy.figures.operating import frequency_scale
 from ep2sindy.forecasting.skill import AUTOREGRESSION, MODEL, ForecastSkill
-from ep2sindy.operating.choice import Branch, StructureTrial
+from ep2sindy.operating.choice import Branch, StructureCase, StructureTrial
+from ep2sindy.operating.constraint import Known, law_constraint
 from ep2sindy.operating.fit import LeaveOneOut, error_statistics
 from ep2sindy.operating.map import Fate, MapPoint
+from ep2sindy.operating.quantity_law import ControlLaw
 from ep2sindy.operating.records import OperatingRecord, point_label
-from ep2sindy.report.document import places
+from ep2sindy.report.document import Equation, places
 from ep2sindy.report.results import Metric, ResultTable, View, percent
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.oscillation import Oscillation
+from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.forecasts import skill_of
 from ep2sindy.studies.views import with_error
 
 Parameters = Mapping[str, float]
+Laws = Mapping[str, Mapping[str, ControlLaw]]  # fit -> quantity -> law
+
+
+@dataclass(frozen=True)
+class LawModel:
+    """The terms of every state, and relations and known coefficients that hold at every point."""
+
+    terms: Terms
+    relations: Sequence[str] = ()
+    known: Known = field(default_factory=dict)
+
+    def case(self, name: str, states: Sequence[str], parameters: Sequence[str]) -> StructureCase:
+        key = f"models.{name}.terms"
+        library, structure = terms_of(self.terms, states=states, key=key)
+        if inputs := [v for v in library.variables if v not in states]:
+            raise ValueError(
+                f"a law's model runs freely, on its states {list(states)} alone: {inputs} came in "
+                f"{key}"
+            )
+        try:
+            law_constraint(library, structure, self.relations, self.known, parameters=parameters)
+        except ValueError as error:
+            raise ValueError(
+                f"models.{name} cannot hold: {error} (or leave it out: ~models.{name})"
+            ) from error
+        return StructureCase(library, structure, self.relations, self.known, name)
 
 
 def points_table(
@@ -252,6 +282,23 @@ def agreement(
     return sum(right), len(right), sum(not says[label] for label in quiet), len(quiet)
 
 
+def advice_if_none_lives(branch: Branch, degrees: Sequence[int], *, searched: bool) -> str:
+    """What to try if no point left out lives; empty if one does.
+
+    degrees: that were tried. searched: whether terms were searched for, and not given.
+    """
+    if error_statistics(branch.left_out)["n_lives"]:
+        return ""
+    n = len(branch.left_out)
+    lower = "" if min(degrees) == 1 else "degrees=[1], "
+    terms = "more terms, structures.max_terms" if searched else "other models, or models=null"
+    return (
+        f"none of {n_points(n)} left out lives by the law of the others, so it predicts none "
+        f"between them: try points that lie closer together, {lower}{terms}, longer records, and "
+        "inputs that are states (docs/predict.md)"
+    )
+
+
 def left_out_text(branch: Branch) -> str:
     """How the law does at the points left out, in the median, and beside plain interpolation."""
     found = error_statistics(branch.left_out)
@@ -268,6 +315,39 @@ def left_out_text(branch: Branch) -> str:
         f"{text(float(np.median(smooth_f)))} and {text(float(np.median(smooth_amplitude)))} in the "
         "median."
     )
+
+
+def control_laws_table(laws: Laws) -> pd.DataFrame:
+    """One row per control law, with its errors at points left out."""
+    rows = [
+        (
+            fit,
+            name,
+            Equation(name, law.coef_by_term, rate=False),
+            law.r2,
+            law.loo_error,
+            law.search_error,
+        )
+        for fit, by_quantity in laws.items()
+        for name, law in by_quantity.items()
+    ]
+    return pd.DataFrame(rows, columns=["fit", "quantity", "law", "r2", "loo_error", "search_error"])
+
+
+def control_laws_summary(laws: Laws) -> dict[str, Any]:
+    """Terms and errors of every control law, by fit and quantity."""
+    return {
+        fit: {
+            name: {
+                "terms": law.coef_by_term,
+                "r2": law.r2,
+                "loo_error": law.loo_error,
+                "search_error": law.search_error,
+            }
+            for name, law in by_quantity.items()
+        }
+        for fit, by_quantity in laws.items()
+    }
 
 
 def published_table(

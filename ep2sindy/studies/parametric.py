@@ -26,7 +26,7 @@ from ep2sindy.operating.point_fits import (
     search_shared,
 )
 from ep2sindy.operating.quantities import REFINED, Fitted, PointResult, Quantity
-from ep2sindy.operating.quantity_law import ControlLaw, exponent, laws, trends
+from ep2sindy.operating.quantity_law import exponent, laws, trends
 from ep2sindy.operating.records import point_label
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.searches import BestSubset
@@ -43,8 +43,13 @@ from ep2sindy.report.document import (
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.studies.fits import Terms, terms_of
-from ep2sindy.studies.law_tables import published_table
-from ep2sindy.studies.points import open_points, point_sources
+from ep2sindy.studies.law_tables import (
+    Laws,
+    control_laws_summary,
+    control_laws_table,
+    published_table,
+)
+from ep2sindy.studies.points import QUIET, GivenPoints, given_points, open_points
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.study import Check, Count
 from ep2sindy.studies.views import coefficients, with_error
@@ -137,7 +142,6 @@ Cases = Annotated[
         lambda value: isinstance(value, dict) and bool(value),
     ),
 ]
-Laws = Mapping[str, Mapping[str, ControlLaw]]  # fit -> quantity -> law
 Published = Mapping[str, Sequence[Mapping[str, float]]]  # fit -> points with their quantities
 
 
@@ -146,7 +150,8 @@ class Study:
     """Fit, refine and search every operating point; then find laws, trends and a common support.
 
     parameters: the place of each parameter in the data group; None if it has none. points: the
-    values of all parameters at each point, and `data` for other differences from the data group.
+    values of all parameters at each point, and `data` for other differences from the data group;
+    or the pattern of files, which names the parameters.
     model: state -> terms. thesis: published quantities by fit; they are shown beside our fit of the
     same name.
     """
@@ -156,7 +161,7 @@ class Study:
     formulation: Formulation
     parallel: Workers
     parameters: Mapping[str, str | None]
-    points: Sequence[Mapping[str, Any]]
+    points: Sequence[Mapping[str, Any]] | str
     model: Terms
     cases: Cases
     bootstrap: TimeBootstrap
@@ -168,26 +173,34 @@ class Study:
     thesis: Published | None = None
 
     def __post_init__(self) -> None:
-        names = list(self.parameters)
+        names = self._given.names
         for each in self.trends:
             if {each.along, *each.at} != set(names):
                 raise ValueError(
-                    f"a trend goes along one parameter and holds the others of {names}: {each} came"
+                    f"a trend goes along one parameter and holds the others of {names}: {each} "
+                    "came; trends=[] leaves all out"
                 )
 
     def idle(self) -> dict[str, str]:
-        own = self.method
-        if isinstance(own, Regression) and isinstance(own.search, BestSubset):
-            return {}
-        return {"law.tied_degree": "only search=best_subset finds a support for all points"}
+        own, found = self.method, {}
+        if isinstance(self.points, str):
+            found["parameters"] = "the names of the files name them"
+        if not (isinstance(own, Regression) and isinstance(own.search, BestSubset)):
+            found["law.tied_degree"] = "only search=best_subset finds a support for all points"
+        return found
+
+    @cached_property
+    def _given(self) -> GivenPoints:
+        return given_points(self.points, self.parameters, self.source)
 
     def compute(self, run: Run) -> Outcome:
         # Everything but the data is built first: a misspelt setting must not cost a simulation.
-        names = list(self.parameters)
+        names = self._given.names
         how = self.at_every_point()
         law, tying = (polynomial(names, degree=n) for n in (self.law.degree, self.law.tied_degree))
         published = published_table(self.thesis or {}, names)
-        sources = point_sources(self.source, self.parameters, self.points)
+        self._given.tell(run)
+        sources = self._given.sources(self.source)
         inputs = self.source.inputs([how.library, how.searched])
         points = open_points(sources, inputs, workers=self.parallel, run=run)
         alone, together = np.random.default_rng(run.seed).spawn(2)
@@ -199,6 +212,8 @@ class Study:
         results = fit_points(
             points, how, workers=self.parallel, rng=alone, tell=tell, progress=run.watch
         )
+        if not any(result.fits for result in results):
+            run.warn("none of the operating points oscillates, so there is no fit: " + QUIET)
         return Outcome(
             study=how,
             results=results,
@@ -265,7 +280,7 @@ class Outcome:
             "points": points_table(self.results),
             "quantities": estimates_table(self.results, self.published),
             "supports": supports_table(self.results, {"given": given, **self.searches}),
-            "laws": laws_table(self.laws),
+            "laws": control_laws_table(self.laws),
             "trends": trends_table(self.results, self.along, self.published),
             "tied": tied_table(self.joint),
             "coefficients": coefficients(self.models("point {}, {}"), heading="model"),
@@ -296,10 +311,9 @@ class Outcome:
         """How many points oscillate, and the laws of their coefficients."""
         n_fitted = sum(bool(result.fits) for result in self.results)
         shown = [
-            replace(_law(name, law), mark=f" ({_spoken(fit)})", on_screen=True)
-            for fit, by_quantity in self.laws.items()
-            for name, law in by_quantity.items()
-            if not fit.endswith(REFINED)
+            replace(row["law"], mark=f" ({_spoken(row['fit'])})", on_screen=True)
+            for row in control_laws_table(self.laws).to_dict("records")
+            if not row["fit"].endswith(REFINED)
         ]
         return Result(
             f"Found: {len(shown) or 'no'} laws over {n_fitted} operating points that oscillate",
@@ -369,7 +383,7 @@ class Outcome:
                 )
                 for k, result in enumerate(self.results)
             ],
-            "laws": laws_summary(self.laws),
+            "laws": control_laws_summary(self.laws),
             "trends": self._tables["trends"].to_dict("records"),
             "joint": shared_summary(self.joint),
         }
@@ -490,20 +504,6 @@ def tied_table(joint: SharedResult | None) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["state", "terms", "point", "r2_free", "r2_tied"])
 
 
-def laws_table(laws: Mapping[str, Mapping[str, ControlLaw]]) -> pd.DataFrame:
-    rows = [
-        (fit, name, _law(name, law), law.r2, law.loo_error, law.search_error)
-        for fit, by_quantity in laws.items()
-        for name, law in by_quantity.items()
-    ]
-    return pd.DataFrame(rows, columns=["fit", "quantity", "law", "r2", "loo_error", "search_error"])
-
-
-def _law(name: str, law: ControlLaw) -> Equation:
-    """A law such as `L_m = 0.00816 + 5.37e-05 V_D_V`."""
-    return Equation(name, law.coef_by_term, rate=False)
-
-
 def trends_table(
     results: Sequence[PointResult],
     along: Sequence[tuple[str, Mapping[str, float]]],
@@ -560,21 +560,6 @@ def _fit_summary(
     known = fit.estimates
     values = {name: known[name].value if name in known else None for name in case.quantities}
     return values, {name: [each.low, each.high] for name, each in known.items()}, dict(fit.r2)
-
-
-def laws_summary(laws: Laws) -> dict[str, Any]:
-    return {
-        fit: {
-            name: {
-                "terms": law.coef_by_term,
-                "r2": law.r2,
-                "loo_error": law.loo_error,
-                "search_error": law.search_error,
-            }
-            for name, law in by_quantity.items()
-        }
-        for fit, by_quantity in laws.items()
-    }
 
 
 def shared_summary(joint: SharedResult | None) -> dict[str, Any] | None:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from ep2sindy.data.quantities import unit_doubts
 from ep2sindy.data.trajectory import ConstantStateError
+from ep2sindy.operating.file_names import FilePattern
 from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, collect
@@ -18,17 +19,70 @@ from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation, quie
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.study import Check, Deferred
 
+QUIET = (
+    "their statuses are above; try the part of the records behind the start-up "
+    "('prepare=[{_target_:ep2sindy.prepare.crop,start_s:...}]'), another zone "
+    "(trajectory.zone.z=...), or other points"
+)
 WITHOUT_BREATHING = (  # attributes of a simulation
     Oscillation.STEADY, Oscillation.DECAYING, Oscillation.TRANSIT, Oscillation.DIVERGED,
 )  # fmt: skip
 
 Points = Annotated[
-    Sequence[Mapping[str, Any]],
+    Sequence[Mapping[str, Any]] | str,
     Check(
-        "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}], every combination being a point",
-        lambda value: isinstance(value, list) and bool(value),
+        "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}], or a pattern of files, "
+        "'points.files=runs/V{V_D_V}_m{mdot_mg_s}.csv'",
+        lambda value: isinstance(value, list | str) and bool(value),
     ),
 ]
+
+
+@dataclass(frozen=True)
+class GivenPoints:
+    """Operating points as they were given.
+
+    places: parameter -> its place in the data group; None if it has none. points: values of all
+    parameters, and `data` for other differences from the data group. left_out: files that a pattern
+    nearly fits.
+    """
+
+    places: Mapping[str, str | None]
+    points: Sequence[Mapping[str, Any]]
+    left_out: Sequence[str] = ()
+
+    @property
+    def names(self) -> list[str]:
+        return list(self.places)
+
+    def sources(self, source: Source) -> list[PointSource]:
+        return point_sources(source, self.places, self.points)
+
+    def tell(self, run: Run) -> None:
+        """Report the files that are no points."""
+        if self.left_out:
+            run.say(f"left out, for their names hold no number there: {', '.join(self.left_out)}")
+
+
+def given_points(
+    points: Sequence[Mapping[str, Any]] | str, parameters: Mapping[str, str | None], source: Source
+) -> GivenPoints:
+    """Operating points of a config: a list, or the files of a pattern, which names the parameters.
+
+    Raises ValueError for a pattern beside data that are not read from files, or that no file fits.
+    """
+    if not isinstance(points, str):
+        return GivenPoints(parameters, points)
+    if "path" not in source.data.settings:
+        raise ValueError(
+            "points of files need data that are read from files: "
+            f"{source.data.settings['_target_']} came with {points!r}; add data=recognised, or "
+            "data=NAME for a config that ep2sindy inspect --write made of them"
+        )
+    pattern = FilePattern(points)
+    found, others = pattern.points()
+    given = [{**values, "data": {"path": file}} for file, values in found.items()]
+    return GivenPoints(dict.fromkeys(pattern.names), given, others)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -15,17 +15,14 @@ from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.choice import (
-    MAX_PARAMETERS,
     Branch,
     BranchSettings,
-    StructureCase,
     find_branch,
     group_by_cycle,
 )
-from ep2sindy.operating.constraint import Known, law_constraint
 from ep2sindy.operating.fit import SETTINGS, error_statistics
 from ep2sindy.operating.law import law_basis
-from ep2sindy.operating.map import Fate
+from ep2sindy.operating.map import MAX_PARAMETERS, Fate
 from ep2sindy.operating.records import OperatingRecord, most_central, point_label
 from ep2sindy.report.document import (
     Block,
@@ -41,10 +38,11 @@ from ep2sindy.report.results import ResultTable
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.oscillation import Oscillation
-from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.forecasts import TypicalSkill
 from ep2sindy.studies.law_tables import (
+    LawModel,
     LeftOutPoint,
+    advice_if_none_lives,
     agreement,
     coefficients_table,
     laws_table,
@@ -59,11 +57,13 @@ from ep2sindy.studies.law_tables import (
     structures_table,
 )
 from ep2sindy.studies.points import (
+    QUIET,
+    GivenPoints,
     Points,
     expand,
+    given_points,
     open_points,
     oscillating_records,
-    point_sources,
 )
 from ep2sindy.studies.simulated import compile_kernels
 from ep2sindy.studies.source import Source
@@ -119,31 +119,6 @@ class Followed:
 
 
 @dataclass(frozen=True)
-class LawModel:
-    """The terms of every state, and relations and known coefficients that hold at every point."""
-
-    terms: Terms
-    relations: Sequence[str] = ()
-    known: Known = field(default_factory=dict)
-
-    def case(self, name: str, states: Sequence[str], parameters: Sequence[str]) -> StructureCase:
-        key = f"models.{name}.terms"
-        library, structure = terms_of(self.terms, states=states, key=key)
-        if inputs := [v for v in library.variables if v not in states]:
-            raise ValueError(
-                f"a law's model runs freely, on its states {list(states)} alone: {inputs} came in "
-                f"{key}"
-            )
-        try:
-            law_constraint(library, structure, self.relations, self.known, parameters=parameters)
-        except ValueError as error:
-            raise ValueError(
-                f"models.{name} cannot hold: {error} (or leave it out: ~models.{name})"
-            ) from error
-        return StructureCase(library, structure, self.relations, self.known, name)
-
-
-@dataclass(frozen=True)
 class SearchSettings:
     """Search without given models: all products of the states to a degree, and how many terms."""
 
@@ -157,7 +132,8 @@ class Study:
 
     parameters: the place of each parameter in the data group; None if it has none. points: blocks,
     each with one value or a list of values for all parameters, and `data` for other differences
-    from the data group. models: of which one is selected, by name; None searches for terms.
+    from the data group; or the pattern of files, which names the parameters.
+    models: of which one is selected, by name; None searches for terms.
     degrees: candidate degrees of the polynomials, of which one is selected. map_points: number of
     points along each parameter. labels: names of the parameters in figures.
     forecasts: number of starts over the second half of every record left out; 0 for none.
@@ -179,9 +155,8 @@ class Study:
         if self.forecasts < 0:
             raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
         self._how(0)
-        given = expand(self.points, list(self.parameters))
-        sources = point_sources(self.source, self.parameters, given)
-        names = list(self.parameters)
+        given = self._given
+        sources, names = given.sources(self.source), given.names
         # Points too few for a law, even if all oscillate, are refused before any simulation.
         law_basis(
             polynomial(names, degree=min(self.degrees)),
@@ -194,20 +169,25 @@ class Study:
         found = {}
         if self.models is not None:
             found["structures"] = "models are given, and models=null alone searches for terms"
-        if len(self.parameters) > MAX_PARAMETERS:
+        if isinstance(self.points, str):
+            found["parameters"] = "the names of the files name them"
+        if len(self._given.names) > MAX_PARAMETERS:
             found["map_points"] = f"a map is drawn over {MAX_PARAMETERS} parameters or fewer"
         return found
 
     def compute(self, run: Run) -> Outcome:
         how = self._how(run.seed)
-        given = expand(self.points, list(self.parameters))
-        sources = point_sources(self.source, self.parameters, given)
+        given = self._given
+        given.tell(run)
+        sources = given.sources(self.source)
         with run.progress(None, "", "kernels, compiled once"):
             compile_kernels([source.source.data for source in sources])
         opened = open_points(sources, (), workers=self.parallel, run=run)
         records, statuses = oscillating_records(opened, run)
         if not records:
-            raise ValueError("a law needs operating points that oscillate: none of these does")
+            raise ValueError(
+                "a law needs operating points that oscillate: none of these does; " + QUIET
+            )
         found: dict[str, Branch] = {}
         reasons: dict[str, str] = {}
         everywhere = [source.parameters for source in sources]
@@ -227,6 +207,8 @@ class Study:
             raise ValueError(f"no law: {'; '.join(reasons.values())}")
         for name, branch in found.items():
             run.write(f"law_{name}.json", branch.law.save)
+            if advice := advice_if_none_lives(branch, self.degrees, searched=self.models is None):
+                run.warn(advice)
         members_of = {name: [r.parameters for r in group] for name, group in groups.items()}
         skills = {
             name: skills_left_out(branch.left_out, starts=self.forecasts, progress=run.watch)
@@ -234,8 +216,13 @@ class Study:
         }
         return Outcome(everywhere, statuses, records, members_of, found, skills, self.labels)
 
+    @cached_property
+    def _given(self) -> GivenPoints:
+        given = given_points(self.points, self.parameters, self.source)
+        return replace(given, points=expand(given.points, given.names))
+
     def _how(self, seed: int) -> BranchSettings:
-        states, parameters = self.source.states, list(self.parameters)
+        states, parameters = self.source.states, self._given.names
         models = self.models or {}
         settings = replace(SETTINGS, n_windows=self.windows.n_windows, periods=self.windows.periods)
         return BranchSettings(

@@ -18,9 +18,9 @@ import xarray as xr
 from ep2sindy.data.conversion import to_si
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
-from ep2sindy.discovery.method import AnyMethod
+from ep2sindy.discovery.method import AnyMethod, TrajectorySearch
 from ep2sindy.discovery.one_signal import SignalSearch, choose_attempt, count_fitted, evaluate
-from ep2sindy.discovery.signal_unknowns import fit_offset
+from ep2sindy.discovery.signal_unknowns import FITTED, fit_offset
 from ep2sindy.report.run import Run
 from ep2sindy.signals.embedding import Delays, LogRate, Rate
 from ep2sindy.signals.trace import Trace, prepare_signal

@@ -1,0 +1,183 @@
+"""Operating points by the names of files: patterns, proposals, an experiment, and the errors."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ep2sindy.app.arguments import mend
+from ep2sindy.app.runner import check_effects
+from ep2sindy.app.schema import study_of
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.operating.file_names import FilePattern, propose_pattern
+from ep2sindy.studies import parametric, predict
+from tests.programs import Computed, composed, computed, ended
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def touch(*paths: str) -> None:
+    for path in map(Path, paths):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def test_each_file_is_a_point_in_the_order_of_its_quantities(folder: Path) -> None:
+    names = ["V1000_m5.csv", "V200_m-4.5e0.csv", "V200_m5.csv", "V200_mold.csv", "V200_m5.csv.gz"]
+    touch(*(f"runs/{name}" for name in names))
+    points, others = FilePattern("runs/V{V}_m{m}.csv").points()
+    assert list(points.items()) == [
+        ("runs/V200_m-4.5e0.csv", {"V": 200.0, "m": -4.5}),
+        ("runs/V200_m5.csv", {"V": 200.0, "m": 5.0}),
+        ("runs/V1000_m5.csv", {"V": 1000.0, "m": 5.0}),
+    ]
+    assert others == ["runs/V200_mold.csv"]
+
+
+def test_a_pattern_takes_signs_of_the_shell_and_a_quantity_twice(folder: Path) -> None:
+    touch("V200/a_V200.csv", "V300/b_V300.csv", "V300/b_V200.csv", "V[1]/c_V4.csv")
+    points, others = FilePattern("V{V}/?_V{V}.csv").points()
+    assert [each["V"] for each in points.values()] == [200.0, 300.0]
+    assert others == ["V300/b_V200.csv", "V[1]/c_V4.csv"]
+    assert list(FilePattern("V[1]/*_V{V}.csv").points()[0]) == ["V[1]/c_V4.csv"]
+
+
+@pytest.mark.parametrize(
+    ("files", "pattern"),
+    [
+        (["runs/V200_m4.5.csv", "runs/V300_m5.csv"], "runs/V{V_D_V}_m{mdot_mg_s}.csv"),
+        (["200V_5mgs.csv", "300V_5mgs.csv"], "{V_D_V}V_5mgs.csv"),
+        (["200V-5mgs.csv", "300V-6mgs.csv"], "{V_D_V}V-{mdot_mg_s}mgs.csv"),
+        (["run_V=200,m=4.csv", "run_V=300,m=5.csv"], "run_V={V_D_V},m={mdot_mg_s}.csv"),
+        (["a_-1.csv", "a_2.5e-3.csv"], "a_{a}.csv"),
+        (["1.5.csv", "2.csv"], "{p}.csv"),
+        (["x1_1.csv", "x2_2.csv"], "x{x}_{p}.csv"),
+        (["a.csv", "b.csv"], None),
+        (["a1.csv"], None),
+        (["a1.csv", "b2.csv"], None),
+    ],
+)
+def test_a_pattern_is_proposed_where_names_differ_in_numbers(
+    files: list[str], pattern: str | None, folder: Path
+) -> None:
+    touch(*files)
+    found = propose_pattern(files)
+    assert (found and found.text) == pattern
+    if found:
+        assert sorted(found.points()[0]) == sorted(files)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("runs/a.csv", "need a pattern with a placeholder for each quantity, like 'points.files="),
+        ("runs/{V.csv", "need a pattern with a placeholder for each quantity"),
+        ("runs/{a b}.csv", "a placeholder must be the name of a quantity, .*: 'a b' came"),
+        ("runs/W{V}.csv", r"no file fits .* 1 files beside it: runs/V1.csv \.\.\."),
+        ("none/{V}.csv", "no file fits the pattern 'none/{V}.csv' in .* there are 0 files beside"),
+        ("runs/V1{V}.csv", "no file fits the pattern .* a number in the place of each"),
+    ],
+)
+def test_a_pattern_that_cannot_be_is_refused(text: str, message: str, folder: Path) -> None:
+    touch("runs/V1.csv")
+    with pytest.raises(ValueError, match=message):
+        FilePattern(text).points()
+
+
+@pytest.mark.parametrize(
+    "typed",
+    [
+        "points.files=runs/V{V}_m{m}.csv",
+        "points.files='runs/V{V}_m{m}.csv'",
+        'points.files="runs/V{V}_m{m}.csv"',
+        "points=runs/V{V}_m{m}.csv",
+    ],
+)
+def test_the_pattern_may_be_typed_in_any_form(typed: str) -> None:
+    assert mend(typed) == 'points="runs/V{V}_m{m}.csv"'
+    assert composed("+exp=parametric", mend(typed)).points == "runs/V{V}_m{m}.csv"
+    listed = "points=[{V_D_V: 300, mdot_mg_s: 5}]"
+    assert mend(listed) == listed
+
+
+def swing(folder: Path, *values: float) -> None:
+    """Lienard's van der Pol over one parameter, by its name; a period takes seven seconds."""
+    library = polynomial(["n_i", "n_n"], degree=3)
+    for a in values:
+        terms = [{"n_i": a, "n_n": -1.0, "n_i^3": -0.3}, {"n_i": 1.0}]
+        model = SparseModel(library, ["n_i", "n_n"], coef_matrix(library, terms))
+        states = model.simulate(0.1 * np.arange(1000), [1.0, 0.0]).states[300:]
+        table = pd.DataFrame(states, columns=["n_i [m^-3]", "n_n [m^-3]"])
+        table.insert(0, "time [s]", 0.1 * np.arange(700))
+        table.to_csv(folder / f"a{a}.csv", index=False)
+
+
+def predicted(folder: Path, terms: str) -> Computed:
+    return computed(
+        composed(
+            "+exp=predict", "data=recognised", mend("points.files=a{a}.csv"), "~models",
+            f"+models.own.terms={terms}", "degrees=[1]", "windows.n_windows=4", "map_points=2",
+            "forecasts=0", "parallel=serial", f"output={folder}",
+        )
+    )  # fmt: skip
+
+
+def test_files_make_a_law_over_the_quantity_of_their_names(folder: Path) -> None:
+    swing(folder, 0.6, 0.9, 1.2)
+    touch("aold.csv")
+    found = predicted(folder, "{n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}")
+    assert found.outcome.tables()["points"]["a"].tolist() == [0.6, 0.9, 1.2]
+    (branch,) = found.outcome.branches.values()
+    assert branch.law.model_at({"a": 1.0}).terms("n_i")["n_i"] == pytest.approx(1.0, abs=1e-3)
+    assert "left out, for their names hold no number there: aold.csv" in found.log
+    assert not [text for text in found.warnings if "lives by the law" in text]
+
+
+def test_a_law_of_which_no_point_lives_says_what_to_try(folder: Path) -> None:
+    swing(folder, 0.6, 0.9, 1.2)
+    found = predicted(folder, "{n_i: [n_i,'n_i^3'], n_n: [n_i]}")
+    (advice,) = [text for text in found.warnings if "lives by the law" in text]
+    assert "none of 3 points left out lives" in advice
+    assert "try points that lie closer together, other models, or models=null" in advice
+
+
+def test_an_inspection_of_a_glob_writes_the_list_and_the_command(
+    folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    swing(folder, 0.6, 0.9)
+    assert not ended("inspect", "a*.csv")
+    said = capsys.readouterr().out
+    assert "2 operating points, if the numbers in the names are such (a; " in said
+    assert "  a=0.6: a0.6.csv\n  a=0.9: a0.9.csv\n" in said
+    assert "ep2sindy +exp=predict data=recognised 'points.files=a{a}.csv'" in said
+    assert not ended("inspect", "a*.csv", "--write", "mine")
+    assert "ep2sindy +exp=predict data=mine 'points.files=a{a}.csv'" in capsys.readouterr().out
+    config = composed("+exp=predict", "data=recognised", mend("points.files=a{a}.csv"))
+    with pytest.raises(ValueError, match="models.inflow cannot hold"):  # its inflow has mdot_mg_s
+        study_of(predict.Study, config)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ([], "points of files need data that are read from files: .*simulate came .* data=recogni"),
+        (["data=recognised"], r"a trend goes along one parameter .*\['a'\].* trends=\[\] leaves"),
+        (["data=recognised", "trends=[]", "parameters.V_D_V=null"], "the names of the files name"),
+    ],
+)
+def test_settings_that_do_not_go_with_files_are_refused(
+    more: list[str], message: str, folder: Path
+) -> None:
+    touch("a1.csv", "a2.csv")
+    typed = ["+exp=parametric", mend("points.files=a{a}.csv"), *more]
+    config = composed(*typed)
+    with pytest.raises(ValueError, match=message) as refused:
+        check_effects(typed, study_of(parametric.Study, config), config)
+    assert not re.search(r"\?\?\?", str(refused.value))
