@@ -9,7 +9,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ep2sindy.data.readers.notation import PLAIN, decimals_shown, is_grouped, is_number
 from ep2sindy.library.units import unit_like
@@ -20,6 +20,9 @@ PARTED = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", None: "bl
 
 # Notations for a missing sample.
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "inf", "-inf"})
+
+# A date of ISO 8601, perhaps with a time of day; other notations may be read in two ways.
+DATE = re.compile(r"\d{4}-\d\d-\d\d([ T]\d\d:\d\d(:\d\d([.,]\d+)?)?\s?(Z|[+-]\d\d:?\d\d)?)?", re.I)
 
 # A ruled line below names.
 RULE = re.compile(r"[\s|+,;]*[-=_]{2,}[-=_\s|+,;]*")
@@ -34,8 +37,9 @@ class Layout:
     """Layout of a table in a text file.
 
     separator: None for blanks. decimal: decimal sign. first: line of the first row, from 0.
-    columns: indices of the columns that hold numbers. has_marks: True if numbers have thousands
-    separators, as in 1,000.5. left_out: names of the other columns, unless these are empty.
+    columns: indices of the columns that hold numbers or dates. dates: of those that hold dates.
+    has_marks: True if numbers have thousands separators, as in 1,000.5. left_out: names of the
+    other columns, unless these are empty.
     """
 
     separator: str | None
@@ -43,15 +47,17 @@ class Layout:
     first: int
     columns: tuple[int, ...]
     header: Header
+    dates: tuple[int, ...] = ()
     has_marks: bool = False
     left_out: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
         """Description of the layout, shown when the file is inspected."""
-        n_columns = len(self.columns)
+        n_columns = len(self.columns) - len(self.dates)
         parts = [f"{n_columns} column{'s' * (n_columns > 1)} of numbers"]
-        parts[0] += f" between {PARTED[self.separator]}" if n_columns > 1 else ""
+        parts[0] += f", {len(self.dates)} of dates" if self.dates else ""
+        parts[0] += f" between {PARTED[self.separator]}" if len(self.columns) > 1 else ""
         parts += ["decimal commas"] if self.decimal == "," else []
         parts += ["marks between thousands"] if self.has_marks else []
         parts += [f"rows from line {self.first + 1}"]
@@ -86,13 +92,15 @@ def layout_of(lines: Sequence[str]) -> Layout:
     ]
     header = header_of(above, n_columns, strict=separator is not None)
     _check_width(above, below, separator)
+    dates = tuple(j for j in range(n_columns) if j not in columns and _are_dates(below, j))
+    columns = tuple(sorted((*columns, *dates)))
     others = [j for j in range(n_columns) if j not in columns]
     for j in others:
         _check_text([row[j] for row in below if j < len(row)], header.names[j], decimal)
     has_marks = any(is_grouped(cell, decimal) for cell in cells)
     filled = [j for j in others if any("".join(row[j : j + 1]) for row in below)]
     left_out = tuple(header.names[j] for j in filled)
-    return Layout(separator, decimal, first, columns, header, has_marks, left_out)
+    return Layout(separator, decimal, first, columns, header, dates, has_marks, left_out)
 
 
 def split(line: str, separator: str | None) -> list[str]:
@@ -216,6 +224,12 @@ def _check_width(
         )
 
 
+def _are_dates(rows: Sequence[Sequence[str]], column: int) -> bool:
+    """True if a column holds ISO dates in every row that fills it."""
+    cells = [row[column] for row in rows if column < len(row) and not _is_missing(row[column])]
+    return bool(cells) and all(map(DATE.fullmatch, cells))
+
+
 def _check_text(cells: Sequence[str], name: str, decimal: str) -> None:
     """Raise ValueError for a column whose numbers use another decimal sign than the table."""
     other = "," if decimal == "." else "."
@@ -316,10 +330,15 @@ def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
         return numbered
     if not has_units:
         _check_names(above, n_columns)
+    said = [_unit(cell) for cell in units]
+    return replace(split_names(names, [*said, *[""] * n_columns][:n_columns]), step_s=step_s)
+
+
+def split_names(names: Sequence[str], units: Sequence[str] = ()) -> Header:
+    """Header of columns whose names may hold units, as `Time (s)`; units: those said elsewhere."""
     parted = [_split_name(name) for name in names]
-    units = [_unit(cell) for cell in units] or [unit for _, unit in parted]
-    units = [*units, *[""] * n_columns][:n_columns]
-    return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)), step_s)
+    units = units if any(units) else [unit for _, unit in parted]
+    return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)))
 
 
 def _check_names(above: Sequence[Line], n_columns: int) -> None:
