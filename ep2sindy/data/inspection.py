@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from ep2sindy.data.arrays import ArrayInfo
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.quantities import MADE_FROM
 from ep2sindy.data.readers.registry import open_source, reader_of
-from ep2sindy.data.recognition import ArrayInfo, Recognised, recognise
+from ep2sindy.data.recognition import Recognised, recognise
 from ep2sindy.runtime.screen import WIDTH, html_table, in_line, one_screen, text_table
 
 HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
