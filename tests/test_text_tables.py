@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ep2sindy.data.inspection import inspect_file
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import open_field
 from ep2sindy.data.readers.registry import open_source
@@ -157,3 +158,48 @@ def test_a_unit_in_the_header_must_agree_with_the_mapping(tmp_path: Path) -> Non
         open_field(
             tmp_path / "a.csv", variables={"n_i": Variable("n", "m^-3")}, time=Variable("t", "s")
         )
+
+
+TEKTRONIX = (
+    "Model,MSO54\nHorizontal Units,S,\nSample Interval,1.5e-06,\nRecord Length,30,\n"
+    "Vertical Units,mV,\n,,\nLabel,,\nTIME,CH1,\n"
+)
+
+
+def tektronix(path: Path, times: np.ndarray) -> Path:
+    path.write_text(TEKTRONIX + rows(times, X, end=","))
+    return path
+
+
+def test_units_of_a_preamble_are_those_of_the_columns(tmp_path: Path) -> None:
+    field = open_field(tektronix(tmp_path / "a.csv", T))
+    np.testing.assert_allclose(field["CH1"].values, 1e-3 * X, rtol=1e-8)
+    assert field["CH1"].attrs["units"] == "V"
+    assert inspect_file(tmp_path / "a.csv").time == Variable("TIME", "s")
+
+
+def test_a_gap_that_a_preamble_knows_nothing_of_stays_and_is_said(tmp_path: Path) -> None:
+    times = np.where(np.arange(len(T)) < 15, T, T + 4e-4)
+    path = tektronix(tmp_path / "a.csv", times)
+    np.testing.assert_allclose(open_field(path)["time"].values, times, atol=1e-18)
+    notes = " ".join(inspect_file(path).notes())
+    assert "'TIME' have a gap: 0.0004015 pass after row 15, where steps are 1.5e-06" in notes
+    assert "the file says steps of 1.5e-06 s beside them; the times are taken" in notes
+
+
+def test_a_preamble_that_contradicts_the_times_is_said(tmp_path: Path) -> None:
+    path = tektronix(tmp_path / "a.csv", 2.0 * T)
+    np.testing.assert_allclose(open_field(path)["time"].values, 2.0 * T, atol=1e-18)
+    notes = " ".join(inspect_file(path).notes())
+    assert "'TIME' go in steps of 3e-06 s, and the file says steps of 1.5e-06 s beside" in notes
+
+
+def test_rounded_times_take_the_step_of_the_preamble(tmp_path: Path) -> None:
+    path = tektronix(tmp_path / "a.csv", np.round(T, 5))
+    np.testing.assert_allclose(open_field(path)["time"].values, T, atol=1e-18)
+
+
+def test_stretches_that_a_file_joins_are_not_made_even(tmp_path: Path) -> None:
+    path = tektronix(tmp_path / "a.csv", np.concatenate([T[:15], T[:15]]))
+    with pytest.raises(ValueError, match="give dt_s if the steps are equal, or the stretches as"):
+        open_field(path)

@@ -11,6 +11,8 @@ from ep2sindy.data.mapping import read_array
 from ep2sindy.data.quantities import typical
 from ep2sindy.data.readers.source import FileSource
 
+MIN_GAP = 3.0  # steps; a shorter one may be a sample that came late
+
 TEXT = "text or objects"  # problem of arrays that are not numbers
 
 
@@ -20,8 +22,9 @@ class ArrayInfo:
 
     unit: "" if the file states none. low, high: range of the finite values. size: median magnitude
     of the nonzero values. n_missing: number of NaN or infinite values. step: mean step of an
-    increasing vector, else None. even: True if the steps are equal. falls: where a vector first
-    does not increase, in words. problem: reason why the array cannot be used, or "".
+    increasing vector, else None. even: True if the steps are equal. usual: median step. gap: where
+    steps that are otherwise even leave out samples, in words. falls: where a vector first does not
+    increase, in words. problem: reason why the array cannot be used, or "".
     """
 
     name: str
@@ -35,6 +38,8 @@ class ArrayInfo:
     n_missing: int = 0
     step: float | None = None
     even: bool = False
+    usual: float | None = None
+    gap: str = ""
     falls: str = ""
     problem: str = ""
 
@@ -42,6 +47,11 @@ class ArrayInfo:
     def lengths(self) -> tuple[int, ...]:
         """Lengths of the axes that have more than one point."""
         return tuple(n for n in self.shape if n > 1)
+
+    @property
+    def is_counter(self) -> bool:
+        """True for a vector that merely numbers the samples, 0, 1, 2 ..., in no unit."""
+        return self.even and self.step == 1.0 and self.low in (0.0, 1.0) and self.unit in ("", "1")
 
 
 def describe_array(source: FileSource, name: str) -> ArrayInfo:
@@ -55,12 +65,16 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     stated = counted_in(str(array.attrs.get("units", "") or source.units.get(name, "")))
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
     is_vector = values.size in values.shape
-    step, even = _step(values.ravel()) if is_vector else (None, False)
+    steps = _steps(values.ravel()) if is_vector else np.empty(0)
     return ArrayInfo(
         name, values.shape, str(array.dtype), stated, dims,
         float(finite.min()) if finite.size else np.nan,
         float(finite.max()) if finite.size else np.nan,
-        typical(values), int(values.size - finite.size), step, even,
+        typical(values), int(values.size - finite.size),
+        float(steps.mean()) if steps.size else None,
+        bool(steps.size and np.ptp(steps) <= 1e-3 * steps.mean()),
+        float(np.median(steps)) if steps.size else None,
+        _gap(steps),
         _fall(values.ravel()) if is_vector else "",
     )  # fmt: skip
 
@@ -78,8 +92,18 @@ def _fall(points: np.ndarray) -> str:
     return f"{points[k + 1]:.9g} follows {points[k]:.9g} at row {k + 2}"
 
 
-def _step(points: np.ndarray) -> tuple[float | None, bool]:
+def _steps(points: np.ndarray) -> np.ndarray:
+    """Steps of points that increase throughout; empty for others, and for fewer than three."""
     steps = np.diff(points)
-    if len(steps) < 2 or not (steps > 0).all():
-        return None, False
-    return float(steps.mean()), bool(np.ptp(steps) <= 1e-3 * steps.mean())
+    return steps if len(steps) > 1 and (steps > 0).all() else np.empty(0)
+
+
+def _gap(steps: np.ndarray) -> str:
+    """The longest gap in steps of which nine in ten are alike, in words; empty if there is none."""
+    if not steps.size:
+        return ""
+    usual, k = float(np.median(steps)), int(steps.argmax())
+    are_alike = np.mean(np.abs(steps - usual) <= 0.1 * usual) >= 0.9
+    if not are_alike or steps[k] < MIN_GAP * usual:
+        return ""
+    return f"{steps[k]:.4g} pass after row {k + 1}, where steps are {usual:.4g}"

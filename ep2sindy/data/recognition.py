@@ -83,7 +83,7 @@ def recognise(
         if axis not in axes and (found := _axis(axis, usable, source, questions)) is not None:
             axes[axis] = found
     if dt_s is None:
-        dt_s = _step_s(source, axes, usable)
+        dt_s = _step_s(source, axes, usable, questions)
     counter = axes.pop("time", None) if dt_s is not None else None
     taken = {v.name for v in (*axes.values(), *([counter] if counter else [])) if v.name}
     taken |= {each.name for each in usable if "time" in meant_by(each.name)}
@@ -95,8 +95,9 @@ def recognise(
     variables = _variables(rest, axes, held, lengths, questions, guesses)
     time = axes.get("time")
     if "time" not in named and time is not None and (one := _of(held, time.name)):
-        said_s = _stated_step_s(usable)
+        said_s = source.step_s or _stated_step_s(usable)
         axes["time"] = with_time_unit(axes["time"], one, variables, said_s, guesses)
+        _compare_step(axes["time"], one, said_s, questions)
     return Recognised(held, variables, axes, dt_s, guesses, questions, lengths.get("time"))
 
 
@@ -132,18 +133,52 @@ def _axis(
 
 
 def _step_s(
-    source: FileSource, axes: Mapping[str, Variable], held: Sequence[ArrayInfo]
+    source: FileSource,
+    axes: Mapping[str, Variable],
+    held: Sequence[ArrayInfo],
+    questions: list[str],
 ) -> float | None:
     """Time step in s from outside the time array, or None.
 
-    A step from the preamble counts unless the time array has a unit of time; without one, the
-    array merely numbers the samples. If there is no time array, a scalar such as dt or fs counts.
+    A time array comes first, unless it merely numbers the samples. Without one, the step of a
+    preamble counts, or a scalar such as dt or fs. Times that do not increase must still span what
+    the step says, as rounded ones do.
     """
     time = axes.get("time")
     one = _of(held, time.name) if time is not None else None
-    if source.step_s is not None:
-        return None if one is not None and is_of(one.unit, "s") else source.step_s
-    return _stated_step_s(held) if time is None else None
+    if source.step_s is None:
+        return _stated_step_s(held) if time is None else None
+    if one is not None:
+        return source.step_s if one.is_counter else None
+    for each in held:
+        if not (each.falls and "time" in meant_by(each.name)):
+            continue
+        span_s = (each.shape[0] - 1) * source.step_s
+        if abs(each.high - each.low - span_s) > 0.01 * span_s + 10.0 * source.step_s:
+            questions.append(
+                f"the times of {each.name!r} run over {each.high - each.low:.6g}, and samples in "
+                f"the file's steps of {source.step_s:.6g} s over {span_s:.6g} s: give dt_s if the "
+                "steps are equal, or the stretches as files of their own"
+            )
+            return None
+    return source.step_s
+
+
+def _compare_step(
+    time: Variable, one: ArrayInfo, step_s: float | None, questions: list[str]
+) -> None:
+    """Note times that the step in the file's preamble contradicts, or that leave out samples."""
+    said = "" if step_s is None else f", and the file says steps of {step_s:.6g} s beside them"
+    usual_s = (one.usual or 0.0) * conversion("time", time.unit)[0]
+    if one.gap:
+        questions.append(
+            f"the times of {one.name!r} have a gap: {one.gap}, in {time.unit}{said}; the times are "
+            "taken as they stand"
+        )
+    elif step_s is not None and one.usual and abs(usual_s - step_s) > 0.01 * step_s:
+        questions.append(
+            f"the times of {one.name!r} go in steps of {usual_s:.6g} s{said}; the times are taken"
+        )
 
 
 def _stated_step_s(held: Sequence[ArrayInfo]) -> float | None:
@@ -323,7 +358,11 @@ def with_time_unit(
     if one.unit not in ("", "1") or _ending("time", one.name) or one.step is None:
         return time
     for unit in ("s", *AXES["time"].others):
-        if said_s and isclose(one.step * conversion("time", unit)[0], said_s, rel_tol=1e-3):
+        if (
+            said_s
+            and one.usual
+            and isclose(one.usual * conversion("time", unit)[0], said_s, rel_tol=1e-3)
+        ):
             return replace(time, unit=unit)
     likely = likely_time_unit(one.step, variables)
     if likely is None:

@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 import xarray as xr
 
 from ep2sindy.data.fields import grid_points
-from ep2sindy.data.gaps import describe_gaps
+from ep2sindy.data.gaps import describe_breaks, describe_gaps
 from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.sampling import ZoneAverage
@@ -199,6 +199,8 @@ def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
     say_doubts(run, field)
     if data.n_samples < field.sizes["time"]:
         run.warn(describe_gaps(data.t, field.sizes["time"]))
+    elif text := describe_breaks(data.t):
+        run.warn(text)
 
 
 def data_summary(data: Trajectory) -> dict[str, Any]:

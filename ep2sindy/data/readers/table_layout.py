@@ -257,6 +257,10 @@ NO_UNIT = frozenset({"", "-", "--", "1", "a.u.", "arb", "arb.", "counts", "none"
 
 NUMBER = re.compile(r"[+-]?[\d.,]+([eE][+-]?\d+)?")
 
+# Labels of the units of the first column and of the others in a preamble.
+UNITS_OF_TIME = re.compile(r"(horizontal|x|time)[ -]?(axis )?units?", re.I)
+UNITS_OF_VALUES = re.compile(r"(vertical|y)[ -]?(axis )?units?", re.I)
+
 # Labels of the time step in s in a preamble.
 STEP = re.compile(
     r"(horizontal )?(sampl\w* (interval|period|time)|time (step|interval)|dt)\b.*", re.I
@@ -331,7 +335,25 @@ def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
     if not has_units:
         _check_names(above, n_columns)
     said = [_unit(cell) for cell in units]
-    return replace(split_names(names, [*said, *[""] * n_columns][:n_columns]), step_s=step_s)
+    header = split_names(names, [*said, *[""] * n_columns][:n_columns])
+    if header.names[0].lower() in TIMES and not any(header.units):
+        header = replace(header, units=_units_said(cells, n_columns))
+    return replace(header, step_s=step_s)
+
+
+def _units_said(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, ...]:
+    """Units of the columns, time first, as lines of a preamble give them; "" where none does."""
+    time, values = "", [""]
+    for label, *cells in filter(None, above):
+        units = _trim([_unit(cell) for cell in cells])
+        if units and UNITS_OF_TIME.fullmatch(label):
+            time = units[0].lower() if unit_like(units[0].lower(), like="s") else units[0]
+        elif units and UNITS_OF_VALUES.fullmatch(label):
+            values = units
+    values = values * (n_columns - 1) if len(values) == 1 else [*values, *[""] * n_columns]
+    return tuple(unit if unit_like(unit) else "" for unit in map(_plain, [time, *values]))[
+        :n_columns
+    ]
 
 
 def split_names(names: Sequence[str], units: Sequence[str] = ()) -> Header:
