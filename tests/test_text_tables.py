@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ep2sindy.data.fields import clock_of
 from ep2sindy.data.inspection import inspect_file
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import open_field
@@ -203,3 +204,54 @@ def test_stretches_that_a_file_joins_are_not_made_even(tmp_path: Path) -> None:
     path = tektronix(tmp_path / "a.csv", np.concatenate([T[:15], T[:15]]))
     with pytest.raises(ValueError, match="give dt_s if the steps are equal, or the stretches as"):
         open_field(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "column", "unit"),
+    [
+        ("rotifers (animals/ml)", "rotifers", "animals/ml"),
+        ("algae [cells/ml]", "algae", "cells/ml"),
+        ("index (foo/bar/baz)", "index", "1"),
+    ],
+)
+def test_a_slash_in_a_unit_is_no_path(tmp_path: Path, name: str, column: str, unit: str) -> None:
+    (tmp_path / "a.csv").write_text(f"t,{name}\n" + rows(T, X))
+    assert inspect_file(tmp_path / "a.csv").variables[column].unit == unit
+    field = open_field(tmp_path / "a.csv")
+    assert field[column].attrs["units"] == unit
+    np.testing.assert_allclose(field[column].values, X, rtol=1e-8)
+
+
+def test_a_count_is_a_unit_only_where_the_file_says_so(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,x\n" + rows(T, X))
+    with pytest.raises(ValueError, match="must be one that converts to SI: 'animals/ml' came"):
+        open_field(
+            tmp_path / "a.csv",
+            variables={"x": Variable("x", "animals/ml")},
+            time=Variable("t", "s"),
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "seconds"),
+    [
+        ("Year", "year", 31557600.0), ("day", "day", 86400.0), ("Time (h)", "h", 3600.0),
+        ("time_h", "hour", 3600.0), ("Elapsed days", "day", 86400.0), ("t_min", "minute", 60.0),
+    ],
+)  # fmt: skip
+def test_the_name_of_a_column_says_the_unit_of_time(
+    tmp_path: Path, name: str, unit: str, seconds: float
+) -> None:
+    (tmp_path / "a.csv").write_text(f"{name},x\n" + rows(np.arange(30.0), X))
+    time = inspect_file(tmp_path / "a.csv").time
+    assert time is not None
+    assert time.unit == unit
+    field = open_field(tmp_path / "a.csv")
+    np.testing.assert_allclose(field["time"].values, seconds * np.arange(30.0), rtol=1e-12)
+    assert clock_of(field).unit == unit
+
+
+def test_a_first_column_of_another_name_is_time_and_said_to_be(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("frame,x\n" + rows(np.arange(30.0), X))
+    (note,) = inspect_file(tmp_path / "a.csv").notes()
+    assert note.startswith("time is taken from 'frame', which is the first column, and rises even")

@@ -122,6 +122,18 @@ HALLTHRUSTER = {
 STEPS = frozenset({"dt", "dts", "deltat", "timestep", "sampletime", "samplinginterval"})
 RATES = frozenset({"fs", "samplingrate", "samplerate", "samplingfrequency", "fshz"})
 
+# Units of time as names, and as endings of names for time.
+TIME_WORDS = frozenset({"t", "time", "times", "elapsed", "in", "the"})
+UNITS_OF_TIME = {
+    word: unit
+    for unit in ("second", "minute", "hour", "day", "week", "month", "year")
+    for word in (unit, f"{unit}s")
+}
+SHORT_UNITS = {
+    "min": "minute", "mins": "minute", "h": "hour", "hr": "hour", "hrs": "hour", "d": "day",
+    "wk": "week", "yr": "year", "yrs": "year", "y": "year",
+}  # fmt: skip
+
 # Units written at the end of a name.
 ENDINGS = {
     "s": "s", "ms": "ms", "us": "us", "ns": "ns", "m": "m", "cm": "cm", "mm": "mm", "ev": "eV",
@@ -138,6 +150,11 @@ def split_unit(name: str) -> tuple[str, str | None]:
     return name, None
 
 
+def last_of(name: str) -> str:
+    """Last part of a path such as `plasma/n_i`; a slash in brackets, as in `x (1/ml)`, is none."""
+    return re.split(r"[/.]", re.sub(r"(?<=.)\s*[(\[].*?[)\]]", "", name))[-1]
+
+
 def words_of(name: str) -> tuple[str, ...]:
     """Meanings of the words in a name, sorted: `ionDensity` and `density_ion` give the same."""
     parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)
@@ -145,9 +162,21 @@ def words_of(name: str) -> tuple[str, ...]:
     return tuple(sorted(word for word in said if word))
 
 
+def time_unit_in(name: str) -> str | None:
+    """Unit of time that a name says: `Year` gives `year`, `time_h` gives `hour`; None if it says
+    none. A short one such as `h` counts only beside a word for time.
+    """
+    words = re.findall(r"[a-z]+", last_of(name).lower())
+    units = [word for word in words if word not in TIME_WORDS]
+    if len(units) != 1:
+        return None
+    word = units[0]
+    return UNITS_OF_TIME.get(word) or (SHORT_UNITS.get(word) if len(words) == 2 else None)
+
+
 def step_said(name: str, value: float) -> float | None:
     """Time step in s that a scalar of this name gives, or None if it is no step or rate."""
-    *_, last = re.split(r"[/.]", name)
+    last = last_of(name)
     plain = re.sub(r"[^a-z]", "", last.lower())
     if not (np.isfinite(value) and value > 0):
         return None
@@ -162,7 +191,7 @@ def meant_by(name: str) -> set[str]:
     exact = {ours for pattern, ours in HALLTHRUSTER.items() if re.fullmatch(pattern, name)}
     if exact:
         return exact
-    *_, last = re.split(r"[/.]", name)
+    last = last_of(name)
     for text in (last, split_unit(last)[0], name, split_unit(name)[0]):
         if last.isdigit():
             break

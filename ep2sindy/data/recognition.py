@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count
 from math import isclose
 
 import numpy as np
@@ -19,13 +20,15 @@ from ep2sindy.data.quantities import (
     AXES,
     QUANTITIES,
     KnownQuantity,
+    last_of,
     likely_time_unit,
     meant_by,
     split_unit,
     step_said,
+    time_unit_in,
 )
 from ep2sindy.data.readers.source import FileSource
-from ep2sindy.library.units import unit_like
+from ep2sindy.library.units import is_count, unit_like
 
 MAX_COLUMNS = 32  # an array of at most so many columns is split into separate signals
 
@@ -115,8 +118,14 @@ def _axis(
     options = [e for e in options if e.unit in ("", "1") or is_of(e.unit, unit)]
     if not options and axis == "time":
         options = [each for each in rising if is_of(each.unit, unit)]
+        options = options or [e for e in rising if e.unit in ("", "1") and time_unit_in(e.name)]
         if not options and source.is_table and rising and rising[0] is held[0]:
             options = rising[:1]  # an increasing first column of a table is its time
+            even = ", and rises evenly" if options[0].even else ", and rises"
+            questions.append(
+                f"time is taken from {options[0].name!r}, which is the first column{even}, in s: "
+                "name another one if that is wrong, or its unit"
+            )
     if not options and axis == "time":
         questions += [
             f"{each.name!r} does not increase ({each.falls}): sort the rows, drop what repeats, or "
@@ -304,12 +313,11 @@ def _columns(one: ArrayInfo, lengths: Mapping[str, int], taken: set[str]) -> dic
 
 def _own_name(name: str, taken: set[str]) -> str:
     """Turn a name in a file into a valid variable name that is not yet taken."""
-    *_, last = re.split(r"[/.]", name)
+    last = last_of(name)
     ours = re.sub(r"\W+", "_", name if last.isdigit() and last != name else last).strip("_")
     ours = f"column_{ours}" if not ours or ours[0].isdigit() else ours
-    while ours in taken:
-        ours += "_"
-    return ours
+    numbers = (f"{ours}_{k}" for k in count(2))
+    return ours if ours not in taken else next(name for name in numbers if name not in taken)
 
 
 # Unit of an array's numbers: stated by the file, in its name, our usual one, or only likely.
@@ -376,7 +384,7 @@ def with_time_unit(
 
 def _ending(ours: str, name: str) -> str:
     """Unit at the end of a name, if it converts to the unit of our name; else ""."""
-    unit = split_unit(re.split(r"[/.]", name)[-1])[1]
+    unit = (time_unit_in(name) if ours == "time" else None) or split_unit(last_of(name))[1]
     return unit if unit and converts(ours, unit) else ""
 
 
@@ -391,7 +399,12 @@ def converts(ours: str, unit: str, *, is_variable: bool = False) -> bool:
 
 
 def own_unit(ours: str, one: ArrayInfo) -> str:
-    """Unit that the file states, or that a name's ending gives, if it converts; else "1"."""
+    """Unit that the file states, or that a name's ending gives, if it converts; else "1".
+
+    A count of named things that the file states, such as `animals/ml`, stays as it is.
+    """
+    if is_count(one.unit):
+        return one.unit
     suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
     options = (one.unit, split_unit(ours)[1] or "", *suffixes)
     return next((unit for unit in options if converts(ours, unit, is_variable=True)), "1")

@@ -103,6 +103,13 @@ def unit_like(text: str, like: str | None = None) -> bool:
     return parsed.is_compatible_with(like)
 
 
+def is_count(unit: str) -> bool:
+    """True for named things counted in a known unit, such as `animals/ml`."""
+    things, _, per = unit.partition("/")
+    is_word = bool(re.fullmatch(r"[^\W\d_]{2,}", things.strip()))
+    return is_word and unit_like(per.strip()) and not unit_like(unit)
+
+
 def netcdf_powers(unit: str) -> str:
     """Rewrite powers in netCDF's notation: `m-3` becomes `m^-3`."""
     return re.sub(r"\b([A-Za-zµ]+)(-?\d+)\b", r"\1^\2", unit)

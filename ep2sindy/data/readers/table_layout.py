@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ep2sindy.data.readers.notation import PLAIN, decimals_shown, is_grouped, is_number
-from ep2sindy.library.units import unit_like
+from ep2sindy.library.units import is_count, unit_like
 
 SEPARATORS = (",", ";", "\t", "|", None)  # None: blanks
 COMMENTS = ("#", "%", "//", "!")
@@ -402,7 +402,8 @@ def _split_name(name: str) -> tuple[str, str]:
         found = pattern.fullmatch(name)
         if found and unit_like(_plain(found[2])):
             return found[1].strip(), found[2].strip()
-    return name, ""
+    found = WITH_UNIT[0].fullmatch(name)
+    return (found[1].strip(), found[2].strip()) if found and is_count(found[2]) else (name, "")
 
 
 def _plain(unit: str) -> str:
