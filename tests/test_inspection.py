@@ -102,7 +102,7 @@ def test_an_inspection_says_what_is_there_and_what_lacks(tmp_path: Path) -> None
         assert part in text, part
     assert found.lacking(["n_i", "R_ion", "V_d"]) == ("V_d",)  # R_ion can be made
     (ready,) = experiments(found)
-    assert "all there for +exp=breathing" in ready
+    assert "all but the time is there for +exp=breathing" in ready
     assert "<table>" in ep.inspect_file(tmp_path / "a.h5")._repr_html_()
 
 

@@ -40,7 +40,7 @@ def read_axes(
     variables: Mapping[str, Variable],
     problems: Problems,
 ) -> dict[str, xr.DataArray]:
-    """Read the file's coordinates, in SI; with `dt_s`, times are built from equal steps."""
+    """Read the file's coordinates, in SI; with `dt_s`, times are built from steps' numbers."""
     points = {}
     for axis, variable in axes.items():
         if axis != "time" or dt_s is None:
@@ -55,7 +55,8 @@ def read_axes(
         return points
     with problems.noted():
         n_samples, dim = time_length(source, arrays, variables, points)
-        steps = xr.DataArray(dt_s * np.arange(n_samples), dims=dim, attrs={"units": "s"})
+        numbers = source.steps if len(source.steps) == n_samples else range(n_samples)
+        steps = xr.DataArray(dt_s * np.array(numbers), dims=dim, attrs={"units": "s"})
         return {"time": steps, **points}
     return points
 

@@ -12,8 +12,10 @@ from pathlib import Path
 from ep2sindy.data.arrays import ArrayInfo
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.quantities import MADE_FROM
-from ep2sindy.data.readers.registry import open_source, reader_of
+from ep2sindy.data.readers.registry import reader_of
+from ep2sindy.data.readers.source import FileSource
 from ep2sindy.data.recognition import Recognised, recognise
+from ep2sindy.data.steps import files_of, open_record
 from ep2sindy.runtime.screen import WIDTH, html_table, in_line, one_screen, text_table
 
 HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
@@ -23,15 +25,41 @@ HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
 class Inspection:
     """Result of inspecting a file, with the mapping by which `open_field` opens it.
 
-    kind: kind of file. words: notes on how it was read. found: the recognised mapping.
-    channel_m: length of the channel in m, if the file gives one.
+    kind: kind of file. source: its arrays, and notes on how it was read. found: the recognised
+    mapping.
     """
 
-    path: Path
     kind: str
-    words: str
+    source: FileSource
     found: Recognised
-    channel_m: float | None
+
+    @property
+    def path(self) -> Path:
+        """The file; the pattern or the first file of several that are joined."""
+        return self.source.path
+
+    @property
+    def words(self) -> str:
+        """Notes on how the file was read."""
+        return self.source.words
+
+    @property
+    def channel_m(self) -> float | None:
+        """Length of the channel in m, if the file gives one."""
+        return self.source.channel_m
+
+    @property
+    def has_time(self) -> bool:
+        return self.time is not None or self.dt_s is not None
+
+    @property
+    def is_certain(self) -> bool:
+        """True if `open_field` opens the file without a mapping."""
+        try:
+            self.found.check(self.source)
+        except ValueError:
+            return False
+        return True
 
     @property
     def variables(self) -> dict[str, Variable]:
@@ -81,10 +109,15 @@ class Inspection:
     def notes(self) -> list[str]:
         """Messages about open decisions, units that are only likely, and missing information."""
         texts = []
-        if self.time is None and self.dt_s is None:
-            texts.append("no time: give the step between samples, data.dt_s=STEP in s")
+        steps = self.source.steps
+        if not self.has_time:
+            what = "step between samples"
+            if steps:
+                what = f"time of one step, of those numbered {steps[0]} to {steps[-1]}"
+            texts.append(f"no time: give the {what}, data.dt_s=STEP in s")
         if self.dt_s is not None:
-            texts.append(f"time in steps of {self.dt_s:.6g} s, as the file says beside its arrays")
+            how = "is the number of a step times" if steps else "in steps of"
+            texts.append(f"time {how} {self.dt_s:.6g} s, as the file says beside its arrays")
         texts += [text.removesuffix(": give it") for text in self.found.guesses.values()]
         texts += list(self.found.questions)
         texts += [
@@ -145,9 +178,10 @@ class Inspection:
         return roles
 
 
-def inspect_file(path: str | Path) -> Inspection:
+def inspect_file(path: str | Path | Sequence[str | Path]) -> Inspection:
     """List the arrays of a file and recognise quantities by names, units, shapes and sizes.
 
+    path: a file, or a pattern or a list of the files of the steps of one run.
     Reads every array once. The result prints as a table, followed by notes on units that are only
     likely and on missing information. `ep2sindy.open_field(path, variables=found.variables,
     time=found.time, z=found.z, r=found.r, dt_s=found.dt_s)` opens the recognised field.
@@ -157,11 +191,10 @@ def inspect_file(path: str | Path) -> Inspection:
     >>> found.variables["n_i"].unit
     'm^-3'
     """
-    path = Path(path)
-    source = open_source(path)
+    source = open_record(path)
     found = recognise(source)
-    kind = reader_of(path).name
-    return Inspection(path, kind, source.words, found, source.channel_m)
+    kind = reader_of(Path(files_of(path)[0])).name
+    return Inspection(kind, source, found)
 
 
 def check_alike(found: Sequence[Inspection]) -> None:

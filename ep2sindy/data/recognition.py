@@ -100,7 +100,7 @@ def recognise(
     if "time" not in named and time is not None and (one := _of(held, time.name)):
         said_s = source.step_s or _stated_step_s(usable)
         axes["time"] = with_time_unit(axes["time"], one, variables, said_s, guesses)
-        _compare_step(axes["time"], one, said_s, questions)
+        _compare_step(axes["time"], one, source.step_s, questions)
     return Recognised(held, variables, axes, dt_s, guesses, questions, lengths.get("time"))
 
 
@@ -115,7 +115,7 @@ def _axis(
     unit = AXES[axis].unit
     rising = [each for each in held if each.step is not None]
     options = [each for each in rising if axis in meant_by(each.name)]
-    options = [e for e in options if e.unit in ("", "1") or is_of(e.unit, unit)]
+    options = [e for e in options if e.unit in ("", "1") or converts(axis, e.unit)]
     if not options and axis == "time":
         options = [each for each in rising if is_of(each.unit, unit)]
         options = options or [e for e in rising if e.unit in ("", "1") and time_unit_in(e.name)]
@@ -192,7 +192,13 @@ def _compare_step(
 
 def _stated_step_s(held: Sequence[ArrayInfo]) -> float | None:
     """Time step in s given by scalars such as dt or fs; None if there is none or they disagree."""
-    scalars = [step_said(e.name, e.low) for e in held if not e.lengths and not e.dims]
+    scalars = [
+        step_said(
+            e.name, e.low * (conversion("time", e.unit)[0] if converts("time", e.unit) else 1)
+        )
+        for e in held
+        if not e.lengths and not e.dims
+    ]
     said = {step for step in scalars if step is not None}
     return said.pop() if len(said) == 1 else None
 

@@ -153,7 +153,7 @@ class Clock:
             return SECONDS
         try:
             check_unit(unit)
-            seconds = float(registry().Quantity(1.0, unit).to("s").magnitude)
+            seconds = float(registry().Quantity(unit).to("s").magnitude)  # perhaps '1e-6 s'
         except unit_errors() as error:
             raise ValueError(
                 f"a unit of time must be such as 's', 'us', 'h' or 'year': {unit!r} came"

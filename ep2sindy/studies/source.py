@@ -13,9 +13,9 @@ import xarray as xr
 
 from ep2sindy.data.fields import grid_points
 from ep2sindy.data.gaps import describe_breaks, describe_gaps
-from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.sampling import ZoneAverage
+from ep2sindy.data.steps import records_of
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory
 from ep2sindy.data.zones import Zone, describe_zone
 from ep2sindy.library.library import Library
@@ -57,10 +57,10 @@ def open_prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
 
 
 def _records(data: Deferred) -> list[Deferred]:
-    """One entry for every file that `data.path` names, or the data themselves."""
+    """One entry for every record that `data.path` names, or the data themselves."""
     path = data.settings.get("path")
-    files = [path] if path is None else files_of(path)
-    return [data] if files == [path] else [data.changed({"path": file}) for file in files]
+    found = [path] if path is None else records_of(path)
+    return [data] if found == [path] else [data.changed({"path": each}) for each in found]
 
 
 def _prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:

@@ -43,6 +43,7 @@ class FileSource:
     file gives it outside its arrays. channel_m: length of the thruster's channel in m, if the file
     gives it. words: notes on how the file was read, shown on inspection. is_table: True if the
     arrays are columns of a table. attributes: texts and numbers that describe the whole file.
+    steps: numbers of the steps of a run that was written step by step.
     """
 
     path: Path
@@ -56,6 +57,7 @@ class FileSource:
     words: str = ""
     is_table: bool = False
     attributes: Mapping[str, str | float] = field(default_factory=dict)
+    steps: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         if len(set(self.names)) < len(self.names):
