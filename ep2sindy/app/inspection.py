@@ -36,6 +36,8 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "discover": (),
 }
 
+NOT_STATES = ("R_ion", "V_d")  # what drives a model
+
 
 def main(arguments: Sequence[str], conf: Path) -> None:
     """Inspect files and write a config for them. conf: the folder of the package's configs.
@@ -89,7 +91,7 @@ def experiments(found: Inspection) -> list[str]:
     """One line on the experiments that can be run, and one for each set of missing variables."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for name, needed in NEEDS.items():
-        lacking = found.lacking(needed) or (() if found.variables else ("a variable",))
+        lacking = found.lacking(needed) or (() if found.signals else ("a signal",))
         groups.setdefault(lacking, []).append(f"+exp={name}")
     ready = "all there" if found.has_time else "all but the time is there"
     return [
@@ -158,7 +160,7 @@ def _flow(value: Any) -> str:
 
 
 def _word(found: Inspection, name: str) -> str:
-    return "  # the likely unit: check it" if name in found.found.guesses else ""
+    return "  # likely: check it" if name in found.found.guesses else ""
 
 
 def commands(found: Inspection, data: list[str]) -> list[str]:
@@ -175,6 +177,7 @@ def commands(found: Inspection, data: list[str]) -> list[str]:
         signal = "I_d" if "I_d" in traces else traces[0]
         lines.append(["+exp=trace", *data, f"signal={signal}"])
     states = traces[:3] if len(traces) > 1 else [n for n in ("n_i", "n_n") if n in found.variables]
+    states = states or [n for n in found.signals if n not in NOT_STATES][:2] * (not traces)
     if states:
         lines.append(["+exp=discover", *data, f"trajectory.states=[{','.join(states)}]"])
     return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]

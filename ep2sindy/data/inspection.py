@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from ep2sindy.data.readers.source import FileSource
 from ep2sindy.data.recognition import Recognised, recognise
 from ep2sindy.data.steps import files_of, open_record
 from ep2sindy.runtime.screen import WIDTH, html_table, in_line, one_screen, text_table
+
+N_ROWS, N_NOTES = 60, 20  # largest numbers of arrays and notes that are listed
 
 HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
 
@@ -98,11 +101,24 @@ class Inspection:
         have = {*self.found.variables, *self.prepare}
         return tuple(name for name in needed if name not in have)
 
+    @property
+    def signals(self) -> list[str]:
+        """Variables that vary and do not increase throughout, as a coordinate does."""
+        held = {each.name: each for each in self.found.held}
+        arrays = {n: held[self._array_of(v)] for n, v in self.variables.items()}
+        return [n for n, one in arrays.items() if one.step is None and one.low < one.high]
+
+    def _array_of(self, variable: Variable) -> str:
+        """Name of the array in the file that a variable is, or is a part of."""
+        name = str(variable.name)
+        whole = any(each.name == name for each in self.found.held)
+        return name if whole else name.rpartition("[")[0]
+
     def is_trace(self, variable: Variable) -> bool:
         """True if a variable depends on time alone, varies, and does not increase throughout."""
-        held = {each.name: each for each in self.found.held}
-        one = held.get(str(variable.name)) or held[str(variable.name).rpartition("[")[0]]
-        n_axes = 1 + (one.name != variable.name)
+        name = self._array_of(variable)
+        one = next(each for each in self.found.held if each.name == name)
+        n_axes = 1 + len(re.findall(r"\d+", str(variable.name)[len(one.name) :]))
         of_time = len(one.lengths) == n_axes and self.found.n_samples in one.lengths
         return of_time and one.step is None and one.low < one.high
 
@@ -133,7 +149,9 @@ class Inspection:
     def lines(self, more_notes: Sequence[str] = ()) -> list[str]:
         """Summary of the file, its arrays and the notes on them, in lines of a screen's width."""
         words = f"; {self.words}" if self.words else ""
-        texts = map(in_line, (*self.notes(), *more_notes))
+        own, rows = self.notes(), self._rows()
+        hidden = [f"... {len(own) - N_NOTES} more notes"] * (len(own) > N_NOTES)
+        texts = map(in_line, (*own[:N_NOTES], *hidden, *more_notes))
         notes = [
             line
             for text in texts
@@ -141,7 +159,9 @@ class Inspection:
                                       break_long_words=False, break_on_hyphens=False)
         ]  # fmt: skip
         head = f"{self.path}: {self.kind}{words}"
-        return [in_line(head), *text_table(HEADER, self._rows()), *notes]
+        table = text_table(HEADER, rows[:N_ROWS])
+        more = [f"... {len(rows) - N_ROWS} more arrays"] * (len(rows) > N_ROWS)
+        return [in_line(head), *table, *more, *notes]
 
     def __repr__(self) -> str:
         return one_screen(self.lines(), n_lines=60)

@@ -13,11 +13,12 @@ import xarray as xr
 
 from ep2sindy.data.arrays import TEXT, ArrayInfo, describe_array
 from ep2sindy.data.conversion import SUFFIX_UNITS, conversion
-from ep2sindy.data.dimensions import fitting, time_length
+from ep2sindy.data.dimensions import fitting, match_axes, time_length
 from ep2sindy.data.fields import DIMS
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file
 from ep2sindy.data.quantities import (
     AXES,
+    PLASMA,
     QUANTITIES,
     KnownQuantity,
     last_of,
@@ -87,6 +88,14 @@ def recognise(
             axes[axis] = found
     if dt_s is None:
         dt_s = _step_s(source, axes, usable, questions)
+    if not source.is_table:
+        rest = [e for e in usable if not meant_by(e.name) & {*DIMS} and not e.dims]
+        known = {axis: one for axis, v in axes.items() if (one := _of(held, v.name))}
+        found_axes = match_axes(
+            [*rest, *known.values()], known, has_step=dt_s is not None,
+            questions=questions, guesses=guesses,
+        )  # fmt: skip
+        axes |= {axis: Variable(one.name, AXES[axis].unit) for axis, one in found_axes.items()}
     counter = axes.pop("time", None) if dt_s is not None else None
     taken = {v.name for v in (*axes.values(), *([counter] if counter else [])) if v.name}
     taken |= {each.name for each in usable if "time" in meant_by(each.name)}
@@ -94,7 +103,7 @@ def recognise(
     for axis, variable in axes.items():
         if (one := _of(held, variable.name)) is not None and axis not in named:
             axes[axis] = with_unit(axis, one, AXES[axis], guesses)
-    lengths = _lengths(axes, held, source, rest, questions)
+    lengths = _lengths(axes, held, source, rest, questions, guesses)
     variables = _variables(rest, axes, held, lengths, questions, guesses)
     time = axes.get("time")
     if "time" not in named and time is not None and (one := _of(held, time.name)):
@@ -209,8 +218,12 @@ def _lengths(
     source: FileSource,
     rest: Sequence[ArrayInfo],
     questions: list[str],
+    guesses: dict[str, str],
 ) -> dict[str, int]:
-    """Number of points of each axis; without a time array, samples are counted from the others."""
+    """Number of points of each axis; without a time array, samples are counted from the others.
+
+    If no other axis of them has a coordinate, the longest one is likely time.
+    """
     found = {axis: one.shape for axis, v in axes.items() if (one := _of(held, v.name))}
     lengths = {axis: int(np.prod(shape)) for axis, shape in found.items()}
     if "time" in axes or not rest:
@@ -223,7 +236,14 @@ def _lengths(
         plain = {name: Variable(name, "1") for name in arrays}
         lengths["time"] = time_length(source, arrays, plain, points)[0]
     except ValueError as error:
-        questions.append(str(error))
+        longest = {max(each.lengths, default=0) for each in rest if len(each.lengths) > 1}
+        if len(longest) == 1 and all(e.shape.count(max(longest)) < 2 for e in rest):
+            lengths["time"] = longest.pop()
+            guesses["time"] = (
+                f"time is likely the axis of {lengths['time']} samples, the longest: give it"
+            )
+        else:
+            questions.append(str(error))
     return lengths
 
 
@@ -259,9 +279,9 @@ def _variables(
             found[ours] = Variable(each.name, own_unit(ours, each))
             used.add(ours)
     for each in rest:
-        columns = _columns(each, lengths, used)
-        found |= columns
-        used |= columns.keys()
+        parts = _middle(each, lengths, used, guesses) or _columns(each, lengths, used)
+        found |= parts
+        used |= parts.keys()
     return found
 
 
@@ -289,7 +309,8 @@ def _fits(
     if len(ways) > 1:
         texts = " or ".join(f"[{','.join(way)}]" for way in ways)
         questions.append(f"{one.name!r} of shape {one.shape} may be {texts}: give its dims")
-    if not ways and len(one.lengths) > 1 and not _has_columns(one, lengths):
+    is_apart = _has_columns(one, lengths) or one.shape.count(lengths.get("time", 0)) == 1
+    if not ways and len(one.lengths) > 1 and not is_apart:
         part = ", ".join([":", *["0"] * (len(one.shape) - 1)])
         questions.append(
             f"{one.name!r} of shape {one.shape} has an axis without a coordinate: name it, or take "
@@ -301,7 +322,27 @@ def _fits(
 def _has_columns(one: ArrayInfo, lengths: Mapping[str, int]) -> bool:
     """True if an array consists of a few signals side by side."""
     n = lengths.get("time", 0)
-    return len(one.shape) == 2 and sorted(one.shape)[-1] == n and min(one.shape) <= MAX_COLUMNS
+    fewer = min(one.shape, default=0)
+    return len(one.shape) == 2 and fewer < max(one.shape) == n and fewer <= MAX_COLUMNS
+
+
+def _middle(
+    one: ArrayInfo, lengths: Mapping[str, int], taken: set[str], guesses: dict[str, str]
+) -> dict[str, Variable]:
+    """The signal in the middle of an array on a grid without coordinates, which is only likely."""
+    n = lengths.get("time", 0)
+    if len(one.lengths) < 2 or fitting(one.shape, lengths) or one.shape.count(n) != 1 or one.dims:
+        return {}
+    meant = meant_by(one.name) & {*QUANTITIES} - taken
+    if _has_columns(one, lengths) and not meant & PLASMA:
+        return {}
+    ours = meant.pop() if len(meant) == 1 else _own_name(one.name, taken)
+    part = ", ".join(":" if size == n else str(size // 2) for size in one.shape)
+    name = f"{one.name}[{part}]"
+    guesses[ours] = f"{ours} is taken at the middle, {name}, as an axis has no coordinate: give it"
+    known = QUANTITIES.get(ours)
+    unit = with_unit(ours, one, known, guesses).unit if known else own_unit(ours, one)
+    return {ours: Variable(name, unit)}
 
 
 def _columns(one: ArrayInfo, lengths: Mapping[str, int], taken: set[str]) -> dict[str, Variable]:
@@ -333,6 +374,12 @@ def is_of(unit: str, like: str) -> bool:
     return bool(unit) and unit != "1" and unit_like(unit, like=like)
 
 
+def _guess(guesses: dict[str, str], ours: str, text: str) -> None:
+    """Add a message about one of our names to those that there are."""
+    before = guesses.get(ours, "").removesuffix(": give it")
+    guesses[ours] = f"{before}; {text}" if before else text
+
+
 def with_unit(
     ours: str, one: ArrayInfo, quantity: KnownQuantity, guesses: dict[str, str]
 ) -> Variable:
@@ -348,9 +395,11 @@ def with_unit(
             unit for unit in quantity.others if quantity.fits(one.size, conversion(ours, unit)[0])
         ]
         if likely:
-            guesses[ours] = (
+            _guess(
+                guesses,
+                ours,
                 f"{ours} ({one.name!r}) is about {one.size:.2g}, as if the file counted in "
-                f"{' or '.join(likely)}, and it names no unit: give it"
+                f"{' or '.join(likely)}, and it names no unit: give it",
             )
             stated = likely[0]
     return Variable(one.name, stated or quantity.unit)
@@ -381,9 +430,11 @@ def with_time_unit(
     likely = likely_time_unit(one.step, variables)
     if likely is None:
         return time
-    guesses["time"] = (
+    _guess(
+        guesses,
+        "time",
         f"time ({one.name!r}) goes in steps of {one.step:.2g}, as if the file counted in {likely}, "
-        "and it names no unit: give it"
+        "and it names no unit: give it",
     )
     return replace(time, unit=likely)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -58,8 +59,13 @@ def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
         return readers[claims.index(max(claims))]
     if look.form == "folder":
         folders = _join_names([e for r in readers if r.form == "folder" for e in r.endings])
+        counts = Counter(each.suffix for each in path.iterdir() if each.is_file() and each.suffix)
+        way_out = ", with no files in it"
+        if counts:
+            (ending, n), *_ = counts.most_common(1)
+            way_out = f"; take its {n} files that end in {ending}, '{path}/*{ending}'"
         raise ValueError(
-            f"a file must come, or a folder that ends in {folders}: {path} is a folder"
+            f"a file must come, or a folder that ends in {folders}: {path} is a folder{way_out}"
         )
     by_ending = [r for r in readers if r.form in ("other", "folder")]
     kinds = _join_names([r.name for r in readers if r not in by_ending])
