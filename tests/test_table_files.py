@@ -62,7 +62,7 @@ def test_a_table_is_opened_with_its_units(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("ending", ["csv", "xlsx", "parquet"])
-@pytest.mark.parametrize(("freq", "unit"), [("D", "day"), ("10min", "minute"), ("10ms", "s")])
+@pytest.mark.parametrize(("freq", "unit"), [("D", "day"), ("10min", "min"), ("10ms", "s")])
 def test_dates_are_counted_from_the_first(
     tmp_path: Path, ending: str, freq: str, unit: str
 ) -> None:

@@ -236,7 +236,7 @@ def test_a_count_is_a_unit_only_where_the_file_says_so(tmp_path: Path) -> None:
     ("name", "unit", "seconds"),
     [
         ("Year", "year", 31557600.0), ("day", "day", 86400.0), ("Time (h)", "h", 3600.0),
-        ("time_h", "hour", 3600.0), ("Elapsed days", "day", 86400.0), ("t_min", "minute", 60.0),
+        ("time_h", "h", 3600.0), ("Elapsed days", "day", 86400.0), ("t_min", "min", 60.0),
     ],
 )  # fmt: skip
 def test_the_name_of_a_column_says_the_unit_of_time(

@@ -126,12 +126,15 @@ RATES = frozenset({"fs", "samplingrate", "samplerate", "samplingfrequency", "fsh
 TIME_WORDS = frozenset({"t", "time", "times", "elapsed", "in", "the"})
 UNITS_OF_TIME = {
     word: unit
-    for unit in ("second", "minute", "hour", "day", "week", "month", "year")
-    for word in (unit, f"{unit}s")
-}
+    for name, unit in {
+        "second": "s", "minute": "min", "hour": "h", "day": "day", "week": "week",
+        "month": "month", "year": "year",
+    }.items()
+    for word in (name, f"{name}s")
+}  # fmt: skip
 SHORT_UNITS = {
-    "min": "minute", "mins": "minute", "h": "hour", "hr": "hour", "hrs": "hour", "d": "day",
-    "wk": "week", "yr": "year", "yrs": "year", "y": "year",
+    "min": "min", "mins": "min", "h": "h", "hr": "h", "hrs": "h", "d": "day", "wk": "week",
+    "yr": "year", "yrs": "year", "y": "year",
 }  # fmt: skip
 
 # Units written at the end of a name.

@@ -25,7 +25,7 @@ UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
 PACKED_BY = ("scale_factor", "add_offset")
 
 # Units in which dates are counted, and their lengths in s.
-CALENDAR = {"day": 86400.0, "hour": 3600.0, "minute": 60.0, "s": 1.0}
+CALENDAR = {"day": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
