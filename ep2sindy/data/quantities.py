@@ -122,21 +122,6 @@ HALLTHRUSTER = {
 STEPS = frozenset({"dt", "dts", "deltat", "timestep", "sampletime", "samplinginterval"})
 RATES = frozenset({"fs", "samplingrate", "samplerate", "samplingfrequency", "fshz"})
 
-# Units of time as names, and as endings of names for time.
-TIME_WORDS = frozenset({"t", "time", "times", "elapsed", "in", "the"})
-UNITS_OF_TIME = {
-    word: unit
-    for name, unit in {
-        "second": "s", "minute": "min", "hour": "h", "day": "day", "week": "week",
-        "month": "month", "year": "year",
-    }.items()
-    for word in (name, f"{name}s")
-}  # fmt: skip
-SHORT_UNITS = {
-    "min": "min", "mins": "min", "h": "h", "hr": "h", "hrs": "h", "d": "day", "wk": "week",
-    "yr": "year", "yrs": "year", "y": "year",
-}  # fmt: skip
-
 # Units written at the end of a name.
 ENDINGS = {
     "s": "s", "ms": "ms", "us": "us", "ns": "ns", "m": "m", "cm": "cm", "mm": "mm", "ev": "eV",
@@ -163,18 +148,6 @@ def words_of(name: str) -> tuple[str, ...]:
     parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)
     said = [WORDS.get(part.lower(), part.lower()) for part in parts]
     return tuple(sorted(word for word in said if word))
-
-
-def time_unit_in(name: str) -> str | None:
-    """Unit of time that a name says: `Year` gives `year`, `time_h` gives `hour`; None if it says
-    none. A short one such as `h` counts only beside a word for time.
-    """
-    words = re.findall(r"[a-z]+", last_of(name).lower())
-    units = [word for word in words if word not in TIME_WORDS]
-    if len(units) != 1:
-        return None
-    word = units[0]
-    return UNITS_OF_TIME.get(word) or (SHORT_UNITS.get(word) if len(words) == 2 else None)
 
 
 def step_said(name: str, value: float) -> float | None:

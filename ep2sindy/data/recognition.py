@@ -26,10 +26,9 @@ from ep2sindy.data.quantities import (
     meant_by,
     split_unit,
     step_said,
-    time_unit_in,
 )
 from ep2sindy.data.readers.source import FileSource
-from ep2sindy.library.units import is_count, unit_like
+from ep2sindy.library.units import is_count, time_unit_in, unit_like
 
 MAX_COLUMNS = 32  # an array of at most so many columns is split into separate signals
 
@@ -127,7 +126,9 @@ def _axis(
     options = [e for e in options if e.unit in ("", "1") or converts(axis, e.unit)]
     if not options and axis == "time":
         options = [each for each in rising if is_of(each.unit, unit)]
-        options = options or [e for e in rising if e.unit in ("", "1") and time_unit_in(e.name)]
+        options = options or [
+            e for e in rising if e.unit in ("", "1") and time_unit_in(last_of(e.name))
+        ]
         if not options and source.is_table and rising and rising[0] is held[0]:
             options = rising[:1]  # an increasing first column of a table is its time
             even = ", and rises evenly" if options[0].even else ", and rises"
@@ -441,7 +442,7 @@ def with_time_unit(
 
 def _ending(ours: str, name: str) -> str:
     """Unit at the end of a name, if it converts to the unit of our name; else ""."""
-    unit = (time_unit_in(name) if ours == "time" else None) or split_unit(last_of(name))[1]
+    unit = (time_unit_in(last_of(name)) if ours == "time" else None) or split_unit(last_of(name))[1]
     return unit if unit and converts(ours, unit) else ""
 
 

@@ -17,15 +17,13 @@ import xarray as xr
 
 from ep2sindy.data.fields import channel_length_m
 from ep2sindy.data.numbers import seconds
+from ep2sindy.library.units import calendar_unit, seconds_in
 from ep2sindy.trust.limits import ALWAYS, check_declared
 
 # xarray must keep times as numbers, whatever their attribute `units` says.
 UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
 
 PACKED_BY = ("scale_factor", "add_offset")
-
-# Units in which dates are counted, and their lengths in s.
-CALENDAR = {"day": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -208,11 +206,8 @@ def counted_dates(dates: pd.Series) -> xr.DataArray:
     is no longer than a usual step.
     """
     elapsed_s = seconds(dates.to_numpy(dtype="datetime64[ns]"))
-    step_s = float(np.nanmedian(np.abs(np.diff(elapsed_s)))) if len(elapsed_s) > 1 else 0.0
-    unit, length_s = next(
-        (unit, length_s) for unit, length_s in CALENDAR.items() if length_s <= max(step_s, 1.0)
-    )
-    return xr.DataArray(elapsed_s / length_s, attrs={"units": unit})
+    unit = calendar_unit(float(np.nanmedian(np.abs(np.diff(elapsed_s)))) if len(dates) > 1 else 0.0)
+    return xr.DataArray(elapsed_s / seconds_in(unit), attrs={"units": unit})
 
 
 def leaves(node: Any, path: str = "") -> dict[str, Any]:

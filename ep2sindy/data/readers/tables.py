@@ -45,7 +45,7 @@ def read_excel(path: Path) -> FileSource:
             faults[str(name)] = str(error)
     if not found:
         said = "; ".join(f"sheet {name!r}: {text}" for name, text in faults.items())
-        raise ValueError(said or "it has no sheets")
+        raise ValueError(f"no sheet of it holds a table: {said}")
     words = [
         f"sheet {name!r}: {source.words.replace(' between tabs', '')}"
         for name, source in found.items()
