@@ -255,3 +255,15 @@ def test_a_first_column_of_another_name_is_time_and_said_to_be(tmp_path: Path) -
     (tmp_path / "a.csv").write_text("frame,x\n" + rows(np.arange(30.0), X))
     (note,) = inspect_file(tmp_path / "a.csv").notes()
     assert note.startswith("time is taken from 'frame', which is the first column, and rises even")
+
+
+def test_a_preamble_beside_the_rows_says_units(tmp_path: Path) -> None:
+    """As oscilloscopes of the series TDS write it."""
+    labels = ["Sample Interval,1.5e-06", "Vertical Units,mV", "Horizontal Units,s", "Pt Fmt,Y"]
+    lines = [f"{label},,{t:.9e},{x:.9e}," for label, t, x in zip(labels, T, X, strict=False)]
+    lines += [f",,,{t:.9e},{x:.9e}," for t, x in zip(T[4:], X[4:], strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    found = inspect_file(tmp_path / "a.csv")
+    assert found.time == Variable("3", "s")
+    assert not found.notes()
+    np.testing.assert_allclose(open_field(tmp_path / "a.csv")["column_4"].values, 1e-3 * X)

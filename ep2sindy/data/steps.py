@@ -166,39 +166,29 @@ def are_steps(files: Sequence[str]) -> bool:
     return bool(grid) and lengths <= grid
 
 
-def _numbers(files: Sequence[str]) -> list[int]:
-    """Numbers of the steps in the names of files, if the names differ in one number alone."""
+def _numbers(files: Sequence[str]) -> dict[int, str]:
+    """Number of the step -> file, if the names of the files differ in one number alone."""
     parts = [re.split(r"(\d+)", Path(file).name) for file in files]
     if len({len(each) for each in parts}) != 1:
-        return []
-    columns = list(zip(*parts, strict=True))
-    differing = [column for column in columns if len(set(column)) > 1]
+        return {}
+    differing = [column for column in zip(*parts, strict=True) if len(set(column)) > 1]
     if len(differing) != 1 or not all(map(str.isdecimal, differing[0])):
-        return []
-    return sorted({int(number) for number in differing[0]})
+        return {}
+    return dict(sorted((int(n), file) for n, file in zip(differing[0], files, strict=True)))
 
 
 def join_files(files: Sequence[str], path: Path) -> FileSource:
     """Join the files of the steps of one run along time. path: what they are called together."""
-    numbers = _numbers(files)
-    by_number = sorted(files, key=lambda file: _number_of(file, files))
-    sources = [open_source(Path(file)) for file in by_number]
+    sources = {number: open_source(Path(file)) for number, file in _numbers(files).items()}
     steps = {}
-    for number, source in zip(numbers, sources, strict=True):
+    for number, source in sources.items():
         inside = {
             place: name
             for name, places in step_groups(source.names).arrays.items()
             for place in places.values()
         }
         steps[number] = {inside.get(name, name): (source, name) for name in source.names}
-    return _joined(replace(sources[0], path=path), steps, {}, "files")
-
-
-def _number_of(file: str, files: Sequence[str]) -> int:
-    """The number in a file's name in which it differs from the names of the others."""
-    parts = [re.split(r"(\d+)", Path(each).name) for each in files]
-    (k,) = (k for k, column in enumerate(zip(*parts, strict=True)) if len(set(column)) > 1)
-    return int(re.split(r"(\d+)", Path(file).name)[k])
+    return _joined(replace(next(iter(sources.values())), path=path), steps, {}, "files")
 
 
 # Both.

@@ -44,9 +44,12 @@ def read_hdf5(path: Path) -> FileSource:
         with h5py.File(path) as file:
             found = file[name]
             values, attrs = read_written(found), _attributes(found, name)
+            units = {"units": attrs.pop("units")}
+            if not attrs:  # not packed, as most
+                return xr.DataArray(values, attrs=units)
             packed = xr.Variable([f"dim_{k}" for k in range(values.ndim)], values, attrs)
         plain = xr.decode_cf(xr.Dataset({"it": packed}), decode_coords=False, **UNDECODED)["it"]
-        return xr.DataArray(plain.values, attrs={"units": attrs["units"]})
+        return xr.DataArray(plain.values, attrs=units)
 
     names = names_in_hdf5(path)
     beside = {name: array for name, array in beside.items() if name not in names}

@@ -91,6 +91,8 @@ def layout_of(lines: Sequence[str]) -> Layout:
         if line.strip() and not _is_rule(line)
     ]
     header = header_of(above, n_columns, strict=separator is not None)
+    if columns[0] > 1 and not any(header.units):
+        header = _labels_beside(header, below, columns)
     _check_width(above, below, separator)
     dates = tuple(j for j in range(n_columns) if j not in columns and _are_dates(below, j))
     columns = tuple(sorted((*columns, *dates)))
@@ -339,6 +341,17 @@ def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
     if header.names[0].lower() in TIMES and not any(header.units):
         header = replace(header, units=_units_said(cells, n_columns))
     return replace(header, step_s=step_s)
+
+
+def _labels_beside(header: Header, rows: Sequence[Sequence[str]], columns: Sequence[int]) -> Header:
+    """Header with units and step from a preamble in the columns before the numbers.
+
+    Older oscilloscopes of Tektronix write it there, one line in each row.
+    """
+    labels = [_trim(list(row[: columns[0]])) for row in rows]
+    units = dict(zip(columns, _units_said(labels, len(columns)), strict=True))
+    said = tuple(units.get(j, "") for j in range(len(header.units)))
+    return replace(header, units=said, step_s=header.step_s or _step_s(labels))
 
 
 def _units_said(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, ...]:
