@@ -1,5 +1,7 @@
 """Samples as tables and Datasets, and back: what comes from pandas and xarray is a run at once."""
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -61,6 +63,35 @@ def test_an_index_of_dates_is_time(name: str | None) -> None:
     (run,) = trajectories_of(table)
     assert run.state_names == ("x", "y")
     assert run.t[:3].tolist() == [0.0, 21600.0, 43200.0]
+    assert run.clock == ep.Clock.of("h")
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "seconds"),
+    [("Year", "year", 31557600.0), ("Time (h)", "h", 3600.0), ("time_us", "s", 1e-6)],
+)
+@pytest.mark.parametrize("is_index", [False, True])
+def test_a_time_column_may_be_called_by_its_unit(
+    name: str, unit: str, seconds: float, is_index: bool
+) -> None:
+    table = pd.DataFrame({name: np.arange(40.0), "x": RUN.states[:, 0]})
+    (run,) = trajectories_of(table.set_index(name) if is_index else table)
+    assert run.state_names == ("x",)
+    assert run.clock == ep.Clock.of(unit)
+    np.testing.assert_allclose(run.t, seconds * np.arange(40.0), rtol=1e-12)
+
+
+def test_a_column_of_years_beside_times_is_a_state() -> None:
+    table = pd.DataFrame({"t": np.arange(40.0), "year": RUN.states[:, 0]})
+    (run,) = trajectories_of(table)
+    assert run.state_names == ("year",)
+
+
+def test_a_field_keeps_the_unit_of_time_of_its_file(tmp_path: Path) -> None:
+    table = pd.DataFrame({"day": np.arange(40.0), "x": RUN.states[:, 0]})
+    table.to_csv(tmp_path / "a.csv", index=False)
+    (run,) = trajectories_of(ep.open_field(tmp_path / "a.csv"))
+    assert run.clock == ep.Clock.of("day")
 
 
 def test_a_field_over_a_grid_is_no_run_and_the_error_says_what_makes_one() -> None:

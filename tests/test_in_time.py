@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.data.gaps import describe_gaps, present_rows
+from ep2sindy.data.gaps import describe_breaks, describe_gaps, present_rows
 
 T = np.sort(np.random.default_rng(2).uniform(0.0, 1.0, 400))
 T[[0, -1]] = 0.0, 1.0
@@ -194,3 +194,11 @@ def test_lorenz_is_found_through_gaps() -> None:
         found = ep.discover(table)
     terms = {state: sorted(found.model.terms(state)) for state in "xyz"}
     assert terms == {"x": ["x", "y"], "y": ["x", "x*z", "y"], "z": ["x*y", "z"]}
+
+
+def test_gaps_in_the_times_themselves_are_counted() -> None:
+    t = 1e-6 * np.array([*range(20), *range(60, 80), *range(200, 220)])
+    assert describe_breaks(t).startswith(
+        "the record has 2 gaps: 0.000121 s pass after sample 40, at 7.9e-05 s, where steps"
+    )
+    assert not describe_breaks(t[:20])

@@ -102,7 +102,7 @@ def test_an_inspection_says_what_is_there_and_what_lacks(tmp_path: Path) -> None
         assert part in text, part
     assert found.lacking(["n_i", "R_ion", "V_d"]) == ("V_d",)  # R_ion can be made
     (ready,) = experiments(found)
-    assert "all there for +exp=breathing" in ready
+    assert "all but the time is there for +exp=breathing" in ready
     assert "<table>" in ep.inspect_file(tmp_path / "a.h5")._repr_html_()
 
 
@@ -299,3 +299,72 @@ def test_time_that_does_not_increase_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\(100 follows 100 at row 3\).*give dt_s"):
         ep.open_field(rounded)
     assert list(ep.open_field(rounded, dt_s=0.1)["x"].values) == [1, 2, 0, 3, 1]
+
+
+F, G = N_I[:, :, 0], N_N[:, :, 0]
+
+
+@pytest.mark.parametrize("names", [("arr_0", "arr_1", "arr_2", "arr_3"), ("n_i", "n_n", "p", "q")])
+def test_axes_without_names_are_matched_by_their_lengths_and_confirmed(
+    tmp_path: Path, names: tuple[str, ...]
+) -> None:
+    np.savez(tmp_path / "a.npz", **dict(zip(names, (F, G, T, Z), strict=True)))
+    found = ep.inspect_file(tmp_path / "a.npz")
+    assert found.time == ep.Variable(names[2], "s")
+    assert found.z == ep.Variable(names[3], "m")
+    assert list(found.variables) == list(names[:2])
+    with pytest.raises(ValueError, match=f"time is likely '{names[2]}', of the longest axis: give"):
+        ep.open_field(tmp_path / "a.npz")
+    field = ep.open_field(tmp_path / "a.npz", variables=found.variables, time=found.time, z=found.z)
+    np.testing.assert_array_equal(field[names[0]].values, F)
+
+
+def test_a_last_axis_without_a_name_is_certain(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", n_i=N_I, z=Z, t=T, q=R)
+    np.testing.assert_array_equal(ep.open_field(tmp_path / "a.npz")["r"].values, R)
+    np.savez(tmp_path / "b.npz", n_i=F, z=Z, q=T)
+    np.testing.assert_array_equal(ep.open_field(tmp_path / "b.npz")["time"].values, T)
+
+
+def test_without_coordinates_the_middle_over_the_longest_axis_is_proposed(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", ni=F.T, nn=G.T)
+    found = ep.inspect_file(tmp_path / "a.npz")
+    assert found.variables["n_i"] == ep.Variable("ni[3, :]", "m^-3")
+    text = " ".join(found.notes())
+    assert "time is likely the axis of 40 samples, the longest" in text
+    assert "n_i is taken at the middle, ni[3, :], as an axis has no coordinate" in text
+    assert all(map(found.is_trace, found.variables.values()))
+    field = ep.open_field(tmp_path / "a.npz", variables=found.variables, dt_s=1e-6)
+    np.testing.assert_array_equal(field["n_i"].values, F[:, 3])
+
+
+def test_axes_that_lengths_do_not_tell_apart_are_asked_for(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", ni=F[:NZ], p=T[:NZ], q=Z)
+    found = ep.inspect_file(tmp_path / "a.npz")
+    assert "the 2 axes of 7 points of 'ni' may be 'p' or 'q': name time, z and r" in found.notes()
+    assert "missing a signal for +exp=trace, +exp=discover" in experiments(found)
+    np.savez(tmp_path / "b.npz", ni=N_I, t=T, p=Z, q=R)
+    notes = ep.inspect_file(tmp_path / "b.npz").notes()
+    assert "which of 'p' and 'q' is z and which is r cannot be told: name them" in notes
+
+
+def test_long_lists_are_cut(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", **{f"signal_{k}": WAVE[:, 0, 0] for k in range(200)})
+    lines = ep.inspect_file(tmp_path / "a.npz").lines()
+    assert len(lines) < 70
+    assert "... 140 more arrays" in lines
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        (["a.csv", "b.csv", "notes.md"], r"take its 2 files that end in .csv, '.*runs/\*.csv'"),
+        ([], "is a folder, with no files in it"),
+    ],
+)
+def test_a_folder_says_the_way(tmp_path: Path, files: list[str], said: str) -> None:
+    (tmp_path / "runs").mkdir()
+    for name in files:
+        (tmp_path / "runs" / name).write_text("t,x\n0,1\n")
+    with pytest.raises(ValueError, match=said):
+        ep.inspect_file(tmp_path / "runs")

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from hydra.utils import instantiate
+from nptdms import ChannelObject, TdmsWriter
 from scipy.io import savemat
 
 from ep2sindy.data.conversion import conversion, same_unit
@@ -367,8 +369,25 @@ def write_text(path: Path) -> None:
     path.write_text("t, Id\n0, 1\n")
 
 
+def write_excel(path: Path) -> None:
+    pd.DataFrame({"t": TIME, "Id": I_D}).to_excel(path, index=False, engine="openpyxl")
+
+
+def write_parquet(path: Path) -> None:
+    pd.DataFrame({"t": TIME, "Id": I_D}).to_parquet(path)
+
+
+def write_tdms(path: Path) -> None:
+    with TdmsWriter(path) as writer:
+        writer.write_segment([ChannelObject("a", n, x) for n, x in (("t", TIME), ("Id", I_D))])
+
+
+TABLES = {"table.xlsx": write_excel, "table.parquet": write_parquet, "daq.tdms": write_tdms}
+
 KINDS = {
     **WRITERS,
+    **TABLES,
+    "book.dat": write_excel,
     "classic.cdf": write_netcdf3,
     "field.nc4": write_netcdf4,
     "field.dat": write_hdf5,
@@ -393,7 +412,9 @@ def test_hdf5_is_recognised_as_its_own_library_does(tmp_path: Path, name: str) -
     assert (look_at(tmp_path / name).form == "hdf5") is is_hdf5
 
 
-KNOWN = r"NetCDF, HDF5, MATLAB \(v5, v7.3\) or npz, or end in .csv, .tsv, .* or .zarr: "
+KNOWN = (
+    r"NetCDF, HDF5, MATLAB \(v5, v7.3\), npz, Excel, Parquet or TDMS, or end in .csv, .* or .zarr: "
+)
 
 
 @pytest.mark.parametrize(
@@ -419,10 +440,13 @@ def test_what_is_no_file_of_a_known_kind_is_refused(
         open_field(tmp_path / name, **SETTINGS)
 
 
+CUT = [n for n in (*WRITERS, "table.xlsx", "table.parquet") if not n.endswith("zarr")]
+
+
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.95])
-@pytest.mark.parametrize("name", [n for n in WRITERS if not n.endswith("zarr")])
+@pytest.mark.parametrize("name", CUT)
 def test_a_truncated_file_is_refused(tmp_path: Path, name: str, share: float) -> None:
-    WRITERS[name](tmp_path / name)
+    KINDS[name](tmp_path / name)
     content = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(content[: int(share * len(content))])
     with pytest.raises(ValueError, match=f"{name} (cannot be read|begins with)"):

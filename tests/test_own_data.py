@@ -70,7 +70,7 @@ def test_a_written_config_is_that_of_the_file(folder: Path, capsys: pytest.Captu
     assert config["path"] == "a b.npz"
     assert config["variables"]["n_i"] == {"name": "ni", "unit": "cm^-3", "dims": None}
     assert config["variables"]["null"] == {"name": "null", "unit": "1", "dims": None}
-    assert "the likely unit: check it" in text
+    assert "  # likely: check it" in text
     field = ep.open_field(
         config.pop("path"), **{k: v for k, v in config.items() if k != "_target_"}
     )

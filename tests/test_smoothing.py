@@ -98,6 +98,7 @@ def test_times_read_in_the_unit_that_a_file_counts_them_in() -> None:
     assert year.duration_text(21.0 * year.seconds) == "21 years"
     assert year.rate_unit("1") == "year^-1"
     assert Clock.of("ms") == Clock()  # the second's parts go by prefixes
+    assert Clock.of("1e-06 s") == Clock()
     assert Clock().duration_text(182e-6) == "182 µs"
     assert Clock().rate_unit("m^-3") == "m^-3 s^-1"
     for unit in ("m", "1", "yaer"):

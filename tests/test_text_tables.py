@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ep2sindy.data.fields import clock_of
+from ep2sindy.data.inspection import inspect_file
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import open_field
 from ep2sindy.data.readers.registry import open_source
@@ -157,3 +159,111 @@ def test_a_unit_in_the_header_must_agree_with_the_mapping(tmp_path: Path) -> Non
         open_field(
             tmp_path / "a.csv", variables={"n_i": Variable("n", "m^-3")}, time=Variable("t", "s")
         )
+
+
+TEKTRONIX = (
+    "Model,MSO54\nHorizontal Units,S,\nSample Interval,1.5e-06,\nRecord Length,30,\n"
+    "Vertical Units,mV,\n,,\nLabel,,\nTIME,CH1,\n"
+)
+
+
+def tektronix(path: Path, times: np.ndarray) -> Path:
+    path.write_text(TEKTRONIX + rows(times, X, end=","))
+    return path
+
+
+def test_units_of_a_preamble_are_those_of_the_columns(tmp_path: Path) -> None:
+    field = open_field(tektronix(tmp_path / "a.csv", T))
+    np.testing.assert_allclose(field["CH1"].values, 1e-3 * X, rtol=1e-8)
+    assert field["CH1"].attrs["units"] == "V"
+    assert inspect_file(tmp_path / "a.csv").time == Variable("TIME", "s")
+
+
+def test_a_gap_that_a_preamble_knows_nothing_of_stays_and_is_said(tmp_path: Path) -> None:
+    times = np.where(np.arange(len(T)) < 15, T, T + 4e-4)
+    path = tektronix(tmp_path / "a.csv", times)
+    np.testing.assert_allclose(open_field(path)["time"].values, times, atol=1e-18)
+    notes = " ".join(inspect_file(path).notes())
+    assert "'TIME' have a gap: 0.0004015 pass after row 15, where steps are 1.5e-06" in notes
+    assert "the file says steps of 1.5e-06 s beside them; the times are taken" in notes
+
+
+def test_a_preamble_that_contradicts_the_times_is_said(tmp_path: Path) -> None:
+    path = tektronix(tmp_path / "a.csv", 2.0 * T)
+    np.testing.assert_allclose(open_field(path)["time"].values, 2.0 * T, atol=1e-18)
+    notes = " ".join(inspect_file(path).notes())
+    assert "'TIME' go in steps of 3e-06 s, and the file says steps of 1.5e-06 s beside" in notes
+
+
+def test_rounded_times_take_the_step_of_the_preamble(tmp_path: Path) -> None:
+    path = tektronix(tmp_path / "a.csv", np.round(T, 5))
+    np.testing.assert_allclose(open_field(path)["time"].values, T, atol=1e-18)
+
+
+def test_stretches_that_a_file_joins_are_not_made_even(tmp_path: Path) -> None:
+    path = tektronix(tmp_path / "a.csv", np.concatenate([T[:15], T[:15]]))
+    with pytest.raises(ValueError, match="give dt_s if the steps are equal, or the stretches as"):
+        open_field(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "column", "unit"),
+    [
+        ("rotifers (animals/ml)", "rotifers", "animals/ml"),
+        ("algae [cells/ml]", "algae", "cells/ml"),
+        ("index (foo/bar/baz)", "index", "1"),
+    ],
+)
+def test_a_slash_in_a_unit_is_no_path(tmp_path: Path, name: str, column: str, unit: str) -> None:
+    (tmp_path / "a.csv").write_text(f"t,{name}\n" + rows(T, X))
+    assert inspect_file(tmp_path / "a.csv").variables[column].unit == unit
+    field = open_field(tmp_path / "a.csv")
+    assert field[column].attrs["units"] == unit
+    np.testing.assert_allclose(field[column].values, X, rtol=1e-8)
+
+
+def test_a_count_is_a_unit_only_where_the_file_says_so(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,x\n" + rows(T, X))
+    with pytest.raises(ValueError, match="must be one that converts to SI: 'animals/ml' came"):
+        open_field(
+            tmp_path / "a.csv",
+            variables={"x": Variable("x", "animals/ml")},
+            time=Variable("t", "s"),
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "seconds"),
+    [
+        ("Year", "year", 31557600.0), ("day", "day", 86400.0), ("Time (h)", "h", 3600.0),
+        ("time_h", "h", 3600.0), ("Elapsed days", "day", 86400.0), ("t_min", "min", 60.0),
+    ],
+)  # fmt: skip
+def test_the_name_of_a_column_says_the_unit_of_time(
+    tmp_path: Path, name: str, unit: str, seconds: float
+) -> None:
+    (tmp_path / "a.csv").write_text(f"{name},x\n" + rows(np.arange(30.0), X))
+    time = inspect_file(tmp_path / "a.csv").time
+    assert time is not None
+    assert time.unit == unit
+    field = open_field(tmp_path / "a.csv")
+    np.testing.assert_allclose(field["time"].values, seconds * np.arange(30.0), rtol=1e-12)
+    assert clock_of(field).unit == unit
+
+
+def test_a_first_column_of_another_name_is_time_and_said_to_be(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("frame,x\n" + rows(np.arange(30.0), X))
+    (note,) = inspect_file(tmp_path / "a.csv").notes()
+    assert note.startswith("time is taken from 'frame', which is the first column, and rises even")
+
+
+def test_a_preamble_beside_the_rows_says_units(tmp_path: Path) -> None:
+    """As oscilloscopes of the series TDS write it."""
+    labels = ["Sample Interval,1.5e-06", "Vertical Units,mV", "Horizontal Units,s", "Pt Fmt,Y"]
+    lines = [f"{label},,{t:.9e},{x:.9e}," for label, t, x in zip(labels, T, X, strict=False)]
+    lines += [f",,,{t:.9e},{x:.9e}," for t, x in zip(T[4:], X[4:], strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    found = inspect_file(tmp_path / "a.csv")
+    assert found.time == Variable("3", "s")
+    assert not found.notes()
+    np.testing.assert_allclose(open_field(tmp_path / "a.csv")["column_4"].values, 1e-3 * X)

@@ -14,7 +14,7 @@ import yaml
 from ep2sindy.data.conversion import KNOWN_UNITS
 from ep2sindy.data.inspection import Inspection, check_alike, inspect_file
 from ep2sindy.data.mapping import Variable
-from ep2sindy.data.open import files_of
+from ep2sindy.data.steps import records_of
 from ep2sindy.operating.file_names import FilePattern, propose_pattern
 from ep2sindy.operating.records import point_label
 from ep2sindy.runtime.files import write_text
@@ -38,6 +38,8 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "discover": (),
 }
 
+NOT_STATES = ("R_ion", "V_d")  # what drives a model
+
 
 def main(arguments: Sequence[str], conf: Path) -> None:
     """Inspect files and write a config for them. conf: the folder of the package's configs.
@@ -54,25 +56,30 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         help="write conf/data/NAME.yaml for data=NAME; by default the name of the first file",
     )
     given = parser.parse_args(arguments)
-    paths = files_of(given.path)
+    paths = records_of(given.path[0] if len(given.path) == 1 else given.path)
     found = [inspect_file(path) for path in paths]
     for each in found:
         say("\n".join(each.lines(experiments(each))) + "\n")
-    name = re.sub(r"\W+", "_", given.write or Path(paths[0]).stem).strip("_")
-    pattern = propose_pattern(paths)
+    pattern = propose_pattern([path for path in paths if isinstance(path, str)])
     if pattern:
         say("\n".join(point_lines(pattern)))
+    name = given.write or _word_for(found[0].path)
     if given.write is None:
-        say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
+        data = ["data=recognised", f"data.path={_hydra(given.path[0])}"]
+        is_certain = len(given.path) == 1 and all(each.is_certain for each in found)
+        lines = commands(found[0], data) if is_certain else []
         if pattern and not any(each.found.doubts for each in found):
-            say_next(point_commands(found[0], "recognised", pattern))
+            lines += point_commands(found[0], "recognised", pattern)
+        say_next(lines)
+        say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
         return
     check_alike(found)
+    name = re.sub(r"\W+", "_", name).strip("_")
     path = own_config(name, conf)
     write_text(path, config_text(found, paths))
     say(f"written: {path}")
     of_points = point_commands(found[0], name, pattern) if pattern else []
-    say_next([*commands(found[0], name), *of_points])
+    say_next([*commands(found[0], [f"data={name}"]), *of_points])
 
 
 def say_next(commands: Sequence[str]) -> None:
@@ -112,13 +119,28 @@ def preparation(found: Inspection) -> list[str]:
     return [f"prepare=[{steps}]"] if steps else []
 
 
+def _word_for(path: Path) -> str:
+    """Name of a config for a file; for a pattern without a name of its own, that of its folder."""
+    words = (
+        re.sub(r"\W+", "_", text).strip("_") for text in (path.stem, path.absolute().parent.name)
+    )
+    return next(filter(None, words), "own")
+
+
+def _hydra(text: str) -> str:
+    """A value as Hydra reads it on the command line; quoted unless it is plain."""
+    return text if re.fullmatch(r"[\w/.*?-]+", text) else "'" + text.replace("'", "\\'") + "'"
+
+
 def experiments(found: Inspection) -> list[str]:
     """One line on the experiments that can be run, and one for each set of missing variables."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for name, needed in NEEDS.items():
-        groups.setdefault(found.lacking(needed), []).append(f"+exp={name}")
+        lacking = found.lacking(needed) or (() if found.signals else ("a signal",))
+        groups.setdefault(lacking, []).append(f"+exp={name}")
+    ready = "all there" if found.has_time else "all but the time is there"
     return [
-        f"{'missing ' + ', '.join(lacking) if lacking else 'all there'} for {', '.join(names)}"
+        f"{'missing ' + ', '.join(lacking) if lacking else ready} for {', '.join(names)}"
         for lacking, names in groups.items()
     ]
 
@@ -133,13 +155,13 @@ def own_config(name: str, conf: Path) -> Path:
     return path
 
 
-def config_text(found: Sequence[Inspection], paths: Sequence[str]) -> str:
+def config_text(found: Sequence[Inspection], paths: Sequence[str | list[str]]) -> str:
     """The config of the data group, with a comment on every entry that is only likely."""
     first = found[0]
     variables = {n: Variable(None, u) for n, u in {**KNOWN_UNITS, "T_e_eV": "eV"}.items()}
     variables |= first.variables
     lines = [
-        f"# {in_line(paths[0])}{' ...' if len(paths) > 1 else ''}, as `ep2sindy inspect` found it.",
+        f"# {in_line(str(first.path))}{' ...' * (len(paths) > 1)}, as `ep2sindy inspect` found it.",
         "# A name is the one in the file; null: the file has it not. Correct what is wrong.",
         "_target_: ep2sindy.open_field",
         f"path: {_flow(paths[0] if len(paths) == 1 else list(paths))}",
@@ -183,14 +205,12 @@ def _flow(value: Any) -> str:
 
 
 def _word(found: Inspection, name: str) -> str:
-    return "  # the likely unit: check it" if name in found.found.guesses else ""
+    return "  # likely: check it" if name in found.found.guesses else ""
 
 
-def commands(found: Inspection, name: str) -> list[str]:
-    """Commands that can be run with the config; placeholders in capitals are for the user."""
-    data = [f"data={name}"]
-    if found.time is None and found.dt_s is None:
-        data.append("data.dt_s=STEP")
+def commands(found: Inspection, data: list[str]) -> list[str]:
+    """Commands that can be run with the data; placeholders in capitals are for the user."""
+    data = data if found.has_time else [*data, "data.dt_s=STEP"]
     lines = []
     if not found.lacking(NEEDS["breathing"]):
         zone = [] if found.z is None or found.channel_m else ["data.channel_m=LENGTH"]
@@ -200,6 +220,7 @@ def commands(found: Inspection, name: str) -> list[str]:
         signal = "I_d" if "I_d" in traces else traces[0]
         lines.append(["+exp=trace", *data, f"signal={signal}"])
     states = traces[:3] if len(traces) > 1 else [n for n in ("n_i", "n_n") if n in found.variables]
+    states = states or [n for n in found.signals if n not in NOT_STATES][:2] * (not traces)
     if states:
         lines.append(["+exp=discover", *data, f"trajectory.states=[{','.join(states)}]"])
     return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]

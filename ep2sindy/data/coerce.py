@@ -24,6 +24,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import Relation, complete, relations_of
 from ep2sindy.library.roles import Roles
+from ep2sindy.library.units import SECONDS, Clock, calendar_unit, seconds_in, time_unit_in
 from ep2sindy.runtime.values import check_kind, check_list
 
 if TYPE_CHECKING:
@@ -45,9 +46,10 @@ def trajectories_of(runs: object, *, partial: bool = False) -> list[Trajectory]:
 
     A run is one of the following.
     - A Trajectory.
-    - A pandas DataFrame with a column of times in s (`time`, `t`, `time_s`, `t_s`), an index of
-      that name, or an index of dates. Its other columns are states; columns labelled by a number
-      are called x0, x1 ...
+    - A pandas DataFrame with a column of times in s (`time`, `t`, `time_s`, `t_s`) or in the unit
+      that its name says (`Year`, `Time (h)`), an index of such a name, or an index of dates. Its
+      other columns are states; columns labelled by a number are called x0, x1 ... Results are
+      displayed in the unit of the times.
       Rows that hold a NaN are left out, with the warning `MissingSamples`; if partial, only those
       that hold nothing else, and in the others the state counts as missing.
     - An xarray Dataset whose one dimension is time, such as `Trajectory.to_xarray` gives.
@@ -102,6 +104,8 @@ def _trajectory(run: object, which: str, partial: bool) -> Trajectory:
 
 
 def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
+    from ep2sindy.data.fields import CLOCK  # loads xarray, as the maker of a Dataset has
+
     if tuple(field.dims) != ("time",):
         raise ValueError(
             "a Dataset must have the dimension time alone to be a run: "
@@ -116,12 +120,13 @@ def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
         )
     run = _from_table(field.to_dataframe()[list(field.data_vars)], partial)
     units = {str(name): str(each.attrs.get("units", "1")) for name, each in field.data_vars.items()}
-    return replace(run, units=units)
+    unit = field["time"].attrs.get(CLOCK)
+    return replace(run, units=units, clock=run.clock if unit is None else Clock.of(str(unit)))
 
 
 def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
-    if table.index.name in TIMES or table.index.dtype.kind in "mM":
-        if table.index.name not in TIMES:
+    if _time_unit(table.index.name) or table.index.dtype.kind in "mM":
+        if not _time_unit(table.index.name):
             table = table.rename_axis(index=TIMES[0])  # dates are times, whatever they are called
         table = table.reset_index(allow_duplicates=True)
     table = table.set_axis([_word(name) for name in table.columns], axis="columns")
@@ -131,10 +136,12 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
             "or drop those that repeat"
         )
     times = [name for name in table.columns if name in TIMES]
+    times = times or [name for name in table.columns if _time_unit(name)]
     if len(times) != 1:
         raise ValueError(
-            f"a table must have one time column, called one of {list(TIMES)}, in s: its columns "
-            f"are {list(table.columns)}; rename one with table.rename(columns=...)"
+            f"a table must have one time column, called one of {list(TIMES)}, in s, or by its unit "
+            f"of time, as 'Year' or 'Time (h)': its columns are {list(table.columns)}; rename one "
+            "with table.rename(columns=...)"
         )
     states = [name for name in table.columns if name != times[0]]
     kinds = {name: table[name].dtype for name in (times[0], *states)}
@@ -145,17 +152,17 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
         way_out = "give time in s, as numbers or dates" if times[0] in wrong else "drop them"
         raise ValueError(f"columns of a table must hold real numbers: {wrong} came; {way_out}")
     values = table[states].to_numpy(dtype=np.float64)
-    t = seconds(_times(table[times[0]]))
+    t, clock = _elapsed(table[times[0]])
     absent = np.isnan(values)
     if not absent.any():
-        return Trajectory(t, values, states)
+        return Trajectory(t, values, states, clock=clock)
     if partial and not absent.all(axis=0).any():
         kept = ~absent.all(axis=1)
-        run = Trajectory(t[kept], values[kept], states, missing=absent[kept])
+        run = Trajectory(t[kept], values[kept], states, missing=absent[kept], clock=clock)
         words = describe_missing(t, dict(zip(states, absent.T, strict=True)))
     else:
         kept = present_rows(dict(zip(states, values.T, strict=True)))
-        run = Trajectory(t[kept], values[kept], states)
+        run = Trajectory(t[kept], values[kept], states, clock=clock)
         words = describe_gaps(t[kept], len(table))
     warnings.warn(words, MissingSamples, stacklevel=5)
     return run
@@ -166,10 +173,24 @@ def _word(label: object) -> str:
     return f"x{label}" if isinstance(label, int | np.integer) else str(label)
 
 
-def _times(column: pd.Series) -> np.ndarray:
-    """Times of a column: dates without their time zone; numbers as they are stored."""
-    kind = column.dtype.kind
-    return column.to_numpy(dtype="datetime64[ns]") if kind == "M" else column.to_numpy()
+def _time_unit(name: object) -> str | None:
+    """Unit of a column of times that is called so; None for another column."""
+    return "s" if name in TIMES else time_unit_in(name) if isinstance(name, str) else None
+
+
+def _elapsed(column: pd.Series) -> tuple[Float[np.ndarray, " rows"], Clock]:
+    """Times of a column in s, and their clock: the unit in its name; of dates, by their steps.
+
+    Dates are counted from the first one, without their time zone.
+    """
+    if column.dtype.kind in "mM":
+        is_date = column.dtype.kind == "M"
+        t = seconds(column.to_numpy(dtype="datetime64[ns]") if is_date else column.to_numpy())
+        step_s = float(np.median(np.abs(np.diff(t)))) if len(t) > 1 else 0.0
+        return t, Clock.of(calendar_unit(step_s)) if is_date and np.isfinite(step_s) else SECONDS
+    unit = _time_unit(str(column.name)) or "s"
+    t = seconds(column.to_numpy())
+    return (t, SECONDS) if unit == "s" else (t * seconds_in(unit), Clock.of(unit))
 
 
 def _from_arrays(t: object, x: object) -> Trajectory:

@@ -12,6 +12,7 @@ from ep2sindy.data.fields import COORDINATE_UNITS
 from ep2sindy.library.units import (
     PLAIN,
     check_unit,
+    is_count,
     netcdf_powers,
     registry,
     unit_errors,
@@ -33,13 +34,16 @@ SUFFIX_UNITS = {"eV": "eV", "kHz": "kHz", "MHz": "MHz", "mg_s": "mg/s", "mN": "m
 def to_si(array: xr.DataArray, ours: str, unit: str, *, is_variable: bool = False) -> xr.DataArray:
     """Convert an array to SI, or to the unit of its name's suffix.
 
-    No arithmetic is done if the unit is already right.
+    No arithmetic is done if the unit is already right, nor for a count of named things that the
+    file itself states, such as `animals/ml`.
     is_variable: `ours` names a variable; a variable called z is then not the coordinate.
     Raises ValueError for an unknown unit, one that the suffix cannot hold, or one that
     contradicts the file's own attribute.
     """
-    factor, offset, target = conversion(ours, unit, is_variable=is_variable)
     stated = str(array.attrs.get("units", ""))
+    if is_variable and unit == stated and is_count(unit):
+        return array.drop_attrs().assign_attrs(units=unit)
+    factor, offset, target = conversion(ours, unit, is_variable=is_variable)
     if stated not in ("", "1") and not same_unit(unit, stated):
         raise ValueError(
             f"the unit of {ours} must agree with the file: the mapping says {unit!r}, the file "

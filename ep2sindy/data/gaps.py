@@ -81,6 +81,18 @@ def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
     )
 
 
+def describe_breaks(t: Float[np.ndarray, " samples"]) -> str:
+    """Message with the number of gaps in the times of a record, and the longest; "" for none."""
+    n_gaps, steps = len(between_gaps(t)) - 1, np.diff(t)
+    if not n_gaps:
+        return ""
+    k = int(steps.argmax())
+    return (
+        f"the record has {n_gaps} gap{'s' * (n_gaps > 1)}: {steps[k]:.4g} s pass after sample "
+        f"{k + 1}, at {t[k]:.4g} s, where steps are {np.median(steps):.4g} s; nothing is filled in"
+    )
+
+
 def describe_missing(
     t: Float[np.ndarray, " samples"], absent: Mapping[str, Bool[np.ndarray, " samples"]]
 ) -> str:

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import html
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from ep2sindy.data.arrays import ArrayInfo
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.quantities import MADE_FROM
-from ep2sindy.data.readers.registry import open_source, reader_of
-from ep2sindy.data.recognition import ArrayInfo, Recognised, recognise
+from ep2sindy.data.readers.registry import reader_of
+from ep2sindy.data.readers.source import FileSource
+from ep2sindy.data.recognition import Recognised, recognise
+from ep2sindy.data.steps import files_of, open_record
 from ep2sindy.runtime.screen import WIDTH, html_table, in_line, one_screen, text_table
+
+N_ROWS, N_NOTES = 60, 20  # largest numbers of arrays and notes that are listed
 
 HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
 
@@ -22,15 +28,41 @@ HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
 class Inspection:
     """Result of inspecting a file, with the mapping by which `open_field` opens it.
 
-    kind: kind of file. words: notes on how it was read. found: the recognised mapping.
-    channel_m: length of the channel in m, if the file gives one.
+    kind: kind of file. source: its arrays, and notes on how it was read. found: the recognised
+    mapping.
     """
 
-    path: Path
     kind: str
-    words: str
+    source: FileSource
     found: Recognised
-    channel_m: float | None
+
+    @property
+    def path(self) -> Path:
+        """The file; the pattern or the first file of several that are joined."""
+        return self.source.path
+
+    @property
+    def words(self) -> str:
+        """Notes on how the file was read."""
+        return self.source.words
+
+    @property
+    def channel_m(self) -> float | None:
+        """Length of the channel in m, if the file gives one."""
+        return self.source.channel_m
+
+    @property
+    def has_time(self) -> bool:
+        return self.time is not None or self.dt_s is not None
+
+    @property
+    def is_certain(self) -> bool:
+        """True if `open_field` opens the file without a mapping."""
+        try:
+            self.found.check(self.source)
+        except ValueError:
+            return False
+        return True
 
     @property
     def variables(self) -> dict[str, Variable]:
@@ -69,21 +101,39 @@ class Inspection:
         have = {*self.found.variables, *self.prepare}
         return tuple(name for name in needed if name not in have)
 
+    @property
+    def signals(self) -> list[str]:
+        """Variables that vary and do not increase throughout, as a coordinate does."""
+        held = {each.name: each for each in self.found.held}
+        arrays = {n: held[self._array_of(v)] for n, v in self.variables.items()}
+        return [n for n, one in arrays.items() if one.step is None and one.low < one.high]
+
+    def _array_of(self, variable: Variable) -> str:
+        """Name of the array in the file that a variable is, or is a part of."""
+        name = str(variable.name)
+        whole = any(each.name == name for each in self.found.held)
+        return name if whole else name.rpartition("[")[0]
+
     def is_trace(self, variable: Variable) -> bool:
         """True if a variable depends on time alone, varies, and does not increase throughout."""
-        held = {each.name: each for each in self.found.held}
-        one = held.get(str(variable.name)) or held[str(variable.name).rpartition("[")[0]]
-        n_axes = 1 + (one.name != variable.name)
+        name = self._array_of(variable)
+        one = next(each for each in self.found.held if each.name == name)
+        n_axes = 1 + len(re.findall(r"\d+", str(variable.name)[len(one.name) :]))
         of_time = len(one.lengths) == n_axes and self.found.n_samples in one.lengths
         return of_time and one.step is None and one.low < one.high
 
     def notes(self) -> list[str]:
         """Messages about open decisions, units that are only likely, and missing information."""
         texts = []
-        if self.time is None and self.dt_s is None:
-            texts.append("no time: give the step between samples, data.dt_s=STEP in s")
+        steps = self.source.steps
+        if not self.has_time:
+            what = "step between samples"
+            if steps:
+                what = f"time of one step, of those numbered {steps[0]} to {steps[-1]}"
+            texts.append(f"no time: give the {what}, data.dt_s=STEP in s")
         if self.dt_s is not None:
-            texts.append(f"time in steps of {self.dt_s:.6g} s, as the file says beside its arrays")
+            how = "is the number of a step times" if steps else "in steps of"
+            texts.append(f"time {how} {self.dt_s:.6g} s, as the file says beside its arrays")
         texts += [text.removesuffix(": give it") for text in self.found.guesses.values()]
         texts += list(self.found.questions)
         texts += [
@@ -99,7 +149,9 @@ class Inspection:
     def lines(self, more_notes: Sequence[str] = ()) -> list[str]:
         """Summary of the file, its arrays and the notes on them, in lines of a screen's width."""
         words = f"; {self.words}" if self.words else ""
-        texts = map(in_line, (*self.notes(), *more_notes))
+        own, rows = self.notes(), self._rows()
+        hidden = [f"... {len(own) - N_NOTES} more notes"] * (len(own) > N_NOTES)
+        texts = map(in_line, (*own[:N_NOTES], *hidden, *more_notes))
         notes = [
             line
             for text in texts
@@ -107,7 +159,9 @@ class Inspection:
                                       break_long_words=False, break_on_hyphens=False)
         ]  # fmt: skip
         head = f"{self.path}: {self.kind}{words}"
-        return [in_line(head), *text_table(HEADER, self._rows()), *notes]
+        table = text_table(HEADER, rows[:N_ROWS])
+        more = [f"... {len(rows) - N_ROWS} more arrays"] * (len(rows) > N_ROWS)
+        return [in_line(head), *table, *more, *notes]
 
     def __repr__(self) -> str:
         return one_screen(self.lines(), n_lines=60)
@@ -144,9 +198,10 @@ class Inspection:
         return roles
 
 
-def inspect_file(path: str | Path) -> Inspection:
+def inspect_file(path: str | Path | Sequence[str | Path]) -> Inspection:
     """List the arrays of a file and recognise quantities by names, units, shapes and sizes.
 
+    path: a file, or a pattern or a list of the files of the steps of one run.
     Reads every array once. The result prints as a table, followed by notes on units that are only
     likely and on missing information. `ep2sindy.open_field(path, variables=found.variables,
     time=found.time, z=found.z, r=found.r, dt_s=found.dt_s)` opens the recognised field.
@@ -156,11 +211,10 @@ def inspect_file(path: str | Path) -> Inspection:
     >>> found.variables["n_i"].unit
     'm^-3'
     """
-    path = Path(path)
-    source = open_source(path)
+    source = open_record(path)
     found = recognise(source)
-    kind = reader_of(path).name
-    return Inspection(path, kind, source.words, found, source.channel_m)
+    kind = reader_of(Path(files_of(path)[0])).name
+    return Inspection(kind, source, found)
 
 
 def check_alike(found: Sequence[Inspection]) -> None:

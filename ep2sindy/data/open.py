@@ -7,8 +7,7 @@ converted to SI when a file is opened and nowhere else.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
-from glob import glob
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import xarray as xr
@@ -19,13 +18,14 @@ from ep2sindy.data.fields import CLOCK, DIMS, check_field, mask_outside, write_n
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.readers.netcdf import NETCDF
-from ep2sindy.data.readers.registry import open_source, reader_of
+from ep2sindy.data.readers.registry import reader_of
 from ep2sindy.data.readers.source import UNDECODED, FileSource, damage_named, file_named
 from ep2sindy.data.recognition import recognise
+from ep2sindy.data.steps import open_record
 
 
 def open_field(
-    path: str | Path,
+    path: str | Path | Sequence[str | Path],
     *,
     variables: Mapping[str, Variable | Keys] | None = None,
     time: Variable | Keys | None = None,
@@ -38,13 +38,13 @@ def open_field(
 ) -> xr.Dataset:
     """Open a file as a field, with our names, dimensions and units.
 
-    NetCDF, HDF5, MATLAB v5 and v7.3, npz and Zarr are recognised by content; text is a table or
-    HallThruster.jl's JSON, depending on the file's ending.
+    path: a file of any kind in docs/data.md; of a code that writes a file per step, a pattern such
+        as `dump_*.h5`, or a list. Steps are joined along time, those in groups of one file too.
     variables: our name -> location in the file, as a `Variable` or the same keys from a config;
         those with name None are left out. None: every quantity that names, units and shapes
         identify without doubt, see `ep2sindy.inspect_file`; time, z and r are then found as well.
     time, z, r: the coordinates; None, or name None, if the file has none.
-    dt_s: time step in s, for a file without times; it replaces `time` if both are given.
+    dt_s: time step in s, taken instead of `time`; of a run in numbered steps, the time of one.
     mask: array that is nonzero where there is plasma; elsewhere values become NaN.
     channel_m: length of the channel from z = 0, stored as an attribute; None: as in the file.
     chunks: our dimension -> length, to stream data that exceed memory (needs dask; NetCDF, Zarr).
@@ -59,7 +59,7 @@ def open_field(
     >>> field["n_i"].attrs["units"]
     'm^-3'
     """
-    source = open_source(Path(path))
+    source = open_record(path)
     axes = {"time": time, "z": z, "r": r}
     if variables is None:
         found = recognise(source, dt_s=dt_s, given={n: v for n, v in axes.items() if v})
@@ -70,7 +70,7 @@ def open_field(
         field = _field(source, variables, axes, dt_s, mask, chunks)
     if (length := channel_m or source.channel_m) is not None:
         field.attrs["channel_m"] = length
-    field.attrs["file"] = str(path)
+    field.attrs["file"] = str(source.path)
     for text in unit_doubts(field):
         warnings.warn(text, DoubtfulUnit, stacklevel=2)
     return field
@@ -135,23 +135,6 @@ def _assign_dims(
         with problems.noted():
             placed[ours] = assign_dims(array, ours, wanted[ours].dims, lengths, file_dims)
     return placed
-
-
-def files_of(path: object) -> list[str]:
-    """Expand a path, a pattern such as `runs/*.csv`, or a list of either, to a list of files.
-
-    Raises ValueError for a pattern that matches no file, and for any other value.
-    """
-    if isinstance(path, list | tuple) and path:
-        return [file for each in path for file in files_of(each)]
-    if not isinstance(path, str | Path):
-        raise ValueError(f"a path must be a file, a pattern or a list of them: {path!r} came")
-    if not any(sign in str(path) for sign in "*?[") or Path(path).exists():
-        return [str(path)]
-    found = sorted(glob(str(path), recursive=True))
-    if not found:
-        raise ValueError(f"no file fits the pattern {str(path)!r} in {Path.cwd()}")
-    return found
 
 
 def write_field(field: xr.Dataset, path: str | Path) -> None:

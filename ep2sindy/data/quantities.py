@@ -138,6 +138,11 @@ def split_unit(name: str) -> tuple[str, str | None]:
     return name, None
 
 
+def last_of(name: str) -> str:
+    """Last part of a path such as `plasma/n_i`; a slash in brackets, as in `x (1/ml)`, is none."""
+    return re.split(r"[/.]", re.sub(r"(?<=.)\s*[(\[].*?[)\]]", "", name))[-1]
+
+
 def words_of(name: str) -> tuple[str, ...]:
     """Meanings of the words in a name, sorted: `ionDensity` and `density_ion` give the same."""
     parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)
@@ -147,7 +152,7 @@ def words_of(name: str) -> tuple[str, ...]:
 
 def step_said(name: str, value: float) -> float | None:
     """Time step in s that a scalar of this name gives, or None if it is no step or rate."""
-    *_, last = re.split(r"[/.]", name)
+    last = last_of(name)
     plain = re.sub(r"[^a-z]", "", last.lower())
     if not (np.isfinite(value) and value > 0):
         return None
@@ -162,7 +167,7 @@ def meant_by(name: str) -> set[str]:
     exact = {ours for pattern, ours in HALLTHRUSTER.items() if re.fullmatch(pattern, name)}
     if exact:
         return exact
-    *_, last = re.split(r"[/.]", name)
+    last = last_of(name)
     for text in (last, split_unit(last)[0], name, split_unit(name)[0]):
         if last.isdigit():
             break

@@ -1,34 +1,34 @@
-"""Recognition of a file's arrays by names, units, shapes and sizes, without a mapping.
-
-Contains the description of one array (`ArrayInfo`) and the choice of its unit.
-"""
+"""Recognition of a file's arrays by names, units, shapes and sizes, without a mapping."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count
 from math import isclose
 
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.conversion import SUFFIX_UNITS, conversion, counted_in
-from ep2sindy.data.dimensions import fitting, time_length
+from ep2sindy.data.arrays import TEXT, ArrayInfo, describe_array
+from ep2sindy.data.conversion import SUFFIX_UNITS, conversion
+from ep2sindy.data.dimensions import fitting, match_axes, time_length
 from ep2sindy.data.fields import DIMS
-from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
+from ep2sindy.data.mapping import Keys, Problems, Variable, in_file
 from ep2sindy.data.quantities import (
     AXES,
+    PLASMA,
     QUANTITIES,
     KnownQuantity,
+    last_of,
     likely_time_unit,
     meant_by,
     split_unit,
     step_said,
-    typical,
 )
 from ep2sindy.data.readers.source import FileSource
-from ep2sindy.library.units import unit_like
+from ep2sindy.library.units import is_count, time_unit_in, unit_like
 
 MAX_COLUMNS = 32  # an array of at most so many columns is split into separate signals
 
@@ -91,7 +91,15 @@ def recognise(
         if axis not in axes and (found := _axis(axis, usable, source, questions)) is not None:
             axes[axis] = found
     if dt_s is None:
-        dt_s = _step_s(source, axes, usable)
+        dt_s = _step_s(source, axes, usable, questions)
+    if not source.is_table:
+        rest = [e for e in usable if not meant_by(e.name) & {*DIMS} and not e.dims]
+        known = {axis: one for axis, v in axes.items() if (one := _of(held, v.name))}
+        found_axes = match_axes(
+            [*rest, *known.values()], known, has_step=dt_s is not None,
+            questions=questions, guesses=guesses,
+        )  # fmt: skip
+        axes |= {axis: Variable(one.name, AXES[axis].unit) for axis, one in found_axes.items()}
     counter = axes.pop("time", None) if dt_s is not None else None
     taken = {v.name for v in (*axes.values(), *([counter] if counter else [])) if v.name}
     taken |= {each.name for each in usable if "time" in meant_by(each.name)}
@@ -99,12 +107,13 @@ def recognise(
     for axis, variable in axes.items():
         if (one := _of(held, variable.name)) is not None and axis not in named:
             axes[axis] = with_unit(axis, one, AXES[axis], guesses)
-    lengths = _lengths(axes, held, source, rest, questions)
+    lengths = _lengths(axes, held, source, rest, questions, guesses)
     variables = _variables(rest, axes, held, lengths, questions, guesses)
     time = axes.get("time")
     if "time" not in named and time is not None and (one := _of(held, time.name)):
-        said_s = _stated_step_s(usable)
+        said_s = source.step_s or _stated_step_s(usable)
         axes["time"] = with_time_unit(axes["time"], one, variables, said_s, guesses)
+        _compare_step(axes["time"], one, source.step_s, questions)
     return Recognised(held, variables, axes, dt_s, guesses, questions, lengths.get("time"))
 
 
@@ -119,11 +128,19 @@ def _axis(
     unit = AXES[axis].unit
     rising = [each for each in held if each.step is not None]
     options = [each for each in rising if axis in meant_by(each.name)]
-    options = [e for e in options if e.unit in ("", "1") or is_of(e.unit, unit)]
+    options = [e for e in options if e.unit in ("", "1") or converts(axis, e.unit)]
     if not options and axis == "time":
         options = [each for each in rising if is_of(each.unit, unit)]
+        options = options or [
+            e for e in rising if e.unit in ("", "1") and time_unit_in(last_of(e.name))
+        ]
         if not options and source.is_table and rising and rising[0] is held[0]:
             options = rising[:1]  # an increasing first column of a table is its time
+            even = ", and rises evenly" if options[0].even else ", and rises"
+            questions.append(
+                f"time is taken from {options[0].name!r}, which is the first column{even}, in s: "
+                "name another one if that is wrong, or its unit"
+            )
     if not options and axis == "time":
         questions += [
             f"{each.name!r} does not increase ({each.falls}): sort the rows, drop what repeats, or "
@@ -140,23 +157,63 @@ def _axis(
 
 
 def _step_s(
-    source: FileSource, axes: Mapping[str, Variable], held: Sequence[ArrayInfo]
+    source: FileSource,
+    axes: Mapping[str, Variable],
+    held: Sequence[ArrayInfo],
+    questions: list[str],
 ) -> float | None:
     """Time step in s from outside the time array, or None.
 
-    A step from the preamble counts unless the time array has a unit of time; without one, the
-    array merely numbers the samples. If there is no time array, a scalar such as dt or fs counts.
+    A time array comes first, unless it merely numbers the samples. Without one, the step of a
+    preamble counts, or a scalar such as dt or fs. Times that do not increase must still span what
+    the step says, as rounded ones do.
     """
     time = axes.get("time")
     one = _of(held, time.name) if time is not None else None
-    if source.step_s is not None:
-        return None if one is not None and is_of(one.unit, "s") else source.step_s
-    return _stated_step_s(held) if time is None else None
+    if source.step_s is None:
+        return _stated_step_s(held) if time is None else None
+    if one is not None:
+        return source.step_s if one.is_counter else None
+    for each in held:
+        if not (each.falls and "time" in meant_by(each.name)):
+            continue
+        span_s = (each.shape[0] - 1) * source.step_s
+        if abs(each.high - each.low - span_s) > 0.01 * span_s + 10.0 * source.step_s:
+            questions.append(
+                f"the times of {each.name!r} run over {each.high - each.low:.6g}, and samples in "
+                f"the file's steps of {source.step_s:.6g} s over {span_s:.6g} s: give dt_s if the "
+                "steps are equal, or the stretches as files of their own"
+            )
+            return None
+    return source.step_s
+
+
+def _compare_step(
+    time: Variable, one: ArrayInfo, step_s: float | None, questions: list[str]
+) -> None:
+    """Note times that the step in the file's preamble contradicts, or that leave out samples."""
+    said = "" if step_s is None else f", and the file says steps of {step_s:.6g} s beside them"
+    usual_s = (one.usual or 0.0) * conversion("time", time.unit)[0]
+    if one.gap:
+        questions.append(
+            f"the times of {one.name!r} have a gap: {one.gap}, in {time.unit}{said}; the times are "
+            "taken as they stand"
+        )
+    elif step_s is not None and one.usual and abs(usual_s - step_s) > 0.01 * step_s:
+        questions.append(
+            f"the times of {one.name!r} go in steps of {usual_s:.6g} s{said}; the times are taken"
+        )
 
 
 def _stated_step_s(held: Sequence[ArrayInfo]) -> float | None:
     """Time step in s given by scalars such as dt or fs; None if there is none or they disagree."""
-    scalars = [step_said(e.name, e.low) for e in held if not e.lengths and not e.dims]
+    scalars = [
+        step_said(
+            e.name, e.low * (conversion("time", e.unit)[0] if converts("time", e.unit) else 1)
+        )
+        for e in held
+        if not e.lengths and not e.dims
+    ]
     said = {step for step in scalars if step is not None}
     return said.pop() if len(said) == 1 else None
 
@@ -167,8 +224,12 @@ def _lengths(
     source: FileSource,
     rest: Sequence[ArrayInfo],
     questions: list[str],
+    guesses: dict[str, str],
 ) -> dict[str, int]:
-    """Number of points of each axis; without a time array, samples are counted from the others."""
+    """Number of points of each axis; without a time array, samples are counted from the others.
+
+    If no other axis of them has a coordinate, the longest one is likely time.
+    """
     found = {axis: one.shape for axis, v in axes.items() if (one := _of(held, v.name))}
     lengths = {axis: int(np.prod(shape)) for axis, shape in found.items()}
     if "time" in axes or not rest:
@@ -181,7 +242,14 @@ def _lengths(
         plain = {name: Variable(name, "1") for name in arrays}
         lengths["time"] = time_length(source, arrays, plain, points)[0]
     except ValueError as error:
-        questions.append(str(error))
+        longest = {max(each.lengths, default=0) for each in rest if len(each.lengths) > 1}
+        if len(longest) == 1 and all(e.shape.count(max(longest)) < 2 for e in rest):
+            lengths["time"] = longest.pop()
+            guesses["time"] = (
+                f"time is likely the axis of {lengths['time']} samples, the longest: give it"
+            )
+        else:
+            questions.append(str(error))
     return lengths
 
 
@@ -217,9 +285,9 @@ def _variables(
             found[ours] = Variable(each.name, own_unit(ours, each))
             used.add(ours)
     for each in rest:
-        columns = _columns(each, lengths, used)
-        found |= columns
-        used |= columns.keys()
+        parts = _middle(each, lengths, used, guesses) or _columns(each, lengths, used)
+        found |= parts
+        used |= parts.keys()
     return found
 
 
@@ -247,7 +315,8 @@ def _fits(
     if len(ways) > 1:
         texts = " or ".join(f"[{','.join(way)}]" for way in ways)
         questions.append(f"{one.name!r} of shape {one.shape} may be {texts}: give its dims")
-    if not ways and len(one.lengths) > 1 and not _has_columns(one, lengths):
+    is_apart = _has_columns(one, lengths) or one.shape.count(lengths.get("time", 0)) == 1
+    if not ways and len(one.lengths) > 1 and not is_apart:
         part = ", ".join([":", *["0"] * (len(one.shape) - 1)])
         questions.append(
             f"{one.name!r} of shape {one.shape} has an axis without a coordinate: name it, or take "
@@ -259,7 +328,27 @@ def _fits(
 def _has_columns(one: ArrayInfo, lengths: Mapping[str, int]) -> bool:
     """True if an array consists of a few signals side by side."""
     n = lengths.get("time", 0)
-    return len(one.shape) == 2 and sorted(one.shape)[-1] == n and min(one.shape) <= MAX_COLUMNS
+    fewer = min(one.shape, default=0)
+    return len(one.shape) == 2 and fewer < max(one.shape) == n and fewer <= MAX_COLUMNS
+
+
+def _middle(
+    one: ArrayInfo, lengths: Mapping[str, int], taken: set[str], guesses: dict[str, str]
+) -> dict[str, Variable]:
+    """The signal in the middle of an array on a grid without coordinates, which is only likely."""
+    n = lengths.get("time", 0)
+    if len(one.lengths) < 2 or fitting(one.shape, lengths) or one.shape.count(n) != 1 or one.dims:
+        return {}
+    meant = meant_by(one.name) & {*QUANTITIES} - taken
+    if _has_columns(one, lengths) and not meant & PLASMA:
+        return {}
+    ours = meant.pop() if len(meant) == 1 else _own_name(one.name, taken)
+    part = ", ".join(":" if size == n else str(size // 2) for size in one.shape)
+    name = f"{one.name}[{part}]"
+    guesses[ours] = f"{ours} is taken at the middle, {name}, as an axis has no coordinate: give it"
+    known = QUANTITIES.get(ours)
+    unit = with_unit(ours, one, known, guesses).unit if known else own_unit(ours, one)
+    return {ours: Variable(name, unit)}
 
 
 def _columns(one: ArrayInfo, lengths: Mapping[str, int], taken: set[str]) -> dict[str, Variable]:
@@ -277,12 +366,11 @@ def _columns(one: ArrayInfo, lengths: Mapping[str, int], taken: set[str]) -> dic
 
 def _own_name(name: str, taken: set[str]) -> str:
     """Turn a name in a file into a valid variable name that is not yet taken."""
-    *_, last = re.split(r"[/.]", name)
+    last = last_of(name)
     ours = re.sub(r"\W+", "_", name if last.isdigit() and last != name else last).strip("_")
     ours = f"column_{ours}" if not ours or ours[0].isdigit() else ours
-    while ours in taken:
-        ours += "_"
-    return ours
+    numbers = (f"{ours}_{k}" for k in count(2))
+    return ours if ours not in taken else next(name for name in numbers if name not in taken)
 
 
 # Unit of an array's numbers: stated by the file, in its name, our usual one, or only likely.
@@ -290,6 +378,12 @@ def _own_name(name: str, taken: set[str]) -> str:
 
 def is_of(unit: str, like: str) -> bool:
     return bool(unit) and unit != "1" and unit_like(unit, like=like)
+
+
+def _guess(guesses: dict[str, str], ours: str, text: str) -> None:
+    """Add a message about one of our names to those that there are."""
+    before = guesses.get(ours, "").removesuffix(": give it")
+    guesses[ours] = f"{before}; {text}" if before else text
 
 
 def with_unit(
@@ -307,9 +401,11 @@ def with_unit(
             unit for unit in quantity.others if quantity.fits(one.size, conversion(ours, unit)[0])
         ]
         if likely:
-            guesses[ours] = (
+            _guess(
+                guesses,
+                ours,
                 f"{ours} ({one.name!r}) is about {one.size:.2g}, as if the file counted in "
-                f"{' or '.join(likely)}, and it names no unit: give it"
+                f"{' or '.join(likely)}, and it names no unit: give it",
             )
             stated = likely[0]
     return Variable(one.name, stated or quantity.unit)
@@ -331,21 +427,27 @@ def with_time_unit(
     if one.unit not in ("", "1") or _ending("time", one.name) or one.step is None:
         return time
     for unit in ("s", *AXES["time"].others):
-        if said_s and isclose(one.step * conversion("time", unit)[0], said_s, rel_tol=1e-3):
+        if (
+            said_s
+            and one.usual
+            and isclose(one.usual * conversion("time", unit)[0], said_s, rel_tol=1e-3)
+        ):
             return replace(time, unit=unit)
     likely = likely_time_unit(one.step, variables)
     if likely is None:
         return time
-    guesses["time"] = (
+    _guess(
+        guesses,
+        "time",
         f"time ({one.name!r}) goes in steps of {one.step:.2g}, as if the file counted in {likely}, "
-        "and it names no unit: give it"
+        "and it names no unit: give it",
     )
     return replace(time, unit=likely)
 
 
 def _ending(ours: str, name: str) -> str:
     """Unit at the end of a name, if it converts to the unit of our name; else ""."""
-    unit = split_unit(re.split(r"[/.]", name)[-1])[1]
+    unit = (time_unit_in(last_of(name)) if ours == "time" else None) or split_unit(last_of(name))[1]
     return unit if unit and converts(ours, unit) else ""
 
 
@@ -360,84 +462,12 @@ def converts(ours: str, unit: str, *, is_variable: bool = False) -> bool:
 
 
 def own_unit(ours: str, one: ArrayInfo) -> str:
-    """Unit that the file states, or that a name's ending gives, if it converts; else "1"."""
+    """Unit that the file states, or that a name's ending gives, if it converts; else "1".
+
+    A count of named things that the file states, such as `animals/ml`, stays as it is.
+    """
+    if is_count(one.unit):
+        return one.unit
     suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
     options = (one.unit, split_unit(ours)[1] or "", *suffixes)
     return next((unit for unit in options if converts(ours, unit, is_variable=True)), "1")
-
-
-# Summary of one array in a file: shape, unit, range, missing values, spacing.
-
-
-TEXT = "text or objects"  # problem of arrays that are not numbers
-
-
-@dataclass(frozen=True)
-class ArrayInfo:
-    """Summary of one array in a file: shape, unit, range, missing values, spacing.
-
-    unit: "" if the file states none. low, high: range of the finite values. size: median magnitude
-    of the nonzero values. n_missing: number of NaN or infinite values. step: mean step of an
-    increasing vector, else None. even: True if the steps are equal. falls: where a vector first
-    does not increase, in words. problem: reason why the array cannot be used, or "".
-    """
-
-    name: str
-    shape: tuple[int, ...] = ()
-    kind: str = ""
-    unit: str = ""
-    dims: tuple[str, ...] = ()
-    low: float = np.nan
-    high: float = np.nan
-    size: float = 0.0
-    n_missing: int = 0
-    step: float | None = None
-    even: bool = False
-    falls: str = ""
-    problem: str = ""
-
-    @property
-    def lengths(self) -> tuple[int, ...]:
-        """Lengths of the axes that have more than one point."""
-        return tuple(n for n in self.shape if n > 1)
-
-
-def describe_array(source: FileSource, name: str) -> ArrayInfo:
-    """Read one array and summarise it."""
-    try:
-        array = read_array(source, name, name)
-    except ValueError as error:
-        return ArrayInfo(name, problem=_short(str(error)))
-    values = np.asarray(array.values, dtype=np.float64)
-    finite = values[np.isfinite(values)]
-    stated = counted_in(str(array.attrs.get("units", "") or source.units.get(name, "")))
-    dims = tuple(map(str, array.dims)) if source.dims_named else ()
-    is_vector = values.size in values.shape
-    step, even = _step(values.ravel()) if is_vector else (None, False)
-    return ArrayInfo(
-        name, values.shape, str(array.dtype), stated, dims,
-        float(finite.min()) if finite.size else np.nan,
-        float(finite.max()) if finite.size else np.nan,
-        typical(values), int(values.size - finite.size), step, even,
-        _fall(values.ravel()) if is_vector else "",
-    )  # fmt: skip
-
-
-def _short(text: str) -> str:
-    return TEXT if "real numbers" in text else text
-
-
-def _fall(points: np.ndarray) -> str:
-    """Where points first do not increase, in words; empty if they do."""
-    falls = np.flatnonzero(np.diff(points) <= 0.0)
-    if not falls.size:
-        return ""
-    k = int(falls[0])
-    return f"{points[k + 1]:.9g} follows {points[k]:.9g} at row {k + 2}"
-
-
-def _step(points: np.ndarray) -> tuple[float | None, bool]:
-    steps = np.diff(points)
-    if len(steps) < 2 or not (steps > 0).all():
-        return None, False
-    return float(steps.mean()), bool(np.ptp(steps) <= 1e-3 * steps.mean())

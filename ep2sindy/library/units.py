@@ -103,6 +103,13 @@ def unit_like(text: str, like: str | None = None) -> bool:
     return parsed.is_compatible_with(like)
 
 
+def is_count(unit: str) -> bool:
+    """True for named things counted in a known unit, such as `animals/ml`."""
+    things, _, per = unit.partition("/")
+    is_word = bool(re.fullmatch(r"[^\W\d_]{2,}", things.strip()))
+    return is_word and unit_like(per.strip()) and not unit_like(unit)
+
+
 def netcdf_powers(unit: str) -> str:
     """Rewrite powers in netCDF's notation: `m-3` becomes `m^-3`."""
     return re.sub(r"\b([A-Za-zµ]+)(-?\d+)\b", r"\1^\2", unit)
@@ -126,6 +133,58 @@ def with_prefix(value: float) -> tuple[float, str]:
     return 10.0**-power, prefixes[power]
 
 
+# Units of time as names of columns, and at the end of names for time.
+TIME_WORDS = frozenset({"t", "time", "times", "elapsed", "in"})
+UNITS_OF_TIME = {
+    word: unit
+    for name, unit in {
+        "second": "s", "minute": "min", "hour": "h", "day": "day", "week": "week",
+        "month": "month", "year": "year",
+    }.items()
+    for word in (name, f"{name}s")
+}  # fmt: skip
+SHORT_UNITS = {
+    "s": "s", "sec": "s", "ms": "ms", "us": "us", "ns": "ns", "min": "min", "mins": "min",
+    "h": "h", "hr": "h", "hrs": "h", "d": "day", "wk": "week", "yr": "year", "yrs": "year",
+    "y": "year",
+}  # fmt: skip
+
+# Units in which dates are counted.
+CALENDAR = ("day", "h", "min", "s")
+
+
+def time_unit_in(name: str) -> str | None:
+    """Unit of time that a name says: `Year` gives `year`, `Time (h)` gives `h`; else None.
+
+    A short unit such as `h` counts only beside a word for time.
+    """
+    words = re.findall(r"[^\W\d_]+", name.lower())
+    units = [word for word in words if word not in TIME_WORDS]
+    if len(units) != 1:
+        return None
+    word = units[0].replace("µ", "u").replace("μ", "u")
+    return UNITS_OF_TIME.get(word) or (SHORT_UNITS.get(word) if len(words) == 2 else None)
+
+
+def seconds_in(unit: str) -> float:
+    """Length of a unit of time in s, also of one with a factor such as `1e-6 s`.
+
+    Raises ValueError for text that is not a unit of time.
+    """
+    try:
+        check_unit(unit)
+        return float(registry().Quantity(unit).to("s").magnitude)
+    except unit_errors() as error:
+        raise ValueError(
+            f"a unit of time must be such as 's', 'us', 'h' or 'year': {unit!r} came"
+        ) from error
+
+
+def calendar_unit(step_s: float) -> str:
+    """The longest of day, h, min and s that is no longer than a step."""
+    return next((unit for unit in CALENDAR if seconds_in(unit) <= step_s), "s")
+
+
 @dataclass(frozen=True)
 class Clock:
     """Unit in which times are displayed, such as years; all values and files stay in seconds.
@@ -144,13 +203,7 @@ class Clock:
         """
         if unit == "s":
             return SECONDS
-        try:
-            check_unit(unit)
-            seconds = float(registry().Quantity(1.0, unit).to("s").magnitude)
-        except unit_errors() as error:
-            raise ValueError(
-                f"a unit of time must be such as 's', 'us', 'h' or 'year': {unit!r} came"
-            ) from error
+        seconds = seconds_in(unit)
         return SECONDS if seconds <= 1.0 else Clock(unit, seconds)
 
     def scale(self, duration_s: float) -> tuple[float, str]:

@@ -10,10 +10,10 @@ from typing import Any, Protocol, runtime_checkable
 import xarray as xr
 
 from ep2sindy.data.fields import clock_of, grid_points
-from ep2sindy.data.gaps import describe_gaps
-from ep2sindy.data.open import files_of
+from ep2sindy.data.gaps import describe_breaks, describe_gaps
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.sampling import ZoneAverage
+from ep2sindy.data.steps import records_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone, describe_zone
 from ep2sindy.library.library import Library
@@ -45,10 +45,10 @@ def open_prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
 
 
 def _records(data: Deferred) -> list[Deferred]:
-    """One entry for every file that `data.path` names, or the data themselves."""
+    """One entry for every record that `data.path` names, or the data themselves."""
     path = data.settings.get("path")
-    files = [path] if path is None else files_of(path)
-    return [data] if files == [path] else [data.changed({"path": file}) for file in files]
+    found = [path] if path is None else records_of(path)
+    return [data] if found == [path] else [data.changed({"path": each}) for each in found]
 
 
 def _prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
@@ -188,6 +188,8 @@ def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
     say_doubts(run, field)
     if data.n_samples < field.sizes["time"]:
         run.warn(describe_gaps(data.t, field.sizes["time"]))
+    elif text := describe_breaks(data.t):
+        run.warn(text)
 
 
 def data_summary(data: Trajectory) -> dict[str, Any]:

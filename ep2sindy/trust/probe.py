@@ -28,6 +28,8 @@ def look_through(path: Path, reader: str) -> None:
         head = file.read(10)
     if head.startswith(b"MATLAB 5.0"):
         _matlab(path)
+    elif head.startswith(b"PAR1"):
+        _parquet(path)
     elif not head.startswith(b"CDF"):
         _hdf5(path)
     if reader == "NetCDF":
@@ -41,6 +43,16 @@ def _matlab(path: Path) -> None:
         is_nested = kind in ("struct", "cell", "object")  # their elements become Python objects
         check_declared(repr(name), prod(shape) * (256 if is_nested else 8), path)
     loadmat(path, simplify_cells=True)
+
+
+def _parquet(path: Path) -> None:
+    from pyarrow import parquet
+
+    with parquet.ParquetFile(path) as file:
+        for k in range(file.metadata.num_row_groups):
+            group = file.metadata.row_group(k)
+            check_declared(f"row group {k}", 8 * group.num_rows * group.num_columns, path)
+            file.read_row_group(k, use_threads=False)
 
 
 def _netcdf(path: Path) -> None:

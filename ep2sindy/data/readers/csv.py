@@ -6,6 +6,7 @@ import codecs
 import re
 from functools import partial
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from ep2sindy.data.readers.notation import remove_grouping
-from ep2sindy.data.readers.source import FileSource, Reader
+from ep2sindy.data.readers.source import FileSource, Reader, counted_dates
 from ep2sindy.data.readers.table_layout import COMMENTS, MISSING, SEPARATORS, Layout, layout_of
 
 # Lines and characters examined to find the layout; no known preamble is longer.
@@ -30,12 +31,18 @@ def read_csv(path: Path) -> FileSource:
 
     Decimal commas, thousands separators, a preamble and a line of units are recognised from the
     content; a header is optional. A column's name is the header's without its unit, or else its
-    number from 0; names that repeat become x.0, x.1. Columns of text are left out, and an empty
-    cell is NaN.
+    number from 0; names that repeat become x.0, x.1. ISO dates are counted from the first one.
+    Columns of other text are left out, and an empty cell is NaN.
     """
-    encoding = _encoding(path)
-    layout = layout_of(_first_lines(path, encoding))
-    frame = _frame(path, layout, encoding)
+    with path.open(encoding=_encoding(path), newline=None) as file:
+        return text_source(path, file)
+
+
+def text_source(path: Path, file: TextIO) -> FileSource:
+    """Source of the table in a text, from its beginning; path: the file that the text is from."""
+    layout = layout_of(_first_lines(file))
+    file.seek(0)
+    frame = _frame(file, layout)
     header = layout.header
     names = {header.names[j]: j for j in layout.columns if j < len(header.names)}
     numbered = {str(j): j for j in layout.columns}
@@ -43,6 +50,8 @@ def read_csv(path: Path) -> FileSource:
 
     def read(name: str) -> xr.DataArray:
         j = places[name]
+        if j in layout.dates:
+            return counted_dates(pd.to_datetime(frame[j], format="ISO8601", utc=True))
         values = _numbers(frame[j], name, layout)
         return xr.DataArray(values, attrs={"units": header.units[j]})
 
@@ -53,25 +62,24 @@ def read_csv(path: Path) -> FileSource:
     )  # fmt: skip
 
 
-def _first_lines(path: Path, encoding: str) -> list[str]:
+def _first_lines(file: TextIO) -> list[str]:
     """Read the first lines; raise ValueError if one is too long or has too many cells."""
     lines: list[str] = []
     n_characters = 0
-    with path.open(encoding=encoding, newline=None) as file:
-        while len(lines) < N_LOOKED_AT and n_characters < CHARACTERS_LOOKED_AT:
-            line = file.readline(LONGEST_LINE + 1)
-            if not line:
-                break
-            lines.append(line)
-            n_characters += len(line)
-            n_cells = max(len(line.split(sign)) for sign in SEPARATORS)
-            if n_cells > MAX_COLUMNS or len(line) > LONGEST_LINE:
-                raise ValueError(
-                    f"a table may have up to {MAX_COLUMNS} columns, in lines of up to "
-                    f"{LONGEST_LINE} characters: line {len(lines)} has {n_cells} cells in its "
-                    f"first {len(line)} characters; write one sample per line, and large arrays "
-                    "as npz, HDF5 or NetCDF"
-                )
+    while len(lines) < N_LOOKED_AT and n_characters < CHARACTERS_LOOKED_AT:
+        line = file.readline(LONGEST_LINE + 1)
+        if not line:
+            break
+        lines.append(line)
+        n_characters += len(line)
+        n_cells = max(len(line.split(sign)) for sign in SEPARATORS)
+        if n_cells > MAX_COLUMNS or len(line) > LONGEST_LINE:
+            raise ValueError(
+                f"a table may have up to {MAX_COLUMNS} columns, in lines of up to "
+                f"{LONGEST_LINE} characters: line {len(lines)} has {n_cells} cells in its "
+                f"first {len(line)} characters; write one sample per line, and large arrays "
+                "as npz, HDF5 or NetCDF"
+            )
     return lines
 
 
@@ -90,31 +98,30 @@ def _encoding(path: Path) -> str:
     return "utf-8-sig"
 
 
-def _frame(path: Path, layout: Layout, encoding: str) -> pd.DataFrame:
+def _frame(file: TextIO, layout: Layout) -> pd.DataFrame:
     """Read the rows; raise ValueError for a row with more cells than the first."""
     missing = sorted({*MISSING, *map(str.upper, MISSING), "NaN", "Inf", "-Inf"} - {""})
-    with path.open(encoding=encoding, newline=None) as file:
-        for _ in range(layout.first):  # skipped here: pandas would pair quotes in a preamble
-            next(file)
-        try:
-            return pd.read_csv(
-                file,
-                sep=layout.separator or r"\s+",
-                decimal=layout.decimal,
-                header=None,
-                comment=COMMENTS[0],
-                skipinitialspace=True,
-                na_values=missing,
-                low_memory=False,
-            )
-        except pd.errors.ParserError as error:
-            found = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", str(error))
-            if not found:
-                raise
-            raise ValueError(
-                f"every row must have as many cells as the first, {found[1]}: row {found[2]} has "
-                f"{found[3]}"
-            ) from error
+    for _ in range(layout.first):  # skipped here: pandas would pair quotes in a preamble
+        file.readline()
+    try:
+        return pd.read_csv(
+            file,
+            sep=layout.separator or r"\s+",
+            decimal=layout.decimal,
+            header=None,
+            comment=COMMENTS[0],
+            skipinitialspace=True,
+            na_values=missing,
+            low_memory=False,
+        )
+    except pd.errors.ParserError as error:
+        found = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", str(error))
+        if not found:
+            raise
+        raise ValueError(
+            f"every row must have as many cells as the first, {found[1]}: row {found[2]} has "
+            f"{found[3]}"
+        ) from error
 
 
 def _numbers(column: pd.Series, name: str, layout: Layout) -> Float[np.ndarray, " rows"]:

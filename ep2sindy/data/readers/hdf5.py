@@ -17,6 +17,12 @@ if TYPE_CHECKING:
 
 UNITS = ("units", "Units", "UNITS", "unit", "Unit", "UNIT")
 
+TIMES = ("time", "dt")  # attributes of a group
+
+# Attributes of the grid of a mesh of openPMD, and base units in the order of its standard.
+MESH = ("axisLabels", "gridSpacing", "gridGlobalOffset")
+SI = ("m", "kg", "s", "A", "K", "mol", "cd")
+
 # Attributes by which NetCDF, and other programs too, pack numbers and mark missing ones.
 PACKING = (*PACKED_BY, "_FillValue", "missing_value")
 
@@ -25,19 +31,82 @@ def read_hdf5(path: Path) -> FileSource:
     """Read HDF5; a name is the path of a data set, such as "group/n_i".
 
     Numbers packed by `scale_factor` and `add_offset` are unpacked. Numbers equal to `_FillValue`,
-    and numbers that were never written, are NaN.
+    and numbers that were never written, are NaN. A group's attributes `time` and `dt` are arrays of
+    one number, "group/time". Of openPMD, units and the grids of meshes are read too.
     """
     import h5py
 
+    beside = _beside(path)
+
     def read(name: str) -> xr.DataArray:
+        if name in beside:
+            return beside[name]
         with h5py.File(path) as file:
             found = file[name]
             values, attrs = read_written(found), _attributes(found, name)
+            units = {"units": attrs.pop("units")}
+            if not attrs:  # not packed, as most
+                return xr.DataArray(values, attrs=units)
             packed = xr.Variable([f"dim_{k}" for k in range(values.ndim)], values, attrs)
         plain = xr.decode_cf(xr.Dataset({"it": packed}), decode_coords=False, **UNDECODED)["it"]
-        return xr.DataArray(plain.values, attrs={"units": attrs["units"]})
+        return xr.DataArray(plain.values, attrs=units)
 
-    return FileSource(path, names_in_hdf5(path), read)
+    names = names_in_hdf5(path)
+    beside = {name: array for name, array in beside.items() if name not in names}
+    return FileSource(path, [*names, *beside], read)
+
+
+def _beside(path: Path) -> dict[str, xr.DataArray]:
+    """Times and steps in the attributes of groups, and the grids of openPMD's meshes."""
+    import h5py
+
+    found: dict[str, xr.DataArray] = {}
+
+    def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        where = f"{name}/" if name else ""
+        if isinstance(item, h5py.Group):
+            unit_s = _plain(item.attrs.get("timeUnitSI"))
+            unit = "s" if unit_s == 1.0 else f"{unit_s:.15g} s" if isinstance(unit_s, float) else ""
+            for key in {*TIMES} & {*item.attrs}:
+                if isinstance(value := _plain(item.attrs[key]), int | float):
+                    found[where + key] = xr.DataArray(float(value), attrs={"units": unit})
+        if {*MESH} <= {*item.attrs}:
+            found.update(_mesh(name, item))
+
+    with h5py.File(path) as file:
+        look("", file)
+        file.visititems(look)
+    return found
+
+
+def _mesh(name: str, item: h5py.Group | h5py.Dataset) -> dict[str, xr.DataArray]:
+    """Coordinates of a mesh of openPMD in m, called as its axes, beside the mesh.
+
+    Source: openPMD standard 1.1.0, mesh based records.
+    """
+    import h5py
+
+    one = item if isinstance(item, h5py.Dataset) else next(iter(item.values()), None)
+    if not isinstance(one, h5py.Dataset):
+        return {}
+    labels = [_plain(label) for label in item.attrs["axisLabels"]]
+    unit_m = float(_plain(item.attrs.get("gridUnitSI", 1.0)))
+    within = np.ravel(one.attrs.get("position", np.zeros(len(labels))))
+    where, found = name.rpartition("/")[0], {}
+    numbers = (item.attrs["gridGlobalOffset"], item.attrs["gridSpacing"], within, one.shape)
+    for label, offset, spacing, start, n in zip(labels, *numbers, strict=True):
+        points = unit_m * (float(offset) + float(spacing) * (np.arange(n) + float(start)))
+        found[f"{where}/{label}".lstrip("/")] = xr.DataArray(points, attrs={"units": "m"})
+    return found
+
+
+def _openpmd_unit(attributes: h5py.AttributeManager) -> str:
+    """Unit of a record of openPMD, such as `1e+18 m^-3`; "" for a pure number."""
+    if "unitSI" not in attributes:
+        return ""
+    powers = dict(zip(SI, np.ravel(attributes.get("unitDimension", [])), strict=False))
+    base = " ".join(f"{unit}^{power:g}" for unit, power in powers.items() if power)
+    return f"{float(_plain(attributes['unitSI'])):.15g} {base}" if base else ""
 
 
 def names_in_hdf5(path: Path) -> list[str]:
@@ -104,7 +173,8 @@ def _attributes(found: h5py.Dataset, name: str) -> dict[str, Any]:
             "null; give it a value, or take it away"
         )
     check_packing(name, attrs)
-    return attrs | {"units": next((said[key] or "" for key in UNITS if key in said), "")}
+    units = next((said[key] or "" for key in UNITS if key in said), "")
+    return attrs | {"units": units or _openpmd_unit(found.attrs)}
 
 
 def _plain(value: Any) -> Any:

@@ -64,8 +64,13 @@ def read_npz(path: Path) -> FileSource:
     with ZipFile(path) as archive:
         for member in archive.infolist():
             check_declared(repr(member.filename), member.file_size, path)
+            if not member.filename.endswith(".npy"):
+                raise ValueError(
+                    f"an archive must hold arrays of NumPy alone: it holds {member.filename!r}; "
+                    "unpack it, and name the file in it"
+                )
     with np.load(path, allow_pickle=False) as arrays:
         return FileSource(path, list(arrays), read)
 
 
-NPZ = Reader("npz", read_npz, first_bytes=(b"PK",))
+NPZ = Reader("npz", read_npz, form="zip")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 from ep2sindy.data.readers.csv import CSV
@@ -11,22 +13,29 @@ from ep2sindy.data.readers.hdf5 import HDF5
 from ep2sindy.data.readers.matlab import MATLAB, NPZ
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_at
+from ep2sindy.data.readers.tables import EXCEL, PARQUET
+from ep2sindy.data.readers.tdms import TDMS
 from ep2sindy.data.readers.zarr import ZARR
 from ep2sindy.trust.guard import look_through_first
 from ep2sindy.trust.limits import check_kind
 
 # The order does not matter, since no two readers claim a file equally strongly.
-READERS = (NETCDF, HDF5, MATLAB, NPZ, CSV, HALLTHRUSTER, ZARR)
+READERS = (NETCDF, HDF5, MATLAB, NPZ, EXCEL, PARQUET, TDMS, CSV, HALLTHRUSTER, ZARR)
 
-# First bytes of files other than HDF5 that C libraries parse: MATLAB up to v7, and classic NetCDF
-# with 64-bit sizes. A damaged one may crash the process.
-IN_C = (b"MATLAB 5.0", b"CDF\x05")
+# First bytes of files other than HDF5 that C libraries parse: MATLAB up to v7, classic NetCDF with
+# 64-bit sizes, Parquet. A damaged one may crash the process.
+IN_C = (b"MATLAB 5.0", b"CDF\x05", b"PAR1")
 
 
 def open_source(path: Path) -> FileSource:
     """Open a file with the reader for its kind."""
     reader = reader_of(path)
     look = look_at(path)
+    if reader.package and find_spec(reader.package) is None:
+        raise ValueError(
+            f"{path} is of the kind {reader.name}, which an extra reads: pip install "
+            "'ep2sindy[files]', or save it as CSV"
+        )
     with damage_named(path):
         if look.form == "hdf5" or look.head.startswith(IN_C):
             look_through_first(path, reader.name)
@@ -50,8 +59,13 @@ def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
         return readers[claims.index(max(claims))]
     if look.form == "folder":
         folders = _join_names([e for r in readers if r.form == "folder" for e in r.endings])
+        counts = Counter(each.suffix for each in path.iterdir() if each.is_file() and each.suffix)
+        way_out = ", with no files in it"
+        if counts:
+            (ending, n), *_ = counts.most_common(1)
+            way_out = f"; take its {n} files that end in {ending}, '{path}/*{ending}'"
         raise ValueError(
-            f"a file must come, or a folder that ends in {folders}: {path} is a folder"
+            f"a file must come, or a folder that ends in {folders}: {path} is a folder{way_out}"
         )
     by_ending = [r for r in readers if r.form in ("other", "folder")]
     kinds = _join_names([r.name for r in readers if r not in by_ending])

@@ -8,12 +8,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.fields import channel_length_m
+from ep2sindy.data.numbers import seconds
+from ep2sindy.library.units import calendar_unit, seconds_in
 from ep2sindy.trust.limits import ALWAYS, check_declared
 
 # xarray must keep times as numbers, whatever their attribute `units` says.
@@ -22,6 +26,9 @@ UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
 PACKED_BY = ("scale_factor", "add_offset")
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+Form: TypeAlias = Literal["folder", "hdf5", "workbook", "zip", "other"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,7 @@ class FileSource:
     file gives it outside its arrays. channel_m: length of the thruster's channel in m, if the file
     gives it. words: notes on how the file was read, shown on inspection. is_table: True if the
     arrays are columns of a table. attributes: texts and numbers that describe the whole file.
+    steps: numbers of the steps of a run that was written step by step.
     """
 
     path: Path
@@ -47,6 +55,7 @@ class FileSource:
     words: str = ""
     is_table: bool = False
     attributes: Mapping[str, str | float] = field(default_factory=dict)
+    steps: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         if len(set(self.names)) < len(self.names):
@@ -66,7 +75,7 @@ class FileSource:
 class Look:
     """Features that identify a file's kind. head: its first 16 bytes; empty for a folder."""
 
-    form: Literal["folder", "hdf5", "other"]
+    form: Form
     head: bytes
     ending: str
 
@@ -76,16 +85,17 @@ class Reader:
     """One kind of file: how it is recognised, and how it is opened.
 
     first_bytes: beginnings that no other kind of file has. form, endings: files without such a
-    beginning are recognised by their form (folder, HDF5 or other) together with one of the
-    endings. A reader without endings takes all files of its form that no other reader claims by
-    their ending. form None: recognised by first bytes alone.
+    beginning are recognised by their form together with one of the endings. A reader without
+    endings takes all files of its form that no other reader claims by their ending. form None:
+    recognised by first bytes alone. package: the module of the extra `files` that it needs.
     """
 
     name: str
     open: Callable[[Path], FileSource]
     first_bytes: tuple[bytes, ...] = ()
-    form: Literal["folder", "hdf5", "other"] | None = None
+    form: Form | None = None
     endings: tuple[str, ...] = ()
+    package: str = ""
 
     def claim(self, look: Look) -> int:
         """Strength of the claim: 3 by first bytes, 2 by ending, 1 by form alone, 0 for none."""
@@ -103,7 +113,18 @@ def look_at(path: Path) -> Look:
         return Look("folder", b"", ending)
     with path.open("rb") as file:
         head = file.read(16)
+    if head.startswith(b"PK"):
+        return Look("workbook" if _is_workbook(path) else "zip", head, ending)
     return Look("hdf5" if _is_hdf5(path) else "other", head, ending)
+
+
+def _is_workbook(path: Path) -> bool:
+    """True for a workbook of Excel, which is a zip archive with a folder `xl`."""
+    try:
+        with ZipFile(path) as archive:
+            return any(name.startswith("xl/") for name in archive.namelist())
+    except BadZipFile:  # cut short: the list of its members stands at its end
+        return path.suffix.lower() in (".xlsx", ".xlsm")
 
 
 def _is_hdf5(path: Path) -> bool:
@@ -178,6 +199,15 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
 
     said = {str(k): v for k, v in dataset.attrs.items() if isinstance(v, str | int | float)}
     return FileSource(path, [*stored], read, dims_named=True, channel_m=length, attributes=said)
+
+
+def counted_dates(dates: pd.Series) -> xr.DataArray:
+    """Dates as numbers from the first one, in the longest of days, hours, minutes and seconds that
+    is no longer than a usual step.
+    """
+    elapsed_s = seconds(dates.to_numpy(dtype="datetime64[ns]"))
+    unit = calendar_unit(float(np.nanmedian(np.abs(np.diff(elapsed_s)))) if len(dates) > 1 else 0.0)
+    return xr.DataArray(elapsed_s / seconds_in(unit), attrs={"units": unit})
 
 
 def leaves(node: Any, path: str = "") -> dict[str, Any]:

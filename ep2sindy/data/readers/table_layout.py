@@ -9,10 +9,10 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ep2sindy.data.readers.notation import PLAIN, decimals_shown, is_grouped, is_number
-from ep2sindy.library.units import unit_like
+from ep2sindy.library.units import is_count, unit_like
 
 SEPARATORS = (",", ";", "\t", "|", None)  # None: blanks
 COMMENTS = ("#", "%", "//", "!")
@@ -20,6 +20,9 @@ PARTED = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", None: "bl
 
 # Notations for a missing sample.
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "inf", "-inf"})
+
+# A date of ISO 8601, perhaps with a time of day; other notations may be read in two ways.
+DATE = re.compile(r"\d{4}-\d\d-\d\d([ T]\d\d:\d\d(:\d\d([.,]\d+)?)?\s?(Z|[+-]\d\d:?\d\d)?)?", re.I)
 
 # A ruled line below names.
 RULE = re.compile(r"[\s|+,;]*[-=_]{2,}[-=_\s|+,;]*")
@@ -34,8 +37,9 @@ class Layout:
     """Layout of a table in a text file.
 
     separator: None for blanks. decimal: decimal sign. first: line of the first row, from 0.
-    columns: indices of the columns that hold numbers. has_marks: True if numbers have thousands
-    separators, as in 1,000.5. left_out: names of the other columns, unless these are empty.
+    columns: indices of the columns that hold numbers or dates. dates: of those that hold dates.
+    has_marks: True if numbers have thousands separators, as in 1,000.5. left_out: names of the
+    other columns, unless these are empty.
     """
 
     separator: str | None
@@ -43,15 +47,17 @@ class Layout:
     first: int
     columns: tuple[int, ...]
     header: Header
+    dates: tuple[int, ...] = ()
     has_marks: bool = False
     left_out: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
         """Description of the layout, shown when the file is inspected."""
-        n_columns = len(self.columns)
+        n_columns = len(self.columns) - len(self.dates)
         parts = [f"{n_columns} column{'s' * (n_columns > 1)} of numbers"]
-        parts[0] += f" between {PARTED[self.separator]}" if n_columns > 1 else ""
+        parts[0] += f", {len(self.dates)} of dates" if self.dates else ""
+        parts[0] += f" between {PARTED[self.separator]}" if len(self.columns) > 1 else ""
         parts += ["decimal commas"] if self.decimal == "," else []
         parts += ["marks between thousands"] if self.has_marks else []
         parts += [f"rows from line {self.first + 1}"]
@@ -85,14 +91,18 @@ def layout_of(lines: Sequence[str]) -> Layout:
         if line.strip() and not _is_rule(line)
     ]
     header = header_of(above, n_columns, strict=separator is not None)
+    if columns[0] > 1 and not any(header.units):
+        header = _labels_beside(header, below, columns)
     _check_width(above, below, separator)
+    dates = tuple(j for j in range(n_columns) if j not in columns and _are_dates(below, j))
+    columns = tuple(sorted((*columns, *dates)))
     others = [j for j in range(n_columns) if j not in columns]
     for j in others:
         _check_text([row[j] for row in below if j < len(row)], header.names[j], decimal)
     has_marks = any(is_grouped(cell, decimal) for cell in cells)
     filled = [j for j in others if any("".join(row[j : j + 1]) for row in below)]
     left_out = tuple(header.names[j] for j in filled)
-    return Layout(separator, decimal, first, columns, header, has_marks, left_out)
+    return Layout(separator, decimal, first, columns, header, dates, has_marks, left_out)
 
 
 def split(line: str, separator: str | None) -> list[str]:
@@ -216,6 +226,12 @@ def _check_width(
         )
 
 
+def _are_dates(rows: Sequence[Sequence[str]], column: int) -> bool:
+    """True if a column holds ISO dates in every row that fills it."""
+    cells = [row[column] for row in rows if column < len(row) and not _is_missing(row[column])]
+    return bool(cells) and all(map(DATE.fullmatch, cells))
+
+
 def _check_text(cells: Sequence[str], name: str, decimal: str) -> None:
     """Raise ValueError for a column whose numbers use another decimal sign than the table."""
     other = "," if decimal == "." else "."
@@ -242,6 +258,10 @@ SECONDS = frozenset({"s", "ms", "us", "µs", "μs", "ns", "sec", "second", "seco
 NO_UNIT = frozenset({"", "-", "--", "1", "a.u.", "arb", "arb.", "counts", "none", "n/a"})
 
 NUMBER = re.compile(r"[+-]?[\d.,]+([eE][+-]?\d+)?")
+
+# Labels of the units of the first column and of the others in a preamble.
+UNITS_OF_TIME = re.compile(r"(horizontal|x|time)[ -]?(axis )?units?", re.I)
+UNITS_OF_VALUES = re.compile(r"(vertical|y)[ -]?(axis )?units?", re.I)
 
 # Labels of the time step in s in a preamble.
 STEP = re.compile(
@@ -316,10 +336,44 @@ def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
         return numbered
     if not has_units:
         _check_names(above, n_columns)
+    said = [_unit(cell) for cell in units]
+    header = split_names(names, [*said, *[""] * n_columns][:n_columns])
+    if header.names[0].lower() in TIMES and not any(header.units):
+        header = replace(header, units=_units_said(cells, n_columns))
+    return replace(header, step_s=step_s)
+
+
+def _labels_beside(header: Header, rows: Sequence[Sequence[str]], columns: Sequence[int]) -> Header:
+    """Header with units and step from a preamble in the columns before the numbers.
+
+    Older oscilloscopes of Tektronix write it there, one line in each row.
+    """
+    labels = [_trim(list(row[: columns[0]])) for row in rows]
+    units = dict(zip(columns, _units_said(labels, len(columns)), strict=True))
+    said = tuple(units.get(j, "") for j in range(len(header.units)))
+    return replace(header, units=said, step_s=header.step_s or _step_s(labels))
+
+
+def _units_said(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, ...]:
+    """Units of the columns, time first, as lines of a preamble give them; "" where none does."""
+    time, values = "", [""]
+    for label, *cells in filter(None, above):
+        units = _trim([_unit(cell) for cell in cells])
+        if units and UNITS_OF_TIME.fullmatch(label):
+            time = units[0].lower() if unit_like(units[0].lower(), like="s") else units[0]
+        elif units and UNITS_OF_VALUES.fullmatch(label):
+            values = units
+    values = values * (n_columns - 1) if len(values) == 1 else [*values, *[""] * n_columns]
+    return tuple(unit if unit_like(unit) else "" for unit in map(_plain, [time, *values]))[
+        :n_columns
+    ]
+
+
+def split_names(names: Sequence[str], units: Sequence[str] = ()) -> Header:
+    """Header of columns whose names may hold units, as `Time (s)`; units: those said elsewhere."""
     parted = [_split_name(name) for name in names]
-    units = [_unit(cell) for cell in units] or [unit for _, unit in parted]
-    units = [*units, *[""] * n_columns][:n_columns]
-    return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)), step_s)
+    units = units if any(units) else [unit for _, unit in parted]
+    return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)))
 
 
 def _check_names(above: Sequence[Line], n_columns: int) -> None:
@@ -361,7 +415,8 @@ def _split_name(name: str) -> tuple[str, str]:
         found = pattern.fullmatch(name)
         if found and unit_like(_plain(found[2])):
             return found[1].strip(), found[2].strip()
-    return name, ""
+    found = WITH_UNIT[0].fullmatch(name)
+    return (found[1].strip(), found[2].strip()) if found and is_count(found[2]) else (name, "")
 
 
 def _plain(unit: str) -> str:

@@ -1,0 +1,111 @@
+"""Readers of tables that are no text: workbooks of Excel, and Parquet."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from io import StringIO
+from pathlib import Path
+from zipfile import ZipFile
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from ep2sindy.data.readers.csv import text_source
+from ep2sindy.data.readers.source import FileSource, Reader, counted_dates
+from ep2sindy.data.readers.table_layout import split_names
+from ep2sindy.trust.limits import check_declared
+
+OLD_EXCEL = b"\xd0\xcf\x11\xe0"
+
+# What Excel shows in a cell whose formula has no value.
+FAULTS = frozenset({"#DIV/0!", "#N/A", "#NAME?", "#NULL!", "#NUM!", "#REF!", "#VALUE!"})
+
+
+def read_excel(path: Path) -> FileSource:
+    """Read a workbook of Excel as text of the same cells would be read; see `read_csv`.
+
+    If several sheets hold tables, a column is called "sheet/column". Sheets without rows of numbers
+    are left out.
+    """
+    with path.open("rb") as file:
+        if file.read(len(OLD_EXCEL)) == OLD_EXCEL:
+            raise ValueError("it is of Excel up to 2003: save it as .xlsx or as CSV")
+    with ZipFile(path) as archive:
+        for member in archive.infolist():
+            check_declared(repr(member.filename), member.file_size, path)
+    sheets = pd.read_excel(path, sheet_name=None, header=None, na_filter=False, engine="openpyxl")
+    found: dict[str, FileSource] = {}
+    faults: dict[str, str] = {}
+    for name, frame in sheets.items():
+        try:
+            found[str(name)] = text_source(path, _as_text(frame))
+        except ValueError as error:
+            faults[str(name)] = str(error)
+    if not found:
+        said = "; ".join(f"sheet {name!r}: {text}" for name, text in faults.items())
+        raise ValueError(f"no sheet of it holds a table: {said}")
+    words = [
+        f"sheet {name!r}: {source.words.replace(' between tabs', '')}"
+        for name, source in found.items()
+    ]
+    words += [f"left out: sheet {name!r}, {text}" for name, text in faults.items()]
+    return _joined(path, found, "; ".join(words))
+
+
+def _as_text(frame: pd.DataFrame) -> StringIO:
+    """Cells of a sheet as text separated by tabs."""
+    text = StringIO()
+    writer = csv.writer(text, delimiter="\t", lineterminator="\n")
+    for row in frame.itertuples(index=False):
+        writer.writerow("" if str(cell) in FAULTS else " ".join(str(cell).split()) for cell in row)
+    text.seek(0)
+    return text
+
+
+def _joined(path: Path, sheets: Mapping[str, FileSource], words: str) -> FileSource:
+    """One source of all sheets; of a single one, the columns keep their names."""
+    if len(sheets) == 1:
+        (only,) = sheets.values()
+        return FileSource(
+            path, only.names, only.read, aliases=only.aliases, words=words, step_s=only.step_s,
+            is_table=True,
+        )  # fmt: skip
+    places = {f"{sheet}/{name}": (s, name) for sheet, s in sheets.items() for name in s.names}
+
+    def read(name: str) -> xr.DataArray:
+        source, column = places[name]
+        return source.read(column)
+
+    return FileSource(path, [*places], read, words=words, is_table=True)
+
+
+def read_parquet(path: Path) -> FileSource:
+    """Read a table of Parquet; its index, if it has a name or holds dates, is its first column.
+
+    Units may stand in names, as in `read_csv`. Dates are counted from the first one.
+    """
+    frame = pd.read_parquet(path, engine="pyarrow")
+    if frame.index.name is not None or frame.index.dtype.kind == "M":
+        frame = frame.reset_index()
+    header = split_names([str(name) for name in frame.columns])
+    places = {name: k for k, name in enumerate(header.names)}
+
+    def read(name: str) -> xr.DataArray:
+        column = frame.iloc[:, places[name]]
+        if column.dtype.kind == "M":
+            return counted_dates(column)
+        attrs = {"units": header.units[places[name]]}
+        if column.dtype.kind in "iufb":  # with masked ones, whose missing values become NaN
+            return xr.DataArray(column.to_numpy(dtype=np.float64, na_value=np.nan), attrs=attrs)
+        return xr.DataArray(column.to_numpy(dtype=object), attrs=attrs)
+
+    n_rows, n_columns = frame.shape
+    return FileSource(
+        path, [*places], read, words=f"{n_columns} columns of {n_rows} rows", is_table=True
+    )
+
+
+EXCEL = Reader("Excel", read_excel, first_bytes=(OLD_EXCEL,), form="workbook", package="openpyxl")
+PARQUET = Reader("Parquet", read_parquet, first_bytes=(b"PAR1",), package="pyarrow")
