@@ -19,6 +19,9 @@ from ep2sindy._stubs import dotted_names
 from ep2sindy.app.runner import check_overrides, study_class
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.data.open import write_field
+from ep2sindy.model.comparison import Verdict
+from ep2sindy.report.results import View
+from ep2sindy.studies.library_result import RULES, candidate_metrics
 from ep2sindy.systems.regions import three_regions
 from tests.pages import (
     FENCE,
@@ -225,6 +228,50 @@ def test_output_far_from_its_code_names_its_command() -> None:
         "1\n",
     )
     assert text[slice(*block.place)] == "1\n"
+
+
+def test_the_messages_that_the_faq_quotes_are_those_of_the_package() -> None:
+    """`...` stands for what a message says of names and numbers."""
+    quotes = re.findall(r'^### "(.*)"$', (ROOT / "docs" / "faq.md").read_text("utf-8"), re.M)
+    assert len(quotes) > 20
+    said = messages()
+    lost = [quote for quote in quotes if not any(is_of(quote, text) for text in said)]
+    assert not lost, "\n".join(lost)
+
+
+def messages() -> list[str]:
+    """All texts in the package's code, with `...` for values."""
+    found = []
+    for path in (ROOT / "ep2sindy").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = [getattr(part, "value", None) for part in node.values]
+                found.append("".join(p if isinstance(p, str) else "..." for p in parts))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return found
+
+
+def is_of(quote: str, text: str) -> bool:
+    pieces = [re.escape(piece.strip(" ")) for piece in quote.split("...")]
+    return re.search(".*".join(pieces), text) is not None
+
+
+def test_a_quote_is_of_a_text_that_holds_its_pieces_in_order() -> None:
+    assert is_of("... is short: ...", "the record ... is short: lengthen it")
+    assert not is_of("short ... record", "the record ... is short: lengthen it")
+
+
+def test_every_experiment_is_on_the_page_that_leads_to_one() -> None:
+    page = (ROOT / "docs" / "which.md").read_text("utf-8")
+    assert set(re.findall(r"\+exp=(\w+)", page)) == set(EXPERIMENTS)
+
+
+def test_the_glossary_has_the_verdicts_and_the_columns_of_candidates() -> None:
+    words = (ROOT / "docs" / "glossary.md").read_text("utf-8").replace("\n  ", " ")
+    columns = [m.heading or m.key for m in candidate_metrics("d_pareto") if View.SCREEN in m.view]
+    for name in [*Verdict, *RULES, *columns]:
+        assert re.search(rf"\*{re.escape(name)}\*|\*\*[^*]*\b{re.escape(name)}\b", words), name
 
 
 def has_example(name: str) -> bool:
