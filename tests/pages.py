@@ -5,8 +5,8 @@ the command that gives it stands before it, in a comment that readers do not see
 
     <!-- ep2sindy +exp=breathing verbose=true -->
 
-A number in the text is followed by its place in the `summary.json` of the page's first such
-command, and by its format: `97 %<!-- models.simple.living.share_reaching .0% -->`.
+A number in the text is followed by its place in the `summary.json` of the first command that stands
+on the page in this way, and by its format: `97 %<!-- models.simple.living.share_reaching .0% -->`.
 """
 
 import re
@@ -22,8 +22,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"(±)?[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?")
-COMMAND = re.compile(r"<!-- (ep2sindy .*?) -->\s*$")
-QUOTED = re.compile(r"(\S+(?: %)?)<!-- (\S+) (\.\d[efg%]) -->")
+COMMAND = re.compile(r"<!-- (ep2sindy .*?) -->")
+QUOTED = re.compile(r"(-?[\d.]+(?:e-?\d+)?(?: %)?)<!-- (\S+) (\.\d[efg%]) -->")
 RUN_FOLDER = re.compile(r"(?<=outputs/)(\w+)/[\d_-]+")
 PROGRAMS = (["ep2sindy"], ["python", "-m", "experiments.run"])
 
@@ -64,7 +64,8 @@ def blocks_of(text: str) -> list[Block]:
         for i, j in enumerate(code):
             shown = (fences[output[i]][2], fences[output[i]].span(2)) if is_paired else ()
             found.append(Block(fences[j][1], fences[j][2], *shown))
-        if not code and (command := COMMAND.search(text[: fences[k].start()])):
+        before = text[: fences[k].start()].rstrip().rpartition("\n")[2]
+        if not code and (command := COMMAND.fullmatch(before)):
             found.append(Block("console", command[1], fences[k][2], fences[k].span(2)))
         k = run[-1] + 1
     return found

@@ -24,6 +24,7 @@ import numpy as np
 from ep2sindy.data.open import write_field
 from ep2sindy.systems.regions import three_regions
 from tests.pages import (
+    COMMAND,
     PAGES,
     QUOTED,
     ROOT,
@@ -82,9 +83,16 @@ def console(command: str) -> Ran:
 
 
 def summary_of(text: str) -> dict[str, Any]:
-    """The summary that the numbers in a page's text are from: of its first command."""
-    first = next(block for block in blocks_of(text) if block.language == "console")
-    return console(first.text).summary
+    """The summary that the numbers in a page's text are from: of its first command.
+
+    Raises ValueError for a page without a command.
+    """
+    command = COMMAND.search(text)
+    if command is None:
+        raise ValueError(
+            "numbers of a summary need their command on the page: <!-- ep2sindy ... -->"
+        )
+    return console(command[1]).summary
 
 
 def run(words: list[str], folder: Path) -> str:
@@ -133,14 +141,15 @@ def rewritten(page: Path) -> str:
 def main() -> None:
     parser = ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("page", nargs="*", type=Path, help="such as README.md")
-    pages = parser.parse_args().page or [
-        page for page in PAGES if any(b.printed is not None for b in blocks_of(page.read_text()))
-    ]
-    for page in pages:
+    for page in parser.parse_args().page or PAGES:
+        text = page.read_text("utf-8")
+        if all(block.printed is None for block in blocks_of(text)) and not QUOTED.search(text):
+            continue
         new = rewritten(page)
-        changed = new != page.read_text("utf-8")
+        changed = new != text
         page.write_text(new, "utf-8")
-        print(page.relative_to(ROOT) if page.is_absolute() else page, "changed" if changed else "")
+        name = page.relative_to(ROOT) if page.is_absolute() else page
+        print(name, "changed" if changed else "as before", flush=True)
 
 
 if __name__ == "__main__":

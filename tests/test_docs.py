@@ -41,7 +41,12 @@ from tests.programs import EXPERIMENTS, composed
 from tests.rerun import ran_blocks, rewritten, summary_of
 
 CONF = ROOT / "conf"
-SHOWING = [p for p in PAGES if any(b.language in ("python", "console") for b in blocks(p))]
+SHOWING = [
+    page
+    for page in PAGES
+    if any(b.language in ("python", "console") for b in blocks(page))
+    or QUOTED.search(page.read_text("utf-8"))
+]
 COMMANDS = ("bash", "console")
 WITH_BASH = [page for page in PAGES if any(b.language in COMMANDS for b in blocks(page))]
 
@@ -211,6 +216,11 @@ def test_a_number_in_the_text_is_that_of_the_summary() -> None:
     assert quoted("1", summary, "models.simple.rows.0", ".2e") == "2.31e23"
     with pytest.raises(KeyError, match="no lives in the summary"):
         quoted("1", summary, "models.lives", ".0%")
+
+
+def test_a_number_without_a_command_is_an_error() -> None:
+    with pytest.raises(ValueError, match="need their command on the page"):
+        summary_of("97 %<!-- models.simple.share .0% -->")
 
 
 def test_a_page_is_written_anew(tmp_path: Path) -> None:
