@@ -91,7 +91,18 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width_px", [1280, 390])
-@pytest.mark.parametrize("page", ["index", "tutorial", "pysindy", "mathematics", "reference/data"])
+@pytest.mark.parametrize(
+    "page",
+    [
+        "index",
+        "beginners",
+        "tutorial",
+        "pysindy",
+        "mathematics",
+        "reference/index",
+        "reference/data",
+    ],
+)
 def test_a_page_reads_at_both_widths_and_asks_for_nothing_outside(
     site: str, page: str, width_px: int
 ) -> None:
