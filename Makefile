@@ -8,7 +8,7 @@ TYPED := $(patsubst %,tests/test_%.py,types files numbers fields inspection kalm
 	propellants axial plane thruster model simulation forecast datasets weak constraints search systems given \
 	control_law refine_law operating_plots map_plots report compare experiment_frontier)
 
-.PHONY: attack breathing test test-fast test-slow test-docs lint types docs benchmark clean
+.PHONY: attack breathing test test-fast test-slow test-docs lint types docs docs-numbers benchmark clean
 
 # The stamp is written last: an interrupted installation is taken up again.
 .venv/installed: pyproject.toml constraints.txt
@@ -46,6 +46,11 @@ test-docs: .venv/installed
 # The site, into ./site; a warning is an error. Its notebook is run on the way.
 docs: .venv/installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
+
+# Writes into the pages what their code and commands print now, and the numbers of their runs; look
+# at the difference before you commit it. One page: make docs-numbers PAGES=docs/odes.md
+docs-numbers: .venv/installed
+	$(BIN)/python -m tests.rerun $(PAGES)
 
 benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.startup

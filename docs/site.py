@@ -3,8 +3,11 @@
 Hooks of MkDocs; `make docs` builds the site.
 """
 
+import ast
 import re
 from base64 import b64decode
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,7 +19,8 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from nbclient import NotebookClient
 
-from ep2sindy._stubs import dotted_names
+from docs.docstrings import first_sentence
+from ep2sindy._stubs import Entry, dotted_names
 
 CONTENTS = """# Reference
 
@@ -95,11 +99,35 @@ def _page(title: str, names: list[str]) -> str:
 
 
 def _contents() -> str:
-    lines = [CONTENTS, "| | names |", "|---|---|"]
-    for title, names in reference().items():
-        links = ", ".join(f"[`{name.removeprefix('ep2sindy.')}`][{name}]" for name in names)
-        lines.append(f"| [{title}]({_path(title)}) | {links} |")
-    return "\n".join(lines) + "\n"
+    """All names with their first sentence, page by page."""
+    names = dotted_names()
+    lines = [CONTENTS]
+    for title, here in reference().items():
+        lines += [f"## [{title}]({_path(title)})", "", "| name | what it is |", "|---|---|"]
+        for name in here:
+            link = f"[`{name.removeprefix('ep2sindy.')}`][{name}]"
+            lines.append(f"| {link} | {first_sentence(docstring(names[name]))} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def docstring(entry: Entry) -> str:
+    """Read from the source, for importing all of the face takes long; empty if there is none."""
+    nodes = _module(entry.module).body
+    for node, after in zip(reversed(nodes), [None, *reversed(nodes)], strict=False):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == entry.name:
+            return ast.get_docstring(node) or ""  # of overloads the last
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == entry.name:
+            return ast.get_docstring(ast.Module([after], [])) or "" if after else ""
+    return ""
+
+
+@cache
+def _module(name: str) -> ast.Module:
+    spec = find_spec(name)
+    assert spec is not None
+    assert spec.origin is not None, name
+    return ast.parse(Path(spec.origin).read_text("utf-8"))
 
 
 def notebook_files(path: Path) -> dict[str, str | bytes]:

@@ -2,13 +2,10 @@
 
 import ast
 import doctest
-import io
 import re
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from contextlib import redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
 from shutil import which
@@ -23,13 +20,36 @@ from ep2sindy.app.arguments import mend
 from ep2sindy.app.runner import check_effects, check_overrides, study_class
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.data.open import write_field
+from ep2sindy.model.comparison import Verdict
+from ep2sindy.report.results import View
+from ep2sindy.studies.library_result import RULES, candidate_metrics
 from ep2sindy.systems.regions import three_regions
-from tests.pages import FENCE, PAGES, ROOT, arguments, blocks, commands, difference
+from tests.pages import (
+    FENCE,
+    PAGES,
+    QUOTED,
+    ROOT,
+    arguments,
+    blocks,
+    blocks_of,
+    commands,
+    difference,
+    is_alike,
+    quoted,
+    updated,
+)
 from tests.programs import EXPERIMENTS, composed
+from tests.rerun import ran_blocks, rewritten, summary_of
 
 CONF = ROOT / "conf"
-WITH_PYTHON = [page for page in PAGES if any(b.language == "python" for b in blocks(page))]
-WITH_BASH = [page for page in PAGES if any(b.language == "bash" for b in blocks(page))]
+SHOWING = [
+    page
+    for page in PAGES
+    if any(b.language in ("python", "console") for b in blocks(page))
+    or QUOTED.search(page.read_text("utf-8"))
+]
+COMMANDS = ("bash", "console")
+WITH_BASH = [page for page in PAGES if any(b.language in COMMANDS for b in blocks(page))]
 
 
 def with_mapping(words: list[str], page: Path) -> list[str]:
@@ -39,59 +59,22 @@ def with_mapping(words: list[str], page: Path) -> list[str]:
     return [each for word in words for each in known.get(word, [word])]
 
 
-# Pages whose commands are run in the tests, one after the other, in one empty folder.
-RUN_WHOLE = ("tutorial.md", "odes.md")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: page.name)
-def test_a_page_runs_and_prints_what_it_says(
-    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In an empty folder that holds the files which pages open: run.h5 and grid.nc."""
-    monkeypatch.chdir(tmp_path)
-    if page.name not in RUN_WHOLE:
-        write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, tmp_path / "grid.nc")
-        write_h5(tmp_path / "run.h5")
-    known: dict = {}
-    for block in blocks(page):
-        printed = io.StringIO()
-        if block.language == "python":
-            with redirect_stdout(printed):
-                exec(compile(block.text, page.name, "exec"), known)
-        elif block.language == "bash" and page.name in RUN_WHOLE:
-            for words in commands(block):
-                printed.write(run(words))
+@pytest.mark.parametrize("page", SHOWING, ids=lambda page: page.name)
+def test_a_page_runs_and_prints_what_it_says(page: Path, tmp_path: Path) -> None:
+    text = page.read_text("utf-8")
+    for block, came in ran_blocks(page, text, tmp_path):
         if block.printed is not None:
-            assert not difference(block.printed, printed.getvalue()), block.text
-
-
-def run(words: list[str]) -> str:
-    """What a command of the program prints."""
-    given = arguments(words)
-    assert given is not None, words
-    command = [sys.executable, "-m", "ep2sindy.app.main", *given]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    return result.stdout
-
-
-def write_h5(path: Path) -> None:
-    """What docs/data.md opens: names and units of its own."""
-    import h5py
-
-    with h5py.File(path, "w") as file:
-        file["t"], file["z"] = np.linspace(0.0, 400.0, 201), np.linspace(1.0, 3.0, 11)
-        wave = 1.0 + 0.5 * np.sin(np.linspace(0.0, 40.0, 201))[:, None] * np.ones(11)
-        for name in ("ni", "nn", "rate", "uz"):
-            file[name] = 1e12 * wave
+            assert not difference(block.printed, came), block.text
+    for number, path, form in QUOTED.findall(text):
+        assert is_alike(number, quoted(number, summary_of(text), path, form)), path
 
 
 @pytest.mark.parametrize("page", WITH_BASH, ids=lambda page: page.name)
 def test_a_command_is_one_that_can_be_given(page: Path) -> None:
     """The program's own are composed and built, but for the data; others are known by name."""
     for block in blocks(page):
-        for words in commands(block) if block.language == "bash" else ():
+        for words in commands(block) if block.language in COMMANDS else ():
             try:
                 check_command(with_mapping(words, page))
             except Exception as error:
@@ -210,6 +193,97 @@ def test_pysindys_examples_take_no_more_lines_here() -> None:
 )
 def test_what_is_printed_is_compared(came: str, is_right: bool) -> None:
     assert (not difference("x' = 0.665 x - 1 (±0.002) y\n...\nend", came)) == is_right
+
+
+@pytest.mark.parametrize(
+    ("said", "came", "expected"),
+    [
+        ("a 1\nb 2", "a 3\nb 4\nc 5", "a 3\nb 4\nc 5\n"),  # all that came
+        ("...\nx' = 2 x\n...", "y' = 3\nx' = 4 x\nz' = 5", "...\nx' = 4 x\n...\n"),
+        ("...\nx' = 2 x - 3 x y", "note\nx' = 2 x - 3 x^2 y", "...\nx' = 2 x - 3 x^2 y\n"),
+    ],
+)
+def test_what_came_is_put_in_the_place_of_what_is_said(said: str, came: str, expected: str) -> None:
+    assert updated(said, came) == expected
+
+
+def test_a_line_like_which_nothing_came_is_an_error() -> None:
+    with pytest.raises(ValueError, match="nothing like 'frequency 3'"):
+        updated("...\nfrequency 3", "x' = 2")
+
+
+def test_a_number_in_the_text_is_that_of_the_summary() -> None:
+    summary = {"models": {"simple": {"share": 0.974, "rows": [2.306e23]}}}
+    assert quoted("1 %", summary, "models.simple.share", ".0%") == "97 %"
+    assert quoted("1", summary, "models.simple.rows.0", ".2e") == "2.31e23"
+    with pytest.raises(KeyError, match="no lives in the summary"):
+        quoted("1", summary, "models.lives", ".0%")
+
+
+def test_a_number_without_a_command_is_an_error() -> None:
+    with pytest.raises(ValueError, match="need their command on the page"):
+        summary_of("97 %<!-- models.simple.share .0% -->")
+
+
+def test_a_page_is_written_anew(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("Two:\n\n```python\nprint(2)\n```\n\n```\n1\n```\n\nEnd.\n")
+    assert rewritten(page) == page.read_text().replace("\n1\n", "\n2\n")
+
+
+def test_output_far_from_its_code_names_its_command() -> None:
+    text = "Said.\n\n<!-- ep2sindy +exp=weak seed=1 -->\n```\n1\n```\n\n```text\n2\n```\n"
+    (block,) = blocks_of(text)
+    assert (block.language, block.text, block.printed) == (
+        "console",
+        "ep2sindy +exp=weak seed=1",
+        "1\n",
+    )
+    assert text[slice(*block.place)] == "1\n"
+
+
+def test_the_messages_that_the_faq_quotes_are_those_of_the_package() -> None:
+    """`...` stands for what a message says of names and numbers."""
+    quotes = re.findall(r'^### "(.*)"$', (ROOT / "docs" / "faq.md").read_text("utf-8"), re.M)
+    assert len(quotes) > 20
+    said = messages()
+    lost = [quote for quote in quotes if not any(is_of(quote, text) for text in said)]
+    assert not lost, "\n".join(lost)
+
+
+def messages() -> list[str]:
+    """All texts in the package's code, with `...` for values."""
+    found = []
+    for path in (ROOT / "ep2sindy").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = [getattr(part, "value", None) for part in node.values]
+                found.append("".join(p if isinstance(p, str) else "..." for p in parts))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return found
+
+
+def is_of(quote: str, text: str) -> bool:
+    pieces = [re.escape(piece.strip(" ")) for piece in quote.split("...")]
+    return re.search(".*".join(pieces), text) is not None
+
+
+def test_a_quote_is_of_a_text_that_holds_its_pieces_in_order() -> None:
+    assert is_of("... is short: ...", "the record ... is short: lengthen it")
+    assert not is_of("short ... record", "the record ... is short: lengthen it")
+
+
+def test_every_experiment_is_on_the_page_that_leads_to_one() -> None:
+    page = (ROOT / "docs" / "which.md").read_text("utf-8")
+    assert set(re.findall(r"\+exp=(\w+)", page)) == set(EXPERIMENTS)
+
+
+def test_the_glossary_has_the_verdicts_and_the_columns_of_candidates() -> None:
+    words = (ROOT / "docs" / "glossary.md").read_text("utf-8").replace("\n  ", " ")
+    columns = [m.heading or m.key for m in candidate_metrics("d_pareto") if View.SCREEN in m.view]
+    for name in [*Verdict, *RULES, *columns]:
+        assert re.search(rf"\*{re.escape(name)}\*|\*\*[^*]*\b{re.escape(name)}\b", words), name
 
 
 def has_example(name: str) -> bool:

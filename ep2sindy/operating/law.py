@@ -48,7 +48,7 @@ INSIDE = 1e-6  # tolerance of the hull, in ranges of the parameters
 class OperatingLaw:
     """One structure, coefficients by a law: coef[k] at a point = coef[k] @ functions(parameters).
 
-    functions: of the parameters; library: of the states. coefficients: (state, term) of each row of
+    functions: of the parameters. library: of the states. coefficients: (state, term) of each row of
     coef, in SI. covariance: of coef.ravel(), None if unknown. points: the operating points of the
     fit, columns in the order of the functions' variables.
     """

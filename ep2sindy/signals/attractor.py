@@ -41,7 +41,7 @@ class Cycle:
     """A record that repeats: states = mean + Re sum_k harmonics[k - 1] exp(i k phase).
 
     phase: (samples,) in rad, phase of the fundamental, followed along the record.
-    mean: (n_states,); harmonics: (n_harmonics, n_states), in the states' units.
+    mean: (n_states,). harmonics: (n_harmonics, n_states), in the states' units.
     share: fraction of the pooled variance of the states, without white noise, that the waveform
     explains.
     """

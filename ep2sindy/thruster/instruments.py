@@ -142,7 +142,7 @@ def probe(
 
     The probe is a first-order low-pass with the corner frequency bandwidth_Hz, at rest before the
     first sample; between samples the quantity is linear, for which the result is exact. It lags, as
-    a probe does. name: of a variable; z: place in m from the anode for one on (time, z), linear
+    a probe does. name: of a variable. z: place in m from the anode for one on (time, z), linear
     between cells. noise: standard deviation of white noise of the recorder, in the variable's unit,
     drawn by `seed`. Returns a series on time, with the variable's unit.
     Raises ValueError for a name or place that is not there, or a bandwidth that is not positive.

@@ -374,3 +374,4 @@ OPERATING_POINTS = (
     OperatingPoint(300.0, 6.0),
     OperatingPoint(400.0, 5.0),
 )
+"""The six operating points that the experiments on several points use."""

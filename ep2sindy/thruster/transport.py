@@ -49,7 +49,7 @@ class AnomalousTransport:
 class GaussianTransport:
     """One level with a trough: c = c_far (1 - (1 - trough) exp(-((d - center)/width)^2 / 2)).
 
-    center: distance of the trough from the exit in m; width: its standard deviation in m;
+    center: distance of the trough from the exit in m. width: its standard deviation in m.
     trough: c at its middle, as a share of c_far. Source: GaussianBohm of HallThruster.jl,
     Marks et al., JOSS 8 (2023) 4672.
     """

@@ -63,7 +63,9 @@ THRUSTER_2D = Thruster(
     conduction_factor=2.4,
     series_resistance=2.0,
 )
+"""The thruster that `simulate_2d` takes if none is given."""
 OPERATING_POINT_2D = OperatingPoint(300.0, 5.0, neutral_speed=240.0)
+"""The operating point that `simulate_2d` takes if none is given."""
 
 
 def simulate_2d(
