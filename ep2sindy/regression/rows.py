@@ -61,20 +61,13 @@ class NoisyRows:
         return self.slope @ self.values[:, self.state]
 
     @cached_property
-    def transposed(self) -> tuple[csr_array, csr_array]:
-        """Both matrices transposed, (samples, rows)."""
-        return self.mean.T.tocsr(), self.slope.T.tocsr()
-
-    @cached_property
     def stretches(self) -> Stretches:
         """The windows of all rows as stretches of neighbouring samples."""
         first = np.minimum(*(_ends(matrix)[0] for matrix in (self.mean, self.slope)))
         last = np.maximum(*(_ends(matrix)[1] for matrix in (self.mean, self.slope)))
+        first, last = first.astype(np.int64), last.astype(np.int64)
         starts = np.append(0, np.cumsum(last + 1 - first))
-        mean, slope = np.zeros((2, starts[-1]))
-        for weights, matrix in ((mean, self.mean), (slope, self.slope)):
-            row = np.repeat(np.arange(len(first)), np.diff(matrix.indptr))
-            weights[starts[row] + matrix.indices - first[row]] = matrix.data
+        mean, slope = (_filled(matrix, starts, first) for matrix in (self.mean, self.slope))
         return Stretches(starts, first, mean, slope, band_width(first, last))
 
 
@@ -94,6 +87,17 @@ class Stretches(NamedTuple):
 def _ends(matrix: csr_array) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " rows"]]:
     """First and last sample of every row of a sparse matrix with sorted columns."""
     return matrix.indices[matrix.indptr[:-1]], matrix.indices[matrix.indptr[1:] - 1]
+
+
+def _filled(
+    matrix: csr_array, starts: Int[np.ndarray, " bounds"], first: Int[np.ndarray, " rows"]
+) -> Float[np.ndarray, " weights"]:
+    """Entries of a sparse matrix as stretches, with zeros for entries that it lacks."""
+    if matrix.nnz == starts[-1]:  # it lacks none
+        return matrix.data
+    weights, row = np.zeros(starts[-1]), np.repeat(np.arange(len(first)), np.diff(matrix.indptr))
+    weights[starts[row] + matrix.indices - first[row]] = matrix.data
+    return weights
 
 
 @dataclass(frozen=True, eq=False)
