@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import cholesky_banded
-from scipy.linalg.lapack import dtbtrs
+from scipy.linalg.lapack import dpbtrf, dtbtrs
 
 from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import column_norms
@@ -276,18 +275,24 @@ def _covariance(
     """Covariance of the rows by the samples' noise, from its diagonal downwards."""
     windows = rows.stretches
     own, std = sensitivity[rows.state], rows.noise_std[:, rows.state] / target_scale
-    band = np.zeros((windows.width, len(windows.first)))
+    band = np.zeros((len(windows.first), windows.width))
     banded_covariance(
         windows.starts, windows.first, windows.mean, windows.slope,
         np.square(sensitivity).sum(axis=0), own * std, np.square(std), band,
     )  # fmt: skip
-    return band
+    return band.T
 
 
 def _banded_cholesky(band: Float[np.ndarray, "band rows"]) -> Float[np.ndarray, "band rows"]:
     """Lower Cholesky factor of the covariance, banded since distant windows do not overlap."""
     band[0] += RIDGE * band[0].mean() + ROUNDING**2 / len(band[0])
-    return cholesky_banded(band, lower=True)
+    factor, info = dpbtrf(band, lower=True, overwrite_ab=True)
+    if info or not np.isfinite(factor[0]).all():
+        raise np.linalg.LinAlgError(
+            "the covariance of the rows must be positive definite, and is not to rounding: scale "
+            "the variables to similar sizes, or take wider windows"
+        )
+    return factor
 
 
 def _solve(factor: np.ndarray, values: np.ndarray, *, transposed: bool = False) -> np.ndarray:

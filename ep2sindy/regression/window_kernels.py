@@ -110,7 +110,7 @@ def _both_products(a, b, c, d):
 
 @compiled(**FAST)
 def banded_covariance(starts, first, mean, slope, of_mean, of_both, of_slope, band):
-    """Write the covariance of the rows to band[k, i], of row i + k with row i.
+    """Write the covariance of the rows to band[i, k], of row i + k with row i.
 
     A unit of a sample's noise moves the row by mean times some factor, of the terms, minus slope
     times another, of the target; of_mean, of_both and of_slope (samples,) are the sums over all
@@ -127,14 +127,14 @@ def banded_covariance(starts, first, mean, slope, of_mean, of_both, of_slope, ba
         for s in range(len(m)):
             by_mean[s] = m[s] * mm[s] - w[s] * mw[s]
             by_slope[s] = w[s] * ww[s] - m[s] * mw[s]
-        for j in range(i, min(i + len(band), n_rows)):
+        for j in range(i, min(i + band.shape[1], n_rows)):
             low = max(first[i], first[j])
             shared = min(here.stop, first[j] + starts[j + 1] - starts[j]) - low
             if shared <= 0:
-                band[j - i, i] = 0.0
+                band[i, j - i] = 0.0
                 continue
             a, b = low - first[i], starts[j] + low - first[j]
-            band[j - i, i] = _both_products(
+            band[i, j - i] = _both_products(
                 by_mean[a : a + shared], mean[b : b + shared],
                 by_slope[a : a + shared], slope[b : b + shared],
             )  # fmt: skip
