@@ -188,10 +188,10 @@ class RegressionRows:
         return self.test_rows[:, : len(self.library)]
 
     def train_target(self, equation: int) -> Float[np.ndarray, " train"]:
-        return self._scaled_target(equation, ~self.test)
+        return self._scaled_target(equation, test=False)
 
     def test_target(self, equation: int) -> Float[np.ndarray, " test"]:
-        return self._scaled_target(equation, self.test)
+        return self._scaled_target(equation, test=True)
 
     def coef_scale(self, equation: int) -> Float[np.ndarray, " terms"]:
         """Factors that convert coefficients of scaled columns to SI."""
@@ -249,8 +249,10 @@ class RegressionRows:
         parts = [rows.T @ rows for rows in self.blocks(test=test)]
         return self._grams(sum(parts[1:], parts[0])[None])
 
-    def _scaled_target(self, equation: int, rows: np.ndarray) -> Float[np.ndarray, " _"]:
-        return self.target[rows, equation] / self.target_scale[equation]
+    def _scaled_target(self, equation: int, *, test: bool) -> Float[np.ndarray, " _"]:
+        if len(self.test) <= MOST_ROWS:  # the scaled rows are at hand
+            return (self.test_rows if test else self.train_rows)[:, len(self.library) + equation]
+        return self.target[self.test == test, equation] / self.target_scale[equation]
 
     def _scaled(self, index: Int[np.ndarray, " _"]) -> Float[np.ndarray, "_ columns"]:
         n = len(self.library)
@@ -263,8 +265,8 @@ class RegressionRows:
     def _grams(self, products: np.ndarray) -> Grams:
         n = len(self.library)
         return Grams(
-            xx=products[:, :n, :n],
-            xy=products[:, n:, :n],
+            xx=np.ascontiguousarray(products[:, :n, :n]),  # views would be compiled for anew
+            xy=np.ascontiguousarray(products[:, n:, :n]),
             yy=products.diagonal(axis1=1, axis2=2)[:, n:],
         )
 

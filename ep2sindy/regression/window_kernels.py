@@ -39,17 +39,17 @@ def linearise(columns, table, term, variable, product, weight, departure, coef, 
     all samples would not stay in the cache.
     """
     values = np.empty((len(table), PIECE))
+    _clear(terms.reshape(-1))
+    _clear(sensitivity.reshape(-1))
     for begin in range(0, columns.shape[1], PIECE):
         here = slice(begin, min(begin + PIECE, columns.shape[1]))
         n = here.stop - begin
         for m in range(len(table)):
             value = values[m, :n]
-            value[:] = columns[table[m, 0], here]
+            _copy(columns[table[m, 0], here], value)
             for k in range(1, table.shape[1]):
                 if table[m, k] != len(departure):
                     _multiply(value, columns[table[m, k], here])
-        terms[:, :, here] = 0.0
-        sensitivity[:, here] = 0.0
         for e in range(len(term)):
             value, t, v = values[product[e], :n], term[e], variable[e]
             if v < 0:
@@ -58,6 +58,18 @@ def linearise(columns, table, term, variable, product, weight, departure, coef, 
             else:
                 _add(value, weight[e] * coef[t], sensitivity[v, here])
                 _multiply_add(value, weight[e], departure[v, here], terms[1, t, here])
+
+
+@compiled(**FAST)
+def _copy(values, out):
+    for i in range(len(out)):
+        out[i] = values[i]
+
+
+@compiled(**FAST)
+def _clear(out):
+    for i in range(len(out)):
+        out[i] = 0.0
 
 
 @compiled(**FAST)
@@ -93,7 +105,7 @@ def sum_windows(starts, first, weights, columns, sums):
 @compiled(**FAST)
 def spread_windows(starts, first, weights, rows, samples):
     """Write the sums over rows of their windows times `rows` (rows,), a transposed product."""
-    samples[:] = 0.0
+    _clear(samples)
     for i in range(len(first)):
         window = weights[starts[i] : starts[i + 1]]
         _add(window, rows[i], samples[first[i] : first[i] + len(window)])

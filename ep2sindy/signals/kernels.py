@@ -257,24 +257,24 @@ def likelihoods(steps, values, ratios):
     fill the vector units, and all columns share the gains.
     """
     (n_samples, n_columns), n_ratios = values.shape, len(ratios)
-    rows = np.empty((10, n_ratios))
-    l10, l20, l21, d0, d1 = rows[0], rows[1], rows[2], rows[3], rows[4]
-    d2, variance, weight, gain1, gain2 = rows[5], rows[6], rows[7], rows[8], rows[9]
-    state, total = np.zeros((n_columns, 3, n_ratios)), np.zeros((n_columns, n_ratios))
-    slope_cov = np.empty((3, 3))
+    rows, slope_cov = np.zeros((12, n_ratios)), np.zeros((3, 3))  # each shape takes compilation
+    l10, l20, l21, d0, d1, d2 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
+    variance, weight, gain1, gain2 = rows[6], rows[7], rows[8], rows[9]
+    log_variance, product = rows[10], rows[11]
+    state, total = np.zeros((3 * n_columns, n_ratios)), np.zeros((n_columns, n_ratios))
     for r in range(n_ratios):
         parabola, lower, diagonal = _start(steps, ratios[r], slope_cov)
         (l10[r], l20[r], l21[r]), (d0[r], d1[r], d2[r]) = lower, diagonal
+        product[r] = 1.0
         for j in range(n_columns):
             for a in range(3):
                 for i in range(3):
-                    state[j, a, r] += parabola[a, i] * values[i, j]
-    log_variance, product = np.zeros(n_ratios), np.ones(n_ratios)
+                    state[3 * j + a, r] += parabola[a, i] * values[i, j]
     for k in range(3, n_samples):
         h = steps[k - 1]
         _advance(h, ratios, l10, l20, l21, d0, d1, d2, variance, weight, gain1, gain2)
         for j in range(n_columns):
-            signal, slope, bend = state[j, 0], state[j, 1], state[j, 2]
+            signal, slope, bend = state[3 * j], state[3 * j + 1], state[3 * j + 2]
             _follow(h, values[k, j], d0, gain1, gain2, weight, signal, slope, bend, total[j])
         for r in range(n_ratios):
             product[r] *= variance[r]
