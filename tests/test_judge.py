@@ -1,5 +1,6 @@
 """The test of a regression's residuals: fast kernels against plain forms, and blocks of records."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,10 @@ from scipy.sparse import csr_array, diags_array
 import ep2sindy as ep
 from ep2sindy.discovery import choice
 from ep2sindy.discovery.choice import spread_blocks
-from ep2sindy.regression.rows import NoisyRows
+from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.test_functions import spectral_change_point
-from ep2sindy.regression.whitening import _covariance
+from ep2sindy.regression.whitening import _covariance, _Sums
+from ep2sindy.regression.window_kernels import linearise, spread_windows, sum_windows
 from ep2sindy.signals.kernels import likelihood, smooth
 
 
@@ -19,36 +21,69 @@ def plain_covariance(rows: NoisyRows, sensitivity: np.ndarray, target_scale: flo
     """The sum over variables of M M', where M is the rows' change per unit noise of a variable."""
     total = np.zeros((rows.mean.shape[0],) * 2)
     for v, std in enumerate(rows.noise_std.T):
-        change = rows.mean @ diags_array(sensitivity[:, v])
+        change = rows.mean @ diags_array(sensitivity[v])
         if v == rows.state:
             change = change - rows.slope @ diags_array(std) / target_scale
         total += (change @ change.T).toarray()
     return total
 
 
-@pytest.mark.parametrize("order", ["as they come", "shuffled"])
-@pytest.mark.parametrize("steps", ["even", "uneven"])
-def test_the_banded_covariance_is_that_of_sparse_products(steps: str, order: str) -> None:
+def rows_of_lorenz(steps: str, functions: Sequence[str] = ()) -> RegressionRows:
     rng = np.random.default_rng(0)
     run = ep.lorenz().trajectory(noise=0.02, rng=0).window(0, 400)
     if steps == "uneven":
         kept = np.sort(rng.choice(400, size=300, replace=False))
         run = ep.Trajectory(run.t[kept], run.states[kept], run.state_names)
-    problems = ep.Weak(split=ep.RandomSplit(0.0)).assemble(
-        [run], ep.polynomial(run.state_names, degree=2), rng=rng
-    )
-    rows = problems[1].noisy
+    library = ep.polynomial(run.state_names, degree=2, functions=functions)
+    return ep.Weak(split=ep.RandomSplit(0.0)).assemble([run], library, rng=rng)[1]
+
+
+@pytest.mark.parametrize("order", ["as they come", "shuffled"])
+@pytest.mark.parametrize("steps", ["even", "uneven"])
+def test_the_banded_covariance_is_that_of_sparse_products(steps: str, order: str) -> None:
+    rng, rows = np.random.default_rng(0), rows_of_lorenz(steps).noisy
     assert rows is not None
     if order == "shuffled":
         mixed = rng.permutation(rows.mean.shape[0])
         rows = replace(rows, mean=csr_array(rows.mean[mixed]), slope=csr_array(rows.slope[mixed]))
-    sensitivity = rng.normal(size=rows.noise_std.shape)
+    sensitivity = rng.normal(size=rows.noise_std.T.shape)
     band, plain = _covariance(rows, sensitivity, 3.0), plain_covariance(rows, sensitivity, 3.0)
     n = len(plain)
     for k in range(n):
         below = np.diagonal(plain, -k)
         found = band[k, : n - k] if k < len(band) else np.zeros(n - k)
         np.testing.assert_allclose(found, below, atol=1e-12 * plain.max())
+
+
+def test_sums_over_windows_are_sparse_products() -> None:
+    rows, rng = rows_of_lorenz("uneven").noisy, np.random.default_rng(0)
+    assert rows is not None
+    windows, (n_rows, n_samples) = rows.stretches, rows.mean.shape
+    columns, weights = rng.normal(size=(4, n_samples)), rng.normal(size=n_rows)
+    for stretch, matrix in ((windows.mean, rows.mean), (windows.slope, rows.slope)):
+        sums, spread = np.empty((4, n_rows)), np.empty(n_samples)
+        sum_windows(windows.starts, windows.first, stretch, columns, sums)
+        spread_windows(windows.starts, windows.first, stretch, weights, spread)
+        np.testing.assert_allclose(sums.T, matrix @ columns.T, atol=1e-12 * abs(sums).max())
+        np.testing.assert_allclose(spread, matrix.T @ weights, atol=1e-12 * abs(spread).max())
+
+
+@pytest.mark.parametrize("kept", [[0, 4, 7, 9, 12], list(range(13))])
+def test_compiled_terms_and_slopes_are_those_of_the_library(kept: list[int]) -> None:
+    problem, rng = rows_of_lorenz("even", functions=["sin"]), np.random.default_rng(0)
+    library, scale = problem.library, problem.theta_scale
+    x, moved, coef = rng.normal(size=(3, 700)), rng.normal(size=(3, 700)), np.zeros(len(library))
+    coef[kept] = rng.normal(size=len(kept))
+    slopes = library.jacobian(x.T) / scale
+    plain = library.evaluate(x.T) / scale
+    change = np.einsum("vst,vs->st", slopes, moved)
+    sums = _Sums.of(problem, np.isin(np.arange(len(library)), kept))
+    columns = sums.products.with_functions(np.concatenate([x, np.ones((1, 700))]), axis=0)
+    terms, sensitivity = np.empty((2, len(kept), 700)), np.empty((3, 700))
+    linearise(columns, sums.table, *sums.entries, moved, coef[kept], terms, sensitivity)
+    np.testing.assert_allclose(terms[0], plain.T[kept], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(terms[1], (plain + change).T[kept], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(sensitivity, slopes @ coef, rtol=1e-12, atol=1e-12)
 
 
 def test_long_records_are_tested_in_blocks_spread_over_them() -> None:

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.linalg import cho_factor, cho_solve, null_space
 
-from ep2sindy.signals.kalman import KalmanSmoother, most_likely_ratio
-from ep2sindy.signals.kernels import likelihood, smooth
+from ep2sindy.signals.kalman import KalmanSmoother, most_likely_ratios
+from ep2sindy.signals.kernels import likelihood, likelihoods, smooth
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 
@@ -150,10 +150,18 @@ def test_smoother_protocol_returns_the_parts_of_the_estimate() -> None:
     assert not estimate.smoothed.flags.writeable
 
 
+@every_time
+def test_ratios_side_by_side_have_the_likelihoods_of_each_alone(t: np.ndarray) -> None:
+    ratios = 10.0 ** np.linspace(-14.0, 4.0, 21)
+    found = likelihoods(np.diff(t), NOISE, ratios)
+    alone = [likelihood(np.diff(t), NOISE, ratio)[0] for ratio in ratios]
+    assert found == pytest.approx(np.transpose(alone), rel=1e-12, abs=1e-10)
+
+
 def test_the_ratio_found_is_the_most_likely() -> None:
     run = lorenz().trajectory(noise=0.05, rng=np.random.default_rng(2))
     steps, values = np.ones(499), run.states[:500, :1].copy()
-    found = most_likely_ratio(steps, values)
+    (found,) = most_likely_ratios(steps, values)
     fine = np.arange(-14.0, 4.0, 0.02)
     best = fine[np.argmax([likelihood(steps, values, 10.0**r)[0][0] for r in fine])]
     assert found == pytest.approx(best, abs=0.02)

@@ -382,7 +382,7 @@ def _whitened_terms(
     coef = np.zeros(len(terms))
     order = [problem.library.index(name) for name in candidate.terms]
     coef[order] = candidate.coef / scale[order]
-    rows = whitened_rows(problem, terms, coef, n_steps=n_steps, settled=settled)
+    rows = whitened_rows(problem, terms, coef, n_steps=n_steps, settled=settled, kept=terms)
     return rows.theta[:, order], rows.target, scale[order]
 
 

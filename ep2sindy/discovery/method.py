@@ -288,7 +288,8 @@ class Regression:
                 f"a regression needs samples of every state: {list(task.hidden)} came as hidden; "
                 "take TrajectorySearch(), or make states of a signal by ep.signals.embed"
             )
-        task = replace(task, runs=[run.complete() for run in task.runs])
+        if any(run.missing is not None for run in task.runs):
+            task = replace(task, runs=[run.complete() for run in task.runs])
         if task.roles is not None:
             return self._identify_under(task.roles, task, rng=rng, progress=progress)
         equations = self.search_equations(task, rng=rng, progress=progress)

@@ -259,9 +259,14 @@ class Library:
         return [self.variables.index(f.variable) for f in self.functions]
 
     @cached_property
+    def derivatives(self) -> tuple[Library, Float[np.ndarray, "terms columns products"]]:
+        """Terms and their derivatives by all variables, as in `with_derivatives`."""
+        return self.with_derivatives(len(self.variables))
+
+    @cached_property
     def _slopes(self) -> tuple[Library, list[list[tuple[np.ndarray, np.ndarray]]]]:
         """Products, and for each variable the addends of all derivatives: (indices, weights)."""
-        products, shares = self.with_derivatives(len(self.variables))
+        products, shares = self.derivatives
         addends = []
         for by_variable in np.moveaxis(shares[:, 1:], 1, 0):
             present = by_variable != 0.0

@@ -138,7 +138,7 @@ def _whiten(
 ) -> WhitenedRows:
     mask, full = np.zeros(len(problem.library), dtype=np.bool_), np.zeros(len(problem.library))
     mask[terms], full[terms] = True, coef
-    return whitened_rows(problem, mask, full, n_steps=n_steps)
+    return whitened_rows(problem, mask, full, n_steps=n_steps, kept=mask)
 
 
 def weighted_equations(

@@ -61,20 +61,13 @@ class NoisyRows:
         return self.slope @ self.values[:, self.state]
 
     @cached_property
-    def transposed(self) -> tuple[csr_array, csr_array]:
-        """Both matrices transposed, (samples, rows)."""
-        return self.mean.T.tocsr(), self.slope.T.tocsr()
-
-    @cached_property
     def stretches(self) -> Stretches:
         """The windows of all rows as stretches of neighbouring samples."""
         first = np.minimum(*(_ends(matrix)[0] for matrix in (self.mean, self.slope)))
         last = np.maximum(*(_ends(matrix)[1] for matrix in (self.mean, self.slope)))
+        first, last = first.astype(np.int64), last.astype(np.int64)
         starts = np.append(0, np.cumsum(last + 1 - first))
-        mean, slope = np.zeros((2, starts[-1]))
-        for weights, matrix in ((mean, self.mean), (slope, self.slope)):
-            row = np.repeat(np.arange(len(first)), np.diff(matrix.indptr))
-            weights[starts[row] + matrix.indices - first[row]] = matrix.data
+        mean, slope = (_filled(matrix, starts, first) for matrix in (self.mean, self.slope))
         return Stretches(starts, first, mean, slope, band_width(first, last))
 
 
@@ -94,6 +87,17 @@ class Stretches(NamedTuple):
 def _ends(matrix: csr_array) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " rows"]]:
     """First and last sample of every row of a sparse matrix with sorted columns."""
     return matrix.indices[matrix.indptr[:-1]], matrix.indices[matrix.indptr[1:] - 1]
+
+
+def _filled(
+    matrix: csr_array, starts: Int[np.ndarray, " bounds"], first: Int[np.ndarray, " rows"]
+) -> Float[np.ndarray, " weights"]:
+    """Entries of a sparse matrix as stretches, with zeros for entries that it lacks."""
+    if matrix.nnz == starts[-1]:  # it lacks none
+        return matrix.data
+    weights, row = np.zeros(starts[-1]), np.repeat(np.arange(len(first)), np.diff(matrix.indptr))
+    weights[starts[row] + matrix.indices - first[row]] = matrix.data
+    return weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,10 +188,10 @@ class RegressionRows:
         return self.test_rows[:, : len(self.library)]
 
     def train_target(self, equation: int) -> Float[np.ndarray, " train"]:
-        return self._scaled_target(equation, ~self.test)
+        return self._scaled_target(equation, test=False)
 
     def test_target(self, equation: int) -> Float[np.ndarray, " test"]:
-        return self._scaled_target(equation, self.test)
+        return self._scaled_target(equation, test=True)
 
     def coef_scale(self, equation: int) -> Float[np.ndarray, " terms"]:
         """Factors that convert coefficients of scaled columns to SI."""
@@ -245,8 +249,10 @@ class RegressionRows:
         parts = [rows.T @ rows for rows in self.blocks(test=test)]
         return self._grams(sum(parts[1:], parts[0])[None])
 
-    def _scaled_target(self, equation: int, rows: np.ndarray) -> Float[np.ndarray, " _"]:
-        return self.target[rows, equation] / self.target_scale[equation]
+    def _scaled_target(self, equation: int, *, test: bool) -> Float[np.ndarray, " _"]:
+        if len(self.test) <= MOST_ROWS:  # the scaled rows are at hand
+            return (self.test_rows if test else self.train_rows)[:, len(self.library) + equation]
+        return self.target[self.test == test, equation] / self.target_scale[equation]
 
     def _scaled(self, index: Int[np.ndarray, " _"]) -> Float[np.ndarray, "_ columns"]:
         n = len(self.library)
@@ -259,8 +265,8 @@ class RegressionRows:
     def _grams(self, products: np.ndarray) -> Grams:
         n = len(self.library)
         return Grams(
-            xx=products[:, :n, :n],
-            xy=products[:, n:, :n],
+            xx=np.ascontiguousarray(products[:, :n, :n]),  # views would be compiled for anew
+            xy=np.ascontiguousarray(products[:, n:, :n]),
             yy=products.diagonal(axis1=1, axis2=2)[:, n:],
         )
 

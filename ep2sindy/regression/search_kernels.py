@@ -11,23 +11,20 @@ from ep2sindy.regression.gram_kernels import (
     ROUNDING,
     independent_terms,
     solve,
-    solve_masks,
 )
 from ep2sindy.runtime.compilation import compiled
 
 
 @compiled
-def _next_event(coef, slope, correlation, drift, level, active, n_active, barred):
+def _next_event(coef, slope, correlation, drift, level, active, n_active, closed):
     """Next knot of the lasso path below the penalty `level`: step, term, and whether it joins."""
     step, term, joins = level, -1, False
-    is_active = np.zeros(len(coef), dtype=np.bool_)
     for i in range(n_active):
         j = active[i]
-        is_active[j] = True
         if coef[j] * slope[i] < 0.0 and -coef[j] / slope[i] < step:
             step, term, joins = -coef[j] / slope[i], j, False
     for j in range(len(coef)):
-        if is_active[j] or barred[j]:
+        if closed[j]:
             continue
         for sign in (1.0, -1.0):
             closing = 1.0 - sign * drift[j]
@@ -46,28 +43,27 @@ def lasso_supports(xx, xy, max_terms):
     doi:10.1093/imanum/20.3.389; Efron et al. 2004, doi:10.1214/009053604000000067).
     """
     n_terms = len(xy)
-    limit = 8 * n_terms + 8
-    masks = np.zeros((limit, n_terms), dtype=np.bool_)
-    coef, correlation = np.zeros(n_terms), xy.copy()
-    slope, signs = np.empty(n_terms), np.zeros(n_terms)
-    active = np.empty(n_terms, dtype=np.int64)
-    barred = np.zeros(n_terms, dtype=np.bool_)
-    n_active, n_masks, left = 0, 1, -1
-    level = np.abs(xy).max() if n_terms else 0.0
+    masks = np.zeros((8 * n_terms + 8, n_terms), dtype=np.bool_)
+    coef, correlation, drift = np.zeros(n_terms), np.zeros(n_terms), np.zeros(n_terms)
+    slope, signs = np.zeros(n_terms), np.zeros(n_terms)
+    active = np.zeros(n_terms, dtype=np.int64)
+    closed = np.zeros(n_terms, dtype=np.bool_)  # terms that cannot join: active, or barred
+    n_active = np.int64(0)  # as a bare 0 it would have callees compiled twice
+    n_masks, left, level = 1, -1, 0.0
+    for j in range(n_terms):
+        correlation[j] = xy[j]
+        level = max(level, abs(xy[j]))
     floor = 1e-13 * level
-    while level > floor and n_masks < limit:
-        drift = _drift(xx, slope, active, n_active)
+    while level > floor and n_masks < len(masks):
+        _fill_drift(xx, slope, active, n_active, drift)
         if left >= 0:
-            barred[left] = True  # it would rejoin at this same knot
+            closed[left] = True  # it would rejoin at this same knot
         step, term, joins = _next_event(
-            coef, slope, correlation, drift, level, active, n_active, barred
+            coef, slope, correlation, drift, level, active, n_active, closed
         )
         if left >= 0:
-            barred[left] = False
-            left = -1
-        for i in range(n_active):
-            coef[active[i]] += step * slope[i]
-        correlation -= step * drift
+            closed[left], left = False, -1
+        _move(step, coef, slope, active, n_active, correlation, drift, signs)
         level -= step
         if term < 0:
             break
@@ -76,29 +72,38 @@ def lasso_supports(xx, xy, max_terms):
             n_active += 1
         else:
             n_active = _leave(active, n_active, term)
-            coef[term] = 0.0
-            left = term
-        signs[active[:n_active]] = np.sign(correlation[active[:n_active]])
+            coef[term], left = 0.0, term
+        closed[term] = joins
         if not solve(xx, signs, active, n_active, slope):
-            barred[term] = True  # it depends on the active terms; the path continues without it
+            closed[term] = True  # it depends on the active terms; the path continues without it
             n_active = _leave(active, n_active, term)
             solve(xx, signs, active, n_active, slope)
             continue
         if n_active > max_terms:
             break
-        masks[n_masks, active[:n_active]] = True
+        for i in range(n_active):
+            masks[n_masks, active[i]] = True
         n_masks += 1
     return masks[:n_masks]
 
 
 @compiled
-def _drift(xx, slope, active, n_active):
-    """Rate at which each term's correlation decreases along the path."""
-    drift = np.zeros(len(xx))
+def _move(step, coef, slope, active, n_active, correlation, drift, signs):
+    """Move coefficients and correlations along the path, and write the signs of the latter."""
     for i in range(n_active):
-        for j in range(len(xx)):
+        coef[active[i]] += step * slope[i]
+    for j in range(len(drift)):
+        correlation[j] -= step * drift[j]
+        signs[j] = np.sign(correlation[j])
+
+
+@compiled
+def _fill_drift(xx, slope, active, n_active, drift):
+    """Write the rate at which each term's correlation decreases along the path."""
+    for j in range(len(drift)):
+        drift[j] = 0.0
+        for i in range(n_active):
             drift[j] += xx[j, active[i]] * slope[i]
-    return drift
 
 
 @compiled
@@ -108,9 +113,29 @@ def adaptive_lasso_supports(xx, xy, gamma, max_terms):
     Scaling each column by |b_ols|^gamma makes this a plain lasso. A term that depends on earlier
     ones has no least-squares coefficient of its own and never joins.
     """
-    everything = independent_terms(xx).reshape(1, -1)
-    scale = np.abs(solve_masks(xx, xy.reshape(1, -1), everything)[0]) ** gamma
-    return lasso_supports(xx * scale.reshape(-1, 1) * scale, xy * scale, max_terms)
+    n_terms = len(xy)
+    kept, n_kept = _places(independent_terms(xx))
+    fitted, scale, scaled_xy = np.zeros(n_terms), np.zeros(n_terms), np.zeros(n_terms)
+    solve(xx, xy, kept, n_kept, fitted)
+    for i in range(n_kept):
+        scale[kept[i]] = abs(fitted[i]) ** gamma
+    scaled_xx = np.zeros((n_terms, n_terms))
+    for i in range(n_terms):
+        scaled_xy[i] = xy[i] * scale[i]
+        for j in range(n_terms):
+            scaled_xx[i, j] = xx[i, j] * scale[i] * scale[j]
+    return lasso_supports(scaled_xx, scaled_xy, max_terms)
+
+
+@compiled
+def _places(mask):
+    """Indices of the true entries of a mask, and their number."""
+    places, n_places = np.zeros(len(mask), dtype=np.int64), 0
+    for j in range(len(mask)):
+        if mask[j]:
+            places[n_places] = j
+            n_places += 1
+    return places, n_places
 
 
 @compiled
@@ -128,15 +153,15 @@ def thresholded_supports(xx, xy, thresholds):
     """Supports by sequentially thresholded least squares, iterated to convergence per threshold."""
     n_terms = len(xy)
     masks = np.zeros((len(thresholds), n_terms), dtype=np.bool_)
-    start = independent_terms(xx)
-    solution = np.empty(n_terms)
+    start, solution = independent_terms(xx), np.zeros(n_terms)
     for m in range(len(thresholds)):
-        masks[m] = start
+        for j in range(n_terms):
+            masks[m, j] = start[j]
         while True:
-            active = np.flatnonzero(masks[m])
-            solve(xx, xy, active, len(active), solution)
+            active, n_active = _places(masks[m])
+            solve(xx, xy, active, n_active, solution)
             n_dropped = 0
-            for i in range(len(active)):
+            for i in range(n_active):
                 if abs(solution[i]) <= thresholds[m]:
                     masks[m, active[i]] = False
                     n_dropped += 1

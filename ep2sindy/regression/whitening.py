@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.linalg import cholesky_banded
-from scipy.linalg.lapack import dtbtrs
+from jaxtyping import Bool, Float, Int
+from scipy.linalg.lapack import dpbtrf, dtbtrs
 
 from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import column_norms
+from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
-from ep2sindy.regression.window_kernels import banded_covariance
+from ep2sindy.regression.window_kernels import (
+    banded_covariance,
+    linearise,
+    spread_windows,
+    sum_windows,
+)
 
 # Largest correction of a sample, in standard deviations of its noise; with a wrong model the
 # corrections would otherwise grow without limit.
@@ -41,8 +47,8 @@ class WhitenedRows:
 
     theta: (rows, terms) and target: (rows,), combined so that target - theta coef is white
     with variance 1 for the true coefficients. Columns and target are scaled by the regression's
-    theta_scale and target_scale. corrected: (samples, variables), the samples minus the noise
-    estimated from the residuals.
+    theta_scale and target_scale; columns of terms that were not asked for are zero.
+    corrected: (samples, variables), the samples minus the noise estimated from the residuals.
     """
 
     theta: Float[np.ndarray, "rows terms"]
@@ -57,6 +63,7 @@ def whitened_rows(
     *,
     n_steps: int = 2,
     settled: float = SETTLED,
+    kept: Bool[np.ndarray, " terms"] | None = None,
 ) -> WhitenedRows:
     """Whiten the rows of one equation by their covariance under the model with these terms.
 
@@ -66,30 +73,40 @@ def whitened_rows(
     the most likely noise, linearise again. Without the correction, the noise in the terms would
     bias the coefficients. A step that raises the misfit too far is halved.
     coef: (terms,), a first guess in scaled columns. settled: change of the coefficients, as a share
-    of them, that ends the steps.
+    of them, that ends the steps. kept: terms whose columns are wanted, at least those of the model;
+    None for all.
     Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance;
     Britt & Luecke 1973, Technometrics 15, 233, for the steps.
     """
     assert problem.noisy is not None
-    rows = _Linearised.at(problem, problem.noisy.smoothed, coef, noisy=False)
+    kept = np.ones_like(terms) if kept is None else kept
+    sums, terms = _Sums.of(problem, kept), terms[kept]
+    rows = _Linearised.at(problem, sums, problem.noisy.smoothed, coef[kept], noisy=False)
     least = rows.misfit
     for _ in range(n_steps):
         before = rows.coef
-        following = _following(problem, rows, terms, limit=least + RISE * len(rows.target))
+        following = _following(problem, sums, rows, terms, limit=least + RISE * len(rows.target))
         if following is None:
             break
         rows, least = following, min(least, following.misfit)
         if np.linalg.norm(rows.coef - before) <= settled * np.linalg.norm(rows.coef):
             break
+    theta = np.zeros((len(rows.target), len(kept)))
+    theta[:, kept] = rows.theta
     return WhitenedRows(
-        theta=rows.theta,
+        theta=theta,
         target=rows.target - (rows.drifted - rows.theta) @ rows.coef,
         corrected=rows.x,
     )
 
 
 def _following(
-    problem: RegressionRows, rows: _Linearised, terms: Bool[np.ndarray, " terms"], *, limit: float
+    problem: RegressionRows,
+    sums: _Sums,
+    rows: _Linearised,
+    terms: Bool[np.ndarray, " kept"],
+    *,
+    limit: float,
 ) -> _Linearised | None:
     """One Gauss-Newton step, halved until the misfit decreases; None if it never does.
 
@@ -97,34 +114,57 @@ def _following(
     """
     coef = rows.fit(terms)
     x = keep_inside(problem.library, rows.correct(coef), rows.x)
-    whole = _Linearised.at(problem, x, coef)
+    whole = _Linearised.at(problem, sums, x, coef)
     if whole.misfit <= limit:
         return whole
     for n_halved in range(1, MAX_HALVED + 1):
         share = 0.5**n_halved
         part = _Linearised.at(
-            problem, rows.x + share * (x - rows.x), rows.coef + share * (coef - rows.coef)
+            problem, sums, rows.x + share * (x - rows.x), rows.coef + share * (coef - rows.coef)
         )
         if part.misfit < rows.misfit:
             return part
     return None
 
 
+class _Sums(NamedTuple):
+    """Some scaled terms and their derivatives, as sums of products: arguments of `linearise`.
+
+    kept: (library terms,), mask of the terms. products: library of the products, of which the rows
+    of `table` are used.
+    """
+
+    kept: Bool[np.ndarray, " terms"]
+    products: Library
+    table: Int[np.ndarray, "products factors"]
+    entries: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+    @staticmethod
+    def of(problem: RegressionRows, kept: Bool[np.ndarray, " terms"]) -> _Sums:
+        products, shares = problem.library.derivatives
+        shares = shares[kept] / problem.theta_scale[kept, None, None]
+        used = shares.any(axis=(0, 1))
+        shares = shares[:, :, used]
+        term, column, product = np.nonzero(shares)
+        entries = term, column - 1, product, shares[term, column, product]
+        return _Sums(kept, products, products.table[used], entries)
+
+
 @dataclass(frozen=True, eq=False)
 class _Linearised:
     """Whitened rows, linearised about samples x and coefficients, with their noise model.
 
-    x: (samples, variables). coef: (terms,), in scaled columns.
+    x: (samples, variables). coef: (kept,), in scaled columns.
     drifted: the terms at x plus their change from x to the raw samples, to first order.
-    sensitivity: (samples, variables), change of the model's rate per unit noise of each variable.
+    sensitivity: (variables, samples), change of the model's rate per unit noise of each variable.
     """
 
     x: Float[np.ndarray, "samples variables"]
-    coef: Float[np.ndarray, " terms"]
-    theta: Float[np.ndarray, "rows terms"]
-    drifted: Float[np.ndarray, "rows terms"]
+    coef: Float[np.ndarray, " kept"]
+    theta: Float[np.ndarray, "rows kept"]
+    drifted: Float[np.ndarray, "rows kept"]
     target: Float[np.ndarray, " rows"]
-    sensitivity: Float[np.ndarray, "samples variables"]
+    sensitivity: Float[np.ndarray, "variables samples"]
     factor: Float[np.ndarray, "band rows"]
     target_scale: float
     source: NoisyRows
@@ -132,8 +172,9 @@ class _Linearised:
     @staticmethod
     def at(
         problem: RegressionRows,
+        sums: _Sums,
         x: Float[np.ndarray, "samples variables"],
-        coef: Float[np.ndarray, " terms"],
+        coef: Float[np.ndarray, " kept"],
         *,
         noisy: bool = True,
     ) -> _Linearised:
@@ -144,24 +185,27 @@ class _Linearised:
         """
         rows, library = problem.noisy, problem.library
         assert rows is not None
-        n_variables = len(library.variables)
-        known = x[:, :n_variables]
-        slopes = library.jacobian(known) / problem.theta_scale
-        change = np.einsum("vst,sv->st", slopes, rows.values[:, :n_variables] - known)
-        terms = library.evaluate(known) / problem.theta_scale
+        n, n_samples = len(library.variables), len(x)
+        columns = np.ones((n + 1, n_samples))
+        columns[:n] = x[:, :n].T
+        departure = rows.values[:, :n].T - columns[:n]
+        terms, sensitivity = np.empty((2, len(coef), n_samples)), np.zeros((x.shape[1], n_samples))
+        linearise(
+            sums.products.with_functions(columns, axis=0), sums.table, *sums.entries,
+            departure, coef, terms, sensitivity[:n],
+        )  # fmt: skip
         if noisy and library.functions:
-            terms = terms - _lift(problem, known) / problem.theta_scale
-        sensitivity = np.zeros_like(rows.noise_std)
-        sensitivity[:, :n_variables] = (slopes @ coef).T
-        sensitivity *= rows.noise_std
+            terms -= (_lift(problem, x[:, :n]) / problem.theta_scale).T[sums.kept]
+        sensitivity *= rows.noise_std.T
         target_scale = float(problem.target_scale[0])
         factor = _banded_cholesky(_covariance(rows, sensitivity, target_scale))
-        n = len(library)
-        means = rows.mean @ np.concatenate([terms, change], axis=1)
-        means[:, n:] += means[:, :n]
-        columns = np.column_stack([means, rows.target / target_scale])
-        white = _solve(factor, columns)
-        theta, drifted, target = white[:, :n], white[:, n:-1], white[:, -1]
+        windows = rows.stretches
+        white = np.empty((2 * len(coef) + 1, len(windows.first)))
+        flat = terms.reshape(2 * len(coef), n_samples)
+        sum_windows(windows.starts, windows.first, windows.mean, flat, white[:-1])
+        white[-1] = rows.target / target_scale
+        white = _solve(factor, white.T)
+        theta, drifted, target = white[:, : len(coef)], white[:, len(coef) : -1], white[:, -1]
         return _Linearised(x, coef, theta, drifted, target, sensitivity, factor, target_scale, rows)
 
     @property
@@ -189,11 +233,12 @@ class _Linearised:
     def correct(self, coef: Float[np.ndarray, " terms"]) -> Float[np.ndarray, "samples variables"]:
         """Samples minus their most likely noise."""
         weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
-        rows = self.source
-        by_mean, by_slope = rows.transposed
-        noise = (by_mean @ weighted)[:, None] * self.sensitivity
-        own = by_slope @ (weighted / self.target_scale)
-        noise[:, rows.state] -= own * rows.noise_std[:, rows.state]
+        rows, windows = self.source, self.source.stretches
+        by_mean, by_slope = np.empty((2, len(self.x)))
+        for weights, sums in ((windows.mean, by_mean), (windows.slope, by_slope)):
+            spread_windows(windows.starts, windows.first, weights, weighted, sums)
+        noise = (by_mean * self.sensitivity).T
+        noise[:, rows.state] -= by_slope / self.target_scale * rows.noise_std[:, rows.state]
         limited = np.clip(noise, -LARGEST_CORRECTION, LARGEST_CORRECTION)
         return rows.values - limited * rows.noise_std
 
@@ -225,23 +270,29 @@ def _lift(
 
 
 def _covariance(
-    rows: NoisyRows, sensitivity: Float[np.ndarray, "samples variables"], target_scale: float
+    rows: NoisyRows, sensitivity: Float[np.ndarray, "variables samples"], target_scale: float
 ) -> Float[np.ndarray, "band rows"]:
     """Covariance of the rows by the samples' noise, from its diagonal downwards."""
     windows = rows.stretches
-    own, std = sensitivity[:, rows.state], rows.noise_std[:, rows.state] / target_scale
-    band = np.zeros((windows.width, len(windows.first)))
+    own, std = sensitivity[rows.state], rows.noise_std[:, rows.state] / target_scale
+    band = np.zeros((len(windows.first), windows.width))
     banded_covariance(
         windows.starts, windows.first, windows.mean, windows.slope,
-        np.square(sensitivity).sum(axis=1), own * std, np.square(std), band,
+        np.square(sensitivity).sum(axis=0), own * std, np.square(std), band,
     )  # fmt: skip
-    return band
+    return band.T
 
 
 def _banded_cholesky(band: Float[np.ndarray, "band rows"]) -> Float[np.ndarray, "band rows"]:
     """Lower Cholesky factor of the covariance, banded since distant windows do not overlap."""
     band[0] += RIDGE * band[0].mean() + ROUNDING**2 / len(band[0])
-    return cholesky_banded(band, lower=True)
+    factor, info = dpbtrf(band, lower=True, overwrite_ab=True)
+    if info or not np.isfinite(factor[0]).all():
+        raise np.linalg.LinAlgError(
+            "the covariance of the rows must be positive definite, and is not to rounding: scale "
+            "the variables to similar sizes, or take wider windows"
+        )
+    return factor
 
 
 def _solve(factor: np.ndarray, values: np.ndarray, *, transposed: bool = False) -> np.ndarray:

@@ -1,8 +1,15 @@
-"""Compiled covariance of weak rows, whose windows are short stretches of neighbouring samples."""
+"""Compiled weak rows, whose windows are short stretches of neighbouring samples.
+
+The windows of row i are mean[starts[i]:starts[i + 1]] and slope in the same places, over samples
+from first[i] on. Loops run over slices: with sums of indices in them they would stay scalar.
+"""
 
 import numpy as np
 
 from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
+
+FAST = {"fastmath": {"reassoc", "contract"}, "error_model": "numpy", **SEPARATE_ARRAYS}
+PIECE = 512  # samples
 
 
 @compiled
@@ -20,30 +27,126 @@ def band_width(first, last):
     return width
 
 
-@compiled(fastmath={"reassoc", "contract"}, **SEPARATE_ARRAYS)
-def banded_covariance(starts, first, mean, slope, of_mean, of_both, of_slope, band):
-    """Write the covariance of the rows to band[k, i], of row i + k with row i.
+@compiled(**FAST)
+def linearise(columns, table, term, variable, product, weight, departure, coef, terms, sensitivity):
+    """Write terms, terms moved along their derivatives, and the slopes of their sum, by sample.
 
-    The windows of row i are mean[starts[i]:starts[i + 1]] and slope in the same places, over
-    samples from first[i] on. A unit of a sample's noise moves the row by mean times some factor, of
-    the terms, minus slope times another, of the target; of_mean, of_both and of_slope (samples,)
-    are the sums over all variables of the products of these factors.
+    columns: (columns, samples), of variables, ones, and functions. table: (products, factors), the
+    columns of each product. Entry e adds weight[e] times product[e] to the term term[e], or to its
+    derivative by a variable if variable[e] is not negative. departure: (variables, samples), of the
+    move. terms: (2, terms, samples), to be filled. sensitivity: (variables, samples), of the sum of
+    coef times term. The loops of products and of sums are fused over pieces of samples: terms of
+    all samples would not stay in the cache.
+    """
+    values = np.empty((len(table), PIECE))
+    _clear(terms.reshape(-1))
+    _clear(sensitivity.reshape(-1))
+    for begin in range(0, columns.shape[1], PIECE):
+        here = slice(begin, min(begin + PIECE, columns.shape[1]))
+        n = here.stop - begin
+        for m in range(len(table)):
+            value = values[m, :n]
+            _copy(columns[table[m, 0], here], value)
+            for k in range(1, table.shape[1]):
+                if table[m, k] != len(departure):
+                    _multiply(value, columns[table[m, k], here])
+        for e in range(len(term)):
+            value, t, v = values[product[e], :n], term[e], variable[e]
+            if v < 0:
+                _add(value, weight[e], terms[0, t, here])
+                _add(value, weight[e], terms[1, t, here])
+            else:
+                _add(value, weight[e] * coef[t], sensitivity[v, here])
+                _multiply_add(value, weight[e], departure[v, here], terms[1, t, here])
+
+
+@compiled(**FAST)
+def _copy(values, out):
+    for i in range(len(out)):
+        out[i] = values[i]
+
+
+@compiled(**FAST)
+def _clear(out):
+    for i in range(len(out)):
+        out[i] = 0.0
+
+
+@compiled(**FAST)
+def _multiply(value, factor):
+    for i in range(len(value)):
+        value[i] *= factor[i]
+
+
+@compiled(**FAST)
+def _add(value, weight, total):
+    for i in range(len(value)):
+        total[i] += weight * value[i]
+
+
+@compiled(**FAST)
+def _multiply_add(value, weight, factor, total):
+    for i in range(len(value)):
+        total[i] += weight * value[i] * factor[i]
+
+
+@compiled(**FAST)
+def sum_windows(starts, first, weights, columns, sums):
+    """Write the weighted sums of columns (columns, samples) over all windows: (columns, rows)."""
+    for i in range(len(first)):
+        window = weights[starts[i] : starts[i + 1]]
+        for c in range(len(columns)):
+            column, total = columns[c, first[i] : first[i] + len(window)], 0.0
+            for s in range(len(window)):
+                total += window[s] * column[s]
+            sums[c, i] = total
+
+
+@compiled(**FAST)
+def spread_windows(starts, first, weights, rows, samples):
+    """Write the sums over rows of their windows times `rows` (rows,), a transposed product."""
+    _clear(samples)
+    for i in range(len(first)):
+        window = weights[starts[i] : starts[i + 1]]
+        _add(window, rows[i], samples[first[i] : first[i] + len(window)])
+
+
+@compiled(**FAST)
+def _both_products(a, b, c, d):
+    """Sum of the scalar products of a with b and of c with d."""
+    total = 0.0
+    for s in range(len(a)):
+        total += a[s] * b[s] + c[s] * d[s]
+    return total
+
+
+@compiled(**FAST)
+def banded_covariance(starts, first, mean, slope, of_mean, of_both, of_slope, band):
+    """Write the covariance of the rows to band[i, k], of row i + k with row i.
+
+    A unit of a sample's noise moves the row by mean times some factor, of the terms, minus slope
+    times another, of the target; of_mean, of_both and of_slope (samples,) are the sums over all
+    variables of the products of these factors.
     """
     n_rows, longest = len(first), 0
     for i in range(n_rows):
         longest = max(longest, starts[i + 1] - starts[i])
     by_mean, by_slope = np.empty(longest), np.empty(longest)
     for i in range(n_rows):
-        length = starts[i + 1] - starts[i]
-        for s in range(length):
-            m, w, k = mean[starts[i] + s], slope[starts[i] + s], first[i] + s
-            by_mean[s] = m * of_mean[k] - w * of_both[k]
-            by_slope[s] = w * of_slope[k] - m * of_both[k]
-        for j in range(i, min(i + len(band), n_rows)):
+        m, w = mean[starts[i] : starts[i + 1]], slope[starts[i] : starts[i + 1]]
+        here = slice(first[i], first[i] + len(m))
+        mm, mw, ww = of_mean[here], of_both[here], of_slope[here]
+        for s in range(len(m)):
+            by_mean[s] = m[s] * mm[s] - w[s] * mw[s]
+            by_slope[s] = w[s] * ww[s] - m[s] * mw[s]
+        for j in range(i, min(i + band.shape[1], n_rows)):
             low = max(first[i], first[j])
-            high = min(first[i] + length, first[j] + starts[j + 1] - starts[j])
-            here, there = low - first[i], starts[j] + low - first[j]
-            total = 0.0
-            for s in range(high - low):
-                total += by_mean[here + s] * mean[there + s] + by_slope[here + s] * slope[there + s]
-            band[j - i, i] = total
+            shared = min(here.stop, first[j] + starts[j + 1] - starts[j]) - low
+            if shared <= 0:
+                band[i, j - i] = 0.0
+                continue
+            a, b = low - first[i], starts[j] + low - first[j]
+            band[i, j - i] = _both_products(
+                by_mean[a : a + shared], mean[b : b + shared],
+                by_slope[a : a + shared], slope[b : b + shared],
+            )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.values import read_only
-from ep2sindy.signals.kernels import likelihood, smooth
+from ep2sindy.signals.kernels import likelihood, likelihoods, smooth
 
 # The range extends from a memory of about 200 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
@@ -80,13 +81,11 @@ class KalmanSmoother:
         """
         steps, step_s = _unit_steps(t, values)
         spread = np.ptp(values, axis=0)
-        scaled = (values - values[0]) / zero_to_one(spread)
+        scaled = np.ascontiguousarray((values - values[0]) / zero_to_one(spread))
         signal, slope = np.empty((2, *values.shape))
-        noise_std, log10_ratio = np.empty((2, values.shape[1]))
-        for j in range(values.shape[1]):
+        noise_std, log10_ratio = np.empty(values.shape[1]), self._ratios(steps, scaled, step_s)
+        for j, ratio in enumerate((10.0**log10_ratio).tolist()):
             column = np.ascontiguousarray(scaled[:, j])[:, None]
-            log10_ratio[j] = self._ratio(steps, column, step_s)
-            ratio = 10.0 ** log10_ratio[j]
             signal[:, j : j + 1], slope[:, j : j + 1] = smooth(steps, column, ratio)
             noise_std[j] = np.sqrt(likelihood(steps, column, ratio)[1][0])
         return KalmanEstimate(
@@ -108,13 +107,13 @@ class KalmanSmoother:
         """Raises ValueError for fewer than five samples."""
         return self.estimate(t, values).derivative
 
-    def _ratio(self, steps: np.ndarray, column: np.ndarray, step_s: float) -> float:
+    def _ratios(self, steps: np.ndarray, values: np.ndarray, step_s: float) -> np.ndarray:
         if self.log10_ratio is not None:
-            return self.log10_ratio
+            return np.full(values.shape[1], self.log10_ratio)
         bounds = ratio_bounds(
             self.finest_s, self.coarsest_s, step_s, (LOG10_RATIO_MIN, LOG10_RATIO_MAX)
         )
-        return most_likely_ratio(steps, column, *bounds)
+        return most_likely_ratios(steps, values, *bounds)
 
 
 def ratio_bounds(
@@ -132,34 +131,38 @@ def ratio_bounds(
     return lowest, max(lowest, highest)
 
 
-def most_likely_ratio(
+def most_likely_ratios(
     steps: Float[np.ndarray, " steps"],
-    values: Float[np.ndarray, "samples 1"],
+    values: Float[np.ndarray, "samples columns"],
     lowest: float = LOG10_RATIO_MIN,
     highest: float = LOG10_RATIO_MAX,
-) -> float:
-    """log10 of the noise ratio of greatest likelihood for one column, within bounds.
+) -> Float[np.ndarray, " columns"]:
+    """log10 of the noise ratio of greatest likelihood for each column, within bounds.
 
     The likelihood may be flat or have several maxima: a grid of whole decades finds the
     highest one, and a bounded search between its neighbours refines it.
     """
-
     from scipy.optimize import minimize_scalar  # imported only when the ratio is estimated
 
-    def misfit(log10_ratio: float) -> float:
-        return -likelihood(steps, values, 10.0**log10_ratio)[0][0]
-
     decades = np.append(np.arange(lowest, highest, 1.0), highest)
-    misfits = [misfit(decade) for decade in decades]
-    best = int(np.argmin(misfits))
-    found = minimize_scalar(
-        misfit,
-        bounds=(decades[max(best - 1, 0)], decades[min(best + 1, len(decades) - 1)]),
-        method="bounded",
-        options={"xatol": LOG10_RATIO_TOLERANCE},
-    )
-    # The bounded search never tries the bounds themselves, so the grid point may be better.
-    return float(found.x if found.fun < misfits[best] else decades[best])
+    on_grid = -likelihoods(steps, values, 10.0**decades)
+    ratios = decades[on_grid.argmin(axis=1)]
+    for j, best in enumerate(on_grid.argmin(axis=1).tolist()):
+        column = np.ascontiguousarray(values[:, j])[:, None]
+        found = minimize_scalar(
+            partial(_misfit, steps, column),
+            bounds=(decades[max(best - 1, 0)], decades[min(best + 1, len(decades) - 1)]),
+            method="bounded",
+            options={"xatol": LOG10_RATIO_TOLERANCE},
+        )
+        # The bounded search never tries the bounds themselves, so the grid point may be better.
+        if found.fun < on_grid[j, best]:
+            ratios[j] = found.x
+    return ratios
+
+
+def _misfit(steps: np.ndarray, column: np.ndarray, log10_ratio: float) -> float:
+    return float(-likelihood(steps, column, 10.0**log10_ratio)[0][0])
 
 
 def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> None:

@@ -9,15 +9,21 @@ are computed once.
 The kernels use loops because array expressions and slices take seconds longer to compile.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import compiled
+from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
 
 # Variance of the rounding errors of values scaled to unit range; less noise cannot be detected.
 ROUNDING = np.finfo(np.float64).eps ** 2
 
+
+# Each value waits for the one before: a product and a sum in one instruction shorten the wait.
+CHAIN: dict[str, Any] = {"fastmath": {"contract"}}
+
+# How loops over ratios are compiled, so that several go through the vector units at once.
+SIDE_BY_SIDE = {**CHAIN, "error_model": "numpy", **SEPARATE_ARRAYS}
 
 # Difference of two steps that count as even, and change of the filter's variances that ends them.
 EVEN, SETTLED = 1e-9, 1e-13
@@ -99,7 +105,7 @@ def _start(steps, ratio, slope_cov):
     return parabola, (l10, l20, l21), (1.0, d1, d2)
 
 
-@compiled
+@compiled(inline="always")  # a call would keep ratios side by side from the vector units
 def _predict(h, ratio, lower, diagonal):
     """Propagate the covariance P = L D L' to F P F' + Q over a step h by weighted Gram-Schmidt.
 
@@ -130,7 +136,7 @@ def _predict(h, ratio, lower, diagonal):
     return (l10, l20, l21), (new0, new1, new2)
 
 
-@compiled
+@compiled(**CHAIN)
 def gains(steps, ratio):
     """Kalman gains and covariances of the filter over all samples."""
     n_samples = len(steps) + 1
@@ -161,38 +167,35 @@ def gains(steps, ratio):
     return Gains(parabola, gain, variance, slope_cov)
 
 
-@compiled
+@compiled(**CHAIN)
 def _filter(steps, values, known):
     """Innovations, and filtered slopes: each given the samples up to it."""
     n_samples, n_columns = values.shape
-    innovation, slope = np.empty((n_samples, n_columns)), np.empty((n_samples, n_columns))
-    state = np.zeros((3, n_columns))
-    for a in range(3):
-        for i in range(3):
-            for j in range(n_columns):
-                state[a, j] += known.parabola[a, i] * values[i, j]
-    signals, slopes, bends = state[0], state[1], state[2]
+    innovation, slopes = np.empty((n_samples, n_columns)), np.empty((n_samples, n_columns))
     for j in range(n_columns):
-        slope[0, j] = slopes[j] - (steps[0] + steps[1]) * bends[j]
-        slope[1, j] = slopes[j] - steps[1] * bends[j]
-        slope[2, j] = slopes[j]
+        signal = slope = bend = 0.0
+        for i in range(3):
+            signal += known.parabola[0, i] * values[i, j]
+            slope += known.parabola[1, i] * values[i, j]
+            bend += known.parabola[2, i] * values[i, j]
+        slopes[0, j] = slope - (steps[0] + steps[1]) * bend
+        slopes[1, j] = slope - steps[1] * bend
+        slopes[2, j] = slope
         innovation[0, j] = innovation[1, j] = innovation[2, j] = 0.0
-    for k in range(3, n_samples):
-        h = steps[k - 1]
-        g0, g1, g2 = known.gain[k, 0], known.gain[k, 1], known.gain[k, 2]
-        for j in range(n_columns):
-            turned = slopes[j] + h * bends[j]
-            predicted = signals[j] + 0.5 * h * (slopes[j] + turned)
+        for k in range(3, n_samples):
+            h = steps[k - 1]
+            turned = slope + h * bend
+            predicted = signal + 0.5 * h * (slope + turned)
             missed = values[k, j] - predicted
             innovation[k, j] = missed
-            signals[j] = predicted + g0 * missed
-            slopes[j] = turned + g1 * missed
-            bends[j] += g2 * missed
-            slope[k, j] = slopes[j]
-    return innovation, slope
+            signal = predicted + known.gain[k, 0] * missed
+            slope = turned + known.gain[k, 1] * missed
+            bend += known.gain[k, 2] * missed
+            slopes[k, j] = slope
+    return innovation, slopes
 
 
-@compiled
+@compiled(**CHAIN)
 def likelihood(steps, values, ratio):
     """Log-likelihood (columns,) of the samples after the third, and the noise variance (columns,).
 
@@ -217,7 +220,76 @@ def likelihood(steps, values, ratio):
     return total, noise
 
 
+@compiled(**SIDE_BY_SIDE)
+def _advance(h, ratios, l10, l20, l21, d0, d1, d2, variance, weight, gain1, gain2):
+    """Propagate the covariance L D L' of every ratio over a step h, and measure, as in `gains`.
+
+    All arrays: (ratios,). The gain of the signal is the new d0; gain1 and gain2 are those of slope
+    and bend. variance: of the innovation; weight: its inverse.
+    """
+    for r in range(len(ratios)):
+        before = (l10[r], l20[r], l21[r]), (d0[r], d1[r], d2[r])
+        lower, diagonal = _predict(h, ratios[r], before[0], before[1])
+        l10[r], l20[r], l21[r] = lower
+        variance[r], weight[r] = diagonal[0] + 1.0, 1.0 / (diagonal[0] + 1.0)
+        d0[r], d1[r], d2[r] = diagonal[0] / variance[r], diagonal[1], diagonal[2]
+        gain1[r], gain2[r] = l10[r] * d0[r], l20[r] * d0[r]
+
+
+@compiled(**SIDE_BY_SIDE)
+def _follow(h, value, gain0, gain1, gain2, weight, signal, slope, bend, total):
+    """Predict one value under every ratio, add the weighted square of the error, and correct."""
+    for r in range(len(total)):
+        turned = slope[r] + h * bend[r]
+        predicted = signal[r] + 0.5 * h * (slope[r] + turned)
+        missed = value - predicted
+        total[r] += weight[r] * missed * missed
+        signal[r] = predicted + gain0[r] * missed
+        slope[r] = turned + gain1[r] * missed
+        bend[r] += gain2[r] * missed
+
+
 @compiled
+def likelihoods(steps, values, ratios):
+    """Log-likelihood as in `likelihood`, of every column under every ratio: (columns, ratios).
+
+    The filter is a chain of divisions that wait for each other. Under many ratios side by side they
+    fill the vector units, and all columns share the gains.
+    """
+    (n_samples, n_columns), n_ratios = values.shape, len(ratios)
+    rows, slope_cov = np.zeros((12, n_ratios)), np.zeros((3, 3))  # each shape takes compilation
+    l10, l20, l21, d0, d1, d2 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
+    variance, weight, gain1, gain2 = rows[6], rows[7], rows[8], rows[9]
+    log_variance, product = rows[10], rows[11]
+    state, total = np.zeros((3 * n_columns, n_ratios)), np.zeros((n_columns, n_ratios))
+    for r in range(n_ratios):
+        parabola, lower, diagonal = _start(steps, ratios[r], slope_cov)
+        (l10[r], l20[r], l21[r]), (d0[r], d1[r], d2[r]) = lower, diagonal
+        product[r] = 1.0
+        for j in range(n_columns):
+            for a in range(3):
+                for i in range(3):
+                    state[3 * j + a, r] += parabola[a, i] * values[i, j]
+    for k in range(3, n_samples):
+        h = steps[k - 1]
+        _advance(h, ratios, l10, l20, l21, d0, d1, d2, variance, weight, gain1, gain2)
+        for j in range(n_columns):
+            signal, slope, bend = state[3 * j], state[3 * j + 1], state[3 * j + 2]
+            _follow(h, values[k, j], d0, gain1, gain2, weight, signal, slope, bend, total[j])
+        for r in range(n_ratios):
+            product[r] *= variance[r]
+        if k % 8 == 0 or k == n_samples - 1:  # fewer logarithms; a product of eight is finite
+            for r in range(n_ratios):
+                log_variance[r] += np.log(product[r])
+                product[r] = 1.0
+    for j in range(n_columns):
+        for r in range(n_ratios):
+            noise = max(total[j, r] / (n_samples - 3), ROUNDING)
+            total[j, r] = -0.5 * ((n_samples - 3) * np.log(noise) + log_variance[r])
+    return total
+
+
+@compiled(**CHAIN)
 def smooth(steps, values, ratio):
     """Smoothed signal and slope per unit time, both (samples, columns), given all samples.
 
@@ -228,24 +300,21 @@ def smooth(steps, values, ratio):
     innovation, slope = _filter(steps, values, known)
     n_samples, n_columns = values.shape
     signal = innovation  # row k is read before it is written
-    later = np.zeros((3, n_columns))  # gradient of the later samples' log-likelihood by the state
-    r0, r1, r2 = later[0], later[1], later[2]
-    for k in range(n_samples - 1, 2, -1):
-        h, weight = steps[k - 1], 1.0 / known.variance[k]
-        g0, g1, g2 = known.gain[k, 0], known.gain[k, 1], known.gain[k, 2]
-        c0, c1, c2 = known.slope_cov[k, 0], known.slope_cov[k, 1], known.slope_cov[k, 2]
-        for j in range(n_columns):
-            slope[k, j] += c0 * r0[j] + c1 * r1[j] + c2 * r2[j]
-            noise = weight * innovation[k, j] - (g0 * r0[j] + g1 * r1[j] + g2 * r2[j])
+    for j in range(n_columns):
+        r0 = r1 = r2 = 0.0  # gradient of the later samples' log-likelihood by the state
+        for k in range(n_samples - 1, 2, -1):
+            h, gain, shared = steps[k - 1], known.gain[k], known.slope_cov[k]
+            slope[k, j] += shared[0] * r0 + shared[1] * r1 + shared[2] * r2
+            noise = innovation[k, j] / known.variance[k]
+            noise -= gain[0] * r0 + gain[1] * r1 + gain[2] * r2
             signal[k, j] = values[k, j] - noise
-            r0[j] += noise
-            turned = r1[j] + 0.5 * h * r0[j]
-            r1[j] += h * r0[j]
-            r2[j] += h * turned
-    for k in range(3):
-        for j in range(n_columns):
+            r0 += noise
+            turned = r1 + 0.5 * h * r0
+            r1 += h * r0
+            r2 += h * turned
+        for k in range(3):
+            shared, parabola = known.slope_cov[k], known.parabola
+            slope[k, j] += shared[0] * r0 + shared[1] * r1 + shared[2] * r2
             signal[k, j] = values[k, j]
-            for a in range(3):
-                slope[k, j] += known.slope_cov[k, a] * later[a, j]
-                signal[k, j] += known.parabola[a, k] * later[a, j]
+            signal[k, j] += parabola[0, k] * r0 + parabola[1, k] * r1 + parabola[2, k] * r2
     return signal, slope

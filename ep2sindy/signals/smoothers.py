@@ -80,15 +80,25 @@ class SavitzkyGolay:
                 "shorten the window or join more data"
             )
         if is_uniform(t):
-            from scipy.signal import savgol_filter  # import takes 0.5 s; weak forms do not need it
-
-            return savgol_filter(values, self.window, self.order, axis=0, mode="interp")
+            return self._smooth_equal(values)
         return self._smooth_unequal(t, values)
 
     def derivative(
         self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
     ) -> Float[np.ndarray, "samples columns"]:
         return difference(t, self.smooth(t, values))
+
+    def _smooth_equal(self, values: np.ndarray) -> np.ndarray:
+        """Weighted sums over windows: each sample takes its own, those at the ends the nearest."""
+        half = self.window // 2
+        powers = np.linspace(-1.0, 1.0, self.window)[:, None] ** np.arange(self.order + 1)
+        weights = powers @ np.linalg.pinv(powers)  # row k gives the polynomial at sample k
+        smoothed = np.empty(values.shape)
+        for column, target in zip(values.T, smoothed.T, strict=True):
+            target[half : len(values) - half] = np.correlate(column, weights[half])
+        smoothed[:half] = weights[:half] @ values[: self.window]
+        smoothed[len(values) - half :] = weights[half + 1 :] @ values[len(values) - self.window :]
+        return smoothed
 
     def _smooth_unequal(self, t: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Fit the window around each sample in scaled time; the nearest full one at the ends."""
