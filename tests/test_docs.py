@@ -3,6 +3,7 @@
 import ast
 import doctest
 import re
+import shlex
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -277,6 +278,12 @@ def test_a_quote_is_of_a_text_that_holds_its_pieces_in_order() -> None:
 def test_every_experiment_is_on_the_page_that_leads_to_one() -> None:
     page = (ROOT / "docs" / "which.md").read_text("utf-8")
     assert set(re.findall(r"\+exp=(\w+)", page)) == set(EXPERIMENTS)
+    commands_given = re.findall(r"`(ep2sindy \+exp=[^`]*)`", page)
+    options = re.findall(r"`('[a-z.]+=[^`]*')`", page)  # for the same command
+    same = "ep2sindy +exp=discover data=recognised data.path=run.csv 'trajectory.states=[x,y]'"
+    assert options
+    for text in [*commands_given, *(f"{same} {option}" for option in options)]:
+        check_command(shlex.split(text))
 
 
 def test_the_glossary_has_the_verdicts_and_the_columns_of_candidates() -> None:
