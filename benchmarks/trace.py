@@ -23,13 +23,12 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import free_run
+from ep2sindy.model.free_run import cycle_of, free_run
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.signals.embedding import embed
 from ep2sindy.signals.trace import prepare_signal
-from ep2sindy.studies.living import cycle_of
 
 POINTS = ("300/4", "300/5", "300/6", "400/5")
 NAME, NOISE, BITS = "I_d", 0.02, 8

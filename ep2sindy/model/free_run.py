@@ -84,7 +84,7 @@ class FreeCycle:
     @staticmethod
     def of(run: FreeRun) -> FreeCycle:
         """The cycle on which a free run ends, and how many starts reach it."""
-        cycle = _cycle_of(run)
+        cycle = cycle_of(run)
         return FreeCycle(run, cycle, np.nan if cycle is None else share_reaching(run.model, cycle))
 
     @property
@@ -150,7 +150,7 @@ def free_run(
     )
 
 
-def _cycle_of(run: FreeRun) -> LimitCycle | None:
+def cycle_of(run: FreeRun) -> LimitCycle | None:
     """The closed orbit on which a free run ends."""
     if run.model.inputs or run.rollout.diverged or run.verdict is Verdict.DIES_OUT:
         return None
