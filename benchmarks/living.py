@@ -27,13 +27,14 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
+from ep2sindy.model.free_run import cycle_of
 from ep2sindy.studies.balance import (
     ComparedProcess,
     compared_processes,
     inflows_of,
     zone_processes,
 )
-from ep2sindy.studies.living import cycle_of, start_of
+from ep2sindy.studies.living import start_of
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 CHANNEL, DOWNSTREAM = "channel", "downstream"
