@@ -76,6 +76,8 @@ def computed(config: DictConfig) -> Computed:
         run.screen.show(sections)
         page = page_html(config.experiment, sections, {}, about(run, study), result=result)
         run.screen.conclude(result, run.folder.path)
+        for end in run.ends:
+            end()
         log = (run.folder.path / "run.log").read_text()
     check_end(log, page, result, run.folder.path)
     return Computed(outcome, log, page, run.folder.path, run.warnings)

@@ -18,6 +18,7 @@ from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.discovery.pointwise import Block, Kept
 from ep2sindy.studies import pointwise
+from ep2sindy.studies.resume import pieces_key
 from ep2sindy.systems.regions import TERMS, three_regions
 from tests import programs
 
@@ -30,7 +31,7 @@ def composed(*overrides: str) -> DictConfig:
 
 def key_of(*overrides: str) -> str:
     settings = OmegaConf.to_container(composed(*overrides), resolve=True)
-    return pointwise.blocks_key(settings)
+    return pieces_key(settings, aside=pointwise.AFTERWARDS)
 
 
 @pytest.fixture(scope="module")

@@ -304,7 +304,7 @@ def test_a_full_disk_keeps_the_blocks_before(
         write(path, **arrays)
 
     monkeypatch.setattr(np, "savez", full_after_two)
-    with pytest.raises(OSError, match=r"No space left on device.*blocks before it are kept"):
+    with pytest.raises(OSError, match=r"No space left on device.*pieces before it are kept"):
         pointwise(noisy(), searching(), workers=Serial(), kept=Kept(tmp_path), block_points=2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["z0-1_r0-2.npz", "z0-1_r2-3.npz"]
 

@@ -242,6 +242,8 @@ def write(
     named = {"experiment": run.title, "seed": run.seed}
     named |= {"warnings": run.warnings} if run.warnings else {}
     folder.write_json("summary.json", named | outcome.summary() | {"headline": headline})
+    for end in run.ends:
+        end()
     run.screen.conclude(result, folder.path)
     return headline
 

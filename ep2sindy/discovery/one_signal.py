@@ -39,6 +39,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.weak import WeightedWeak
+from ep2sindy.runtime.kept import Once, at_once
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
@@ -180,20 +181,22 @@ class SignalSearch:
         seed: int = 0,
         progress: Progress = SILENT,
         say: Callable[[str], None] | None = None,
+        once: Once = at_once,
     ) -> list[Attempt]:
         """One with hidden states if it explains the signal, or else one for every number.
 
         past: the part of the whole that is fitted. say: is told why hidden states are given up.
+        once: does each search, or takes it from a run that was broken off.
         """
         numbers = self._numbers(whole)
         if self.embedding in ("auto", "hidden"):
             libraries = self._libraries(past, numbers)
-            search = search_hidden(past, libraries, self.by_trajectories, progress)
+            search = search_hidden(past, libraries, self.by_trajectories, progress, once)
             if search.explains or self.embedding == "hidden":
                 return [self._attempt(past, search.chosen(past), search.found, progress)]
             if say is not None:
                 say(NOT_EXPLAINED)
-        return [self._smoothed(past, n, seed, progress) for n in numbers]
+        return [self._smoothed(past, n, seed, progress, once) for n in numbers]
 
     def _numbers(self, signal: Trace) -> list[int]:
         """Numbers of states to try; a signal of two states either repeats itself or spirals."""
@@ -222,10 +225,18 @@ class SignalSearch:
             return TrajectorySearch(max_terms=own.max_terms)
         return TrajectorySearch()
 
-    def _smoothed(self, past: Trace, n_states: int, seed: int, progress: Progress) -> Attempt:
+    def _smoothed(
+        self, past: Trace, n_states: int, seed: int, progress: Progress, once: Once
+    ) -> Attempt:
+        chosen, found = once(partial(self._searched, past, n_states, seed, progress))
+        return self._attempt(past, chosen, found, progress)
+
+    def _searched(
+        self, past: Trace, n_states: int, seed: int, progress: Progress
+    ) -> tuple[Chosen, Discovery]:
         with progress.stage(None, "", f"{n_states} states of the signal"):
             chosen = self._embedded(past, n_states)
-        return self._attempt(past, chosen, self._found(chosen, past.name, seed, progress), progress)
+        return chosen, self._found(chosen, past.name, seed, progress)
 
     def _attempt(
         self, past: Trace, chosen: Chosen, found: Discovery, progress: Progress

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import xarray as xr
@@ -29,13 +27,12 @@ from ep2sindy.discovery.point_search import (
     search_point,
 )
 from ep2sindy.library.units import unit_product
-from ep2sindy.runtime.files import WriteError, fingerprint, replacing, sweep
+from ep2sindy.runtime.files import fingerprint
+from ep2sindy.runtime.kept import Kept
 from ep2sindy.runtime.parallel import Workers, run_alike
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 
 NO_FIT = "no_fit"
-
-KEY = "key"  # of the arrays in the file of a finished block, the one that says what they depend on
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -287,61 +284,3 @@ def blocks_of(field: xr.Dataset, n_points: int) -> list[Block]:
         parts = [slice(k, min(k + steps[axis], n)) for k in range(0, n, steps[axis])]
         blocks = [Block({**block.slices, axis: part}) for block in blocks for part in parts]
     return blocks
-
-
-@dataclass(frozen=True)
-class Kept:
-    """Store of finished blocks in a folder; each file is complete or absent.
-
-    key: of all that a result depends on, stored with every block; a block of another key counts as
-    absent, and is replaced. None: `pointwise` takes the key of its search and of the field's axes
-    (`search_key`), which does not look at the values of the field: give every field its own folder.
-    """
-
-    folder: Path
-    key: str | None = None
-
-    def __post_init__(self) -> None:
-        sweep(self.folder)
-
-    def holds(self, block: Block) -> bool:
-        """True if the block is finished under this key."""
-        return self._read(block, names=[KEY]) is not None
-
-    def read(self, block: Block) -> dict[str, np.ndarray] | None:
-        """Results of a finished block, or None if there are none of this key that can be read."""
-        return self._read(block)
-
-    def _read(self, block: Block, names: Sequence[str] = ()) -> dict[str, np.ndarray] | None:
-        """Some arrays of a finished block, or all, but for its key; None as in `read`."""
-        try:
-            with np.load(self._path(block), allow_pickle=False) as stored:
-                found = {name: stored[name] for name in names or stored.files}
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-            return None
-        return found if str(found.pop(KEY, "")) == (self.key or "") else None
-
-    def write(self, block: Block, done: Mapping[str, np.ndarray]) -> None:
-        """Store a finished block. Raises OSError, naming the way out, if writing fails."""
-        try:
-            with replacing(self._path(block)) as temporary:
-                np.savez(temporary, **done, **{KEY: np.array(self.key or "")})  # type: ignore[arg-type]
-        except WriteError as error:
-            raise OSError(
-                f"a finished block must be kept on disk: writing to {self.folder} failed with "
-                f"{error.reason!r}; the blocks before it are kept: mend that, and start "
-                "the same run again"
-            ) from error
-
-    def clear(self) -> None:
-        """Remove the finished blocks, once the whole result is written.
-
-        The folder stays if another run of the same study is at work in it.
-        """
-        for path in self.folder.glob("[!.]*.npz"):  # leaves out files being written
-            path.unlink(missing_ok=True)
-        with suppress(OSError):
-            self.folder.rmdir()
-
-    def _path(self, block: Block) -> Path:
-        return self.folder / f"{block.name}.npz"

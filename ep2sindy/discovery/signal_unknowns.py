@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.names import number_text
 from ep2sindy.model.comparison import SPIRALS, Verdict
 from ep2sindy.model.free_run import FreeCycle, free_run
+from ep2sindy.runtime.kept import Once, at_once
 from ep2sindy.runtime.progress import Progress
 from ep2sindy.signals.embedding import Chosen, Embedded, LogRate, Rate
 from ep2sindy.signals.trace import Trace, is_positive
@@ -81,13 +83,20 @@ class HiddenSearch:
 
 
 def search_hidden(
-    past: Trace, libraries: Iterable[Library], method: TrajectorySearch, progress: Progress
+    past: Trace,
+    libraries: Iterable[Library],
+    method: TrajectorySearch,
+    progress: Progress,
+    once: Once = at_once,
 ) -> HiddenSearch:
-    """The model of the first library that explains a signal, or of the last."""
+    """The model of the first library that explains a signal, or of the last.
+
+    once: does each search, or takes it from a run that was broken off.
+    """
     run = alone(past.window(max(0, len(past.t) - MAX_FITTED), len(past.t)))
     for library in libraries:
         hidden = [name for name in library.variables if name != past.name]
-        found = discover(run, library, method, hidden=hidden, progress=progress)
+        found = once(partial(discover, run, library, method, hidden=hidden, progress=progress))
         estimate = found.estimate
         assert estimate is not None  # a search of trajectories has one
         search = HiddenSearch(found, estimate, not found.misfit and _endures(estimate, past.name))
@@ -109,27 +118,35 @@ class FittedOffset:
 
 
 def fit_offset(
-    past: Trace, library: Library, method: TrajectorySearch, progress: Progress
+    past: Trace,
+    library: Library,
+    method: TrajectorySearch,
+    progress: Progress,
+    once: Once = at_once,
 ) -> FittedOffset:
     """The offset of a signal x, by the equations of x and of the growth rate g of x + offset.
 
     x' = (x + offset) g, so the offset is the coefficient of g where that of x g is one. library: of
-    x and g. Raises ValueError if none of its models explains the signal to its noise, or if the
-    signal and its offset are not positive.
+    x and g. once: as of `search_hidden`.
+    Raises ValueError if none of its models explains the signal to its noise, or if the signal and
+    its offset are not positive.
     """
     run = alone(past.window(max(0, len(past.t) - MAX_FITTED), len(past.t)))
     mean, spread = run.states.mean(), run.states.std()
     x, g = library.variables
     for share in SHIFTS:
         shift = share * spread - mean
-        found = discover(
-            replace(run, states=run.states + shift),
-            library,
-            method,
-            relations=[f"{x}: {x}*{g} == 1"],
-            terms={x: [g, f"{x}*{g}"]},
-            hidden=[g],
-            progress=progress,
+        found = once(
+            partial(
+                discover,
+                replace(run, states=run.states + shift),
+                library,
+                method,
+                relations=[f"{x}: {x}*{g} == 1"],
+                terms={x: [g, f"{x}*{g}"]},
+                hidden=[g],
+                progress=progress,
+            )
         )
         rest = found.model.terms(x).get(g, 0.0)
         if not found.misfit and is_positive(past.t, past.x + shift + rest):

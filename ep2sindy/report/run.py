@@ -22,7 +22,7 @@ class Run:
 
     settings: the whole config as plain values. said: messages to be repeated on the page.
     warnings: messages about problems, for the page and the summary. provenance: version of the
-    code, and the command. watch: receives the progress of the run.
+    code, and the command. watch: receives the progress of the run. ends: what is done last.
     """
 
     title: str
@@ -35,6 +35,7 @@ class Run:
     said: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     watch: Progress = field(default_factory=Bars)
+    ends: list[Callable[[], None]] = field(default_factory=list)
 
     def say(self, text: str, *, warning: bool = False) -> None:
         """Print a message at once, on the screen and in run.log, and repeat it on the page."""
@@ -46,6 +47,10 @@ class Run:
         """Print a warning at once, and repeat it on the page and in the summary."""
         self.warnings.append(text)
         self.say(text, warning=True)
+
+    def when_written(self, end: Callable[[], None]) -> None:
+        """Do something once all that was found is written, such as removing what is kept."""
+        self.ends.append(end)
 
     def write(self, name: str, writer: Callable[[Path], None]) -> None:
         """Write a file of the study's own into the run folder, complete or not at all."""

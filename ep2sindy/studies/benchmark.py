@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from itertools import product
@@ -46,6 +46,7 @@ from ep2sindy.report.document import (
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
+from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.study import Count, CountOrNone, Deferred, Levels, Names, NamesOrOne
 from ep2sindy.systems.draws import COLLECTION, DRAWS, realization, system_names
 from ep2sindy.systems.systems import System
@@ -135,7 +136,8 @@ class Study:
     systems: names of systems, or `dysts` for all of that collection, which needs the package.
     noises: standard deviations of the white noise, in RMS of each state. n_trajectories: number of
     trajectories in each realization. degree: of the library; None takes each system's own.
-    variants: names among the definitions. thesis: the thesis's tables, shown beside ours.
+    variants: names among the definitions. thesis: the thesis's tables, shown beside ours. keep: the
+    folder of finished realizations, from which a run continues a broken one.
     """
 
     systems: NamesOrOne
@@ -147,6 +149,7 @@ class Study:
     definitions: Mapping[str, Deferred]
     thesis: Mapping[str, Any]
     parallel: Workers
+    keep: str = ".cache/benchmark"
 
     def idle(self) -> dict[str, str]:
         unused = [name for name in self.definitions if name not in self.variants]
@@ -157,17 +160,20 @@ class Study:
         variants = build_variants(self.variants, self.definitions)
         names = self._names
         n_pieces = len(names) * len(self.noises) * self.n_realizations
-        with run.progress(n_pieces, "realization") as progress:
-            outcomes = self.outcomes(variants, seed=run.seed, progress=progress)
-        first = first_realizations(
-            variants,
-            [name for name in names if name in DRAWS] or names[:MAX_EXAMPLES],
-            self.noises,
-            n_trajectories=self.n_trajectories,
-            degree=self.degree,
-            seed=run.seed,
-            progress=run.watch,
-        )
+        with resumed(self.keep, run, self.parallel) as workers:
+            with run.progress(n_pieces, "realization") as progress:
+                outcomes = replace(self, parallel=workers).outcomes(
+                    variants, seed=run.seed, progress=progress
+                )
+            first = first_realizations(
+                variants,
+                [name for name in names if name in DRAWS] or names[:MAX_EXAMPLES],
+                self.noises,
+                n_trajectories=self.n_trajectories,
+                degree=self.degree,
+                seed=run.seed,
+                progress=run.watch,
+            )
         return Outcome(variants, outcomes, cells(outcomes), published, first)
 
     def outcomes(

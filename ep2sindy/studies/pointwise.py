@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,9 +17,7 @@ from ep2sindy.data.fields import SPACE, write_netcdf
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.point_search import PointSearch
 from ep2sindy.discovery.pointwise import (
-    PACKAGE,
     STATUSES,
-    Kept,
     blocks_of,
     pointwise,
 )
@@ -42,17 +38,16 @@ from ep2sindy.report.document import (
     pictures,
 )
 from ep2sindy.report.run import Run
-from ep2sindy.runtime.files import fingerprint
+from ep2sindy.runtime.kept import Kept
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.runtime.progress import Advance
+from ep2sindy.studies.resume import kept_pieces, told
 from ep2sindy.studies.simulated import say_simulation
 from ep2sindy.studies.source import Step, open_prepared, say_field
 from ep2sindy.studies.study import A_LIST, Count, Deferred, Names
 from ep2sindy.thruster.parameters import Thruster
-from ep2sindy.trust.user_code import own_source
 
-# Settings that do not change a point's result; they may differ when a broken run is continued.
-AFTERWARDS = {"output", "parallel", "max_regimes", "keep", "outline", "experiment", "study"}
+AFTERWARDS = {"max_regimes", "outline"}  # settings that do not change a point's result
 FADING = (
     "It fades to grey where it says little: as the equation's R2 (held-out rows, if any), times "
     "the share of the bootstraps that have the term, falls to 0."
@@ -118,8 +113,7 @@ class Study:
         left_out = [name for name in map(str, self.terms) if name not in search.library.names]
         if left_out:
             run.say(f"terms left out, for this field lacks their variables: {', '.join(left_out)}")
-        key = blocks_key(run.settings)
-        kept = Kept(Path(self.keep) / key, key)  # runs of other settings may be at work beside it
+        kept = kept_pieces(self.keep, run, aside=AFTERWARDS)
         begin = time.perf_counter()
         result, n_before = self._searched(field, search, kept, run)
         wall_s = time.perf_counter() - begin
@@ -141,7 +135,7 @@ class Study:
         n_points = sum(block.n_points for block in blocks)
         if n_before:
             run.say(f"going on with {n_before} of {n_points} points that a broken run had done")
-        try:
+        with told(kept, run):
             result = pointwise(
                 field,
                 search,
@@ -150,11 +144,6 @@ class Study:
                 block_points=self.block_points,
                 progress=Rates(run, n_before),
             )
-        except KeyboardInterrupt:
-            run.say(
-                f"finished blocks are kept in {kept.folder}: the same command goes on with them"
-            )
-            raise
         return result, n_before
 
 
@@ -182,40 +171,6 @@ class Rates:
                 self.run.board.scalars(rates, step=done)
 
             yield count
-
-
-def blocks_key(settings: Mapping[str, Any]) -> str:
-    """Hash of everything that a block's result depends on: settings, their files, the code."""
-    decisive = {key: value for key, value in settings.items() if key not in AFTERWARDS}
-    decisive["files"] = [
-        (str(path), each.stat().st_size, each.stat().st_mtime_ns)
-        for key, text in texts([settings["data"], settings["prepare"]])
-        if key != "cache" and text and (path := Path(text)).exists()
-        for each in (path, *sorted(path.rglob("*")))  # a Zarr store is a folder
-    ]
-    found = json.dumps(decisive, sort_keys=True)
-    for sources in (PACKAGE, *own_sources(settings)):
-        found = fingerprint(found, sources=sources)
-    return found
-
-
-def own_sources(settings: Mapping[str, Any]) -> list[Path]:
-    """The user's own code: modules and packages other than ours that the settings name."""
-    names = [text for key, text in texts(settings) if key in ("_target_", "study") and "." in text]
-    found = {own_source(name) for name in names if not name.startswith("ep2sindy.")}
-    return sorted(path for path in found if path is not None)
-
-
-def texts(settings: object, key: str = "") -> Iterator[tuple[str, str]]:
-    """Every (key, text) pair among some settings, at any depth."""
-    if isinstance(settings, Mapping):
-        for name, value in settings.items():
-            yield from texts(value, str(name))
-    elif isinstance(settings, list):
-        for each in settings:
-            yield from texts(each, key)
-    elif isinstance(settings, str):
-        yield key, settings
 
 
 @dataclass(frozen=True, eq=False)

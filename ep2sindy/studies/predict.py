@@ -60,11 +60,13 @@ from ep2sindy.studies.points import (
     QUIET,
     GivenPoints,
     Points,
+    PointSource,
     expand,
     given_points,
     open_points,
     oscillating_records,
 )
+from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.simulated import compile_kernels
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.study import Count, Counts, Positive
@@ -136,7 +138,8 @@ class Study:
     models: of which one is selected, by name; None searches for terms.
     degrees: candidate degrees of the polynomials, of which one is selected. map_points: number of
     points along each parameter. labels: names of the parameters in figures.
-    forecasts: number of starts over the second half of every record left out; 0 for none.
+    forecasts: number of starts over the second half of every record left out; 0 for none. keep: the
+    folder of finished pieces, from which a run continues a broken one.
     """
 
     source: Source
@@ -150,6 +153,7 @@ class Study:
     map_points: Count
     labels: Mapping[str, str]
     forecasts: int = 0
+    keep: str = ".cache/predict"
 
     def __post_init__(self) -> None:
         if self.forecasts < 0:
@@ -182,7 +186,13 @@ class Study:
         sources = given.sources(self.source)
         with run.progress(None, "", "kernels, compiled once"):
             compile_kernels([source.source.data for source in sources])
-        opened = open_points(sources, (), workers=self.parallel, run=run)
+        with resumed(self.keep, run, self.parallel) as workers:
+            return self._found(sources, how, workers, run)
+
+    def _found(
+        self, sources: Sequence[PointSource], how: BranchSettings, workers: Workers, run: Run
+    ) -> Outcome:
+        opened = open_points(sources, (), workers=workers, run=run)
         records, statuses = oscillating_records(opened, run)
         if not records:
             raise ValueError(
@@ -197,7 +207,7 @@ class Study:
             run.say(f"fitting a law to {n_points(len(members))}{cycle} ...")
             try:
                 found[name] = find_branch(
-                    name, members, everywhere, how, self.parallel, progress=run.watch
+                    name, members, everywhere, how, workers, progress=run.watch
                 )
             except ValueError as error:
                 reasons[name] = str(error)

@@ -22,8 +22,10 @@ from ep2sindy.discovery.method import AnyMethod, TrajectorySearch
 from ep2sindy.discovery.one_signal import SignalSearch, choose_attempt, count_fitted, evaluate
 from ep2sindy.discovery.signal_unknowns import FITTED, fit_offset
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.kept import Once
 from ep2sindy.signals.embedding import Delays, LogRate, Rate
 from ep2sindy.signals.trace import Trace, prepare_signal
+from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import Source, zone_of
 from ep2sindy.studies.study import Count, Deferred, Positive, Share
 from ep2sindy.studies.trace_result import Outcome
@@ -45,7 +47,8 @@ class Study:
     where they were fitted. harmonics: of the period, which the smoother follows.
     decimate, detrend: see `prepare_signal`. degree, functions, function_degree: of the library; a
     `?` in a function stands for a number to be fitted, as in `sign(?*v)` and `1/(?+x)`.
-    held_out: the share at the end of the record that is not fitted and serves as the test.
+    held_out: the share at the end of the record that is not fitted and serves as the test. keep:
+    the folder of finished searches, from which a run continues a broken one.
     """
 
     source: Source
@@ -62,6 +65,7 @@ class Study:
     function_degree: Count
     held_out: Share
     unit: str | None = None
+    keep: str = ".cache/trace"
 
     def __post_init__(self) -> None:
         if isinstance(self.offset, str) and self.offset != "fit":
@@ -90,7 +94,11 @@ class Study:
 
     def compute(self, run: Run) -> Outcome:
         data = self._sampled(run)
-        signal = self._with_offset(self._signal(data), data, run)
+        with resumed(self.keep, run) as keeping:
+            return self._found_in(data, keeping.once, run)
+
+    def _found_in(self, data: Trajectory, once: Once, run: Run) -> Outcome:
+        signal = self._with_offset(self._signal(data), data, once, run)
         for text in signal.done:
             run.say(f"{signal.name}: {text}")
         for text in signal.advice:
@@ -98,7 +106,7 @@ class Study:
         n_fitted = count_fitted(signal, self.held_out)
         past = signal.window(0, n_fitted)
         attempts = self._search.attempts(
-            past, signal, seed=run.seed, progress=run.watch, say=run.say
+            past, signal, seed=run.seed, progress=run.watch, say=run.say, once=once
         )
         best = choose_attempt(attempts)
         if isinstance(best.chosen.embedding, Rate | Delays) and (hint := lost_mean(signal)):
@@ -109,14 +117,14 @@ class Study:
     def _signal(self, data: Trajectory) -> Trace:
         return prepare_signal(data, decimate=self.decimate, detrend=self.detrend)
 
-    def _with_offset(self, signal: Trace, data: Trajectory, run: Run) -> Trace:
+    def _with_offset(self, signal: Trace, data: Trajectory, once: Once, run: Run) -> Trace:
         """The signal with its fitted offset, if one is asked for."""
         if self.offset != "fit":
             return signal
         names = LogRate().names(signal.name)
         library = self._search.library(names, (), max(2, self.degree))
         past = signal.window(0, count_fitted(signal, self.held_out))
-        found = fit_offset(past, library, self._search.by_trajectories, run.watch)
+        found = fit_offset(past, library, self._search.by_trajectories, run.watch, once)
         moved = self._signal(replace(data, states=data.states + found.value))
         words = (
             f"offset of {found.value:.4g} {signal.unit} fitted and added (95 %: {found.low:.4g} to "
