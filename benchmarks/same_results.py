@@ -211,8 +211,11 @@ def is_same(name: str, other: Path, paths: dict[str, Path], *, close: float) -> 
         if run.returncode:
             print(f"{name}: failed in {checkout}:\n{run.stderr[-2000:]}")
             return False
-        found.append(contents(output if name in PROGRAMS else Path(run.stdout.splitlines()[-1])))
+        found.append(contents(output if name in PROGRAMS else folder_of(run.stdout)))
     before, now = found
+    if not before:
+        print(f"{name}: no files in {other} to compare with")
+        return False
     differences = [
         text
         for path in before
@@ -229,6 +232,12 @@ def is_same(name: str, other: Path, paths: dict[str, Path], *, close: float) -> 
     for text in differences[:10]:
         print(f"  {text}")
     return not differences
+
+
+def folder_of(printed: str) -> Path:
+    """The run folder that the last line of an experiment names, by its page or by itself."""
+    path = Path(printed.splitlines()[-1].removeprefix("open: "))
+    return path.parent if path.suffix == ".html" else path
 
 
 def outcome(
