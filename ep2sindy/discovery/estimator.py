@@ -153,8 +153,9 @@ class SINDy(BaseEstimator):
         for k, (part, at, drive) in enumerate(zip(parts, times, inputs, strict=True)):
             first = reset and k == 0
             states = validate_data(self, part, reset=first, dtype=np.float64, ensure_min_samples=2)
-            own = vars(self).get("feature_names_in_") if names is None else names
-            found.append(_trajectory(states, at, drive, own))
+            if names is None and "feature_names_in_" in vars(self):
+                names = self.feature_names_in_.tolist()
+            found.append(_trajectory(states, at, drive, names))
         return found
 
 
