@@ -418,7 +418,7 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         (["selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
         (["+libraries.simple.degre=3"], "libraries.simple may have"),
         (["libraries.simple.degree=-1"], "degree must be a whole number, zero or more: -1"),
-        (["+seeds=1"], "unknown keys ['seeds']; there are "),
+        (["+seeds=1"], "unknown keys ['seeds']; near it is seed; there are "),
         (["seed=abc"], "seed must be a whole number"),
         (["depth=0"], "depth must be a whole number, one or more: 0 came"),
         (["depth=1.5"], "depth must be a whole number: 1.5 came"),

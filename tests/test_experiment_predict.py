@@ -78,7 +78,7 @@ def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
     page = (folder / "report.html").read_text()
     assert "Points left out" in page
     assert "9 coefficients of 3 functions each, 15 numbers, from 4 records" in page
-    assert "exact at every point: n_n: 1 == 4.58e+22 * mdot_mg_s" in page
+    assert "exact at every point: n_n: 1 == 4.58·10<sup>22</sup> * mdot_mg_s" in page
 
 
 def test_the_numbers_of_a_law_reach_to_the_digit_of_their_error(folder: Path) -> None:

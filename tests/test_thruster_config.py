@@ -67,7 +67,10 @@ def test_an_input_of_hallthruster_is_a_data_group(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("+data.thruster.chanel_length=0.02", r"data\.thruster, Thruster: .*'chanel_length'; it t"),
+        (
+            "+data.thruster.chanel_length=0.02",
+            r"Thruster: .*'chanel_length'; near it are channel_length",
+        ),
         ("+data.thruster.wall.colour=1", r"data\.thruster\.wall, wall_material: .*'colour'; it ta"),
         ("data.thruster.wall.name=glass", r"there are walls of .* 'glass' came"),
         ("data.thruster.propellant.name=iodine", r"there are the propellants .* 'iodine' came"),

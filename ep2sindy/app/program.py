@@ -160,7 +160,7 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
     with note_job() as (done, ended_early):
         try:
             if config.experiment is None:
-                raise ValueError(no_experiment(HydraConfig.get().overrides.task, conf))
+                raise _no_experiment(HydraConfig.get().overrides.task, conf)
             typed = HydraConfig.get().overrides.task
             check_places(resolved(config), typed)
             say(first_word(config))  # the imports below take seconds
@@ -215,15 +215,15 @@ def first_word(config: DictConfig) -> str:
     return f"{config.experiment}: loading study={config.get('study')}; writes below {folder}/"
 
 
-def no_experiment(typed: Sequence[str], conf: Path) -> str:
-    """Words for a command that names no experiment, with all that there are."""
+def _no_experiment(typed: Sequence[str], conf: Path) -> ValueError:
+    """The error of a command that names no experiment, with all that there are."""
     folders = {conf, Path.cwd() / "conf"}
     names = sorted({path.stem for each in folders for path in each.glob("exp/*.yaml")})
     for text in typed:
         key, _, value = text.lstrip("+").partition("=")
         if value in names and near_words(key, ["exp", "experiment"]):
-            return f"an experiment is chosen with +exp={value}: {text!r} came"
-    return (
+            return ValueError(f"an experiment is chosen with +exp={value}: {text!r} came")
+    return ValueError(
         f"choose an experiment with +exp=NAME; there are {listed(names)}. A config of your own "
         "begins with the line '# @package _global_'"
     )

@@ -98,7 +98,8 @@ class EstimationProblem:
 
     library: of scaled variables, states first. term_names: names of its terms in SI variables.
     equation, column: (coefficients,), the equation and the term of each coefficient.
-    C: (coefficients, free), fixed: (coefficients,), both scaled.
+    C: (coefficients, free), scaled. fixed_SI: (coefficients,), in SI, so that a coefficient that a
+    relation fixes has its value to the last digit.
     required: (free,), coefficients that are never left out. to_SI: (coefficients,), factors from
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
     measured: (d,), False for hidden states. watch: told of every step of a fit. whole: the
@@ -113,7 +114,7 @@ class EstimationProblem:
     equation: Int[np.ndarray, " coefficients"]
     column: Int[np.ndarray, " coefficients"]
     C: Float[np.ndarray, "coefficients free"] | None
-    fixed: Float[np.ndarray, " coefficients"]
+    fixed_SI: Float[np.ndarray, " coefficients"]
     required: Bool[np.ndarray, " free"]
     to_SI: Float[np.ndarray, " coefficients"]
     scale: Float[np.ndarray, " d"]
@@ -131,7 +132,7 @@ class EstimationProblem:
             return self
         rows = kept
         if self.C is not None:
-            rows = (self.C[:, kept] != 0.0).any(axis=1) | (self.fixed != 0.0)
+            rows = (self.C[:, kept] != 0.0).any(axis=1) | (self.fixed_SI != 0.0)
         columns = np.unique(self.column[rows])
         return replace(
             self,
@@ -140,7 +141,7 @@ class EstimationProblem:
             equation=self.equation[rows],
             column=np.searchsorted(columns, self.column[rows]),
             C=None if self.C is None else self.C[np.ix_(rows, kept)],
-            fixed=self.fixed[rows],
+            fixed_SI=self.fixed_SI[rows],
             required=self.required[kept],
             to_SI=self.to_SI[rows],
             places=self.places[columns],
@@ -218,6 +219,11 @@ class EstimationProblem:
             return degrees
         return np.where(self.C != 0.0, degrees[:, None], degrees.max()).min(axis=0)
 
+    @cached_property
+    def fixed(self) -> Float[np.ndarray, " coefficients"]:
+        """The fixed parts of all coefficients, scaled."""
+        return self.fixed_SI / self.to_SI
+
     def coef(self, free: Float[np.ndarray, " free"]) -> Float[np.ndarray, "terms d"]:
         """Scaled coefficients as a matrix."""
         coef = np.zeros((len(self.library), len(self.states)))
@@ -230,7 +236,7 @@ class EstimationProblem:
 
     def coef_SI(self, free: Float[np.ndarray, " free"]) -> Float[np.ndarray, " coefficients"]:
         """All coefficients that may differ from zero, in SI."""
-        return self.all_coefficients(free) * self.to_SI
+        return (free if self.C is None else self.C @ free) * self.to_SI + self.fixed_SI
 
     @property
     def driven(self) -> bool:
@@ -322,7 +328,7 @@ def scale_problem(
         equation=equation,
         column=column,
         C=held.C * to_SI[held.free] / to_SI[:, None] if held else None,
-        fixed=held.d / to_SI if held else np.zeros(len(column)),
+        fixed_SI=held.d if held else np.zeros(len(column)),
         required=(held.C[known] != 0.0).any(axis=0) if held else known,
         to_SI=to_SI,
         scale=size[: len(states)],

@@ -322,7 +322,7 @@ class _Unpacker:
         made = self._made[name] = object.__new__(plain)
         for key, node in content["state"].items():
             if key not in known:
-                raise KeyError(key)
+                raise KeyError(f"{content['class']} has no field {key!r}")
             object.__setattr__(made, key, self.value(node))
 
 
