@@ -111,7 +111,7 @@ def test_medians_come_with_their_spread_and_the_share_of_points(
 
 def test_an_equation_in_which_no_term_acts_is_zero(found: Outcome, tmp_path: Path) -> None:
     assert "\nn_i' = 0\n" in printed(found, tmp_path)
-    assert "<mo>=</mo><mn>0</mn></mrow></math>" in page(found)
+    assert "<mo>=</mo><mrow><mn>0</mn></mrow></mrow></math>" in page(found)
 
 
 def test_the_table_of_regimes_fits_the_log(tmp_path: Path) -> None:

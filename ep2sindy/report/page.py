@@ -164,7 +164,8 @@ def equation_mathml(equation: Equation) -> str:
     if equation.rate:
         left = rf"\mathrm{{d}} {left} / \mathrm{{d}} t"
     first, *others = terms_latex(equation.terms) or ["0"]
-    return " ".join(map(mathml, (f"{left} = {first}", *(f"{t[0]} \\,{t[1:]}" for t in others))))
+    begin = f"{left} = {{{first}}}"  # in a group of its own a minus is a sign, not an operation
+    return " ".join(map(mathml, (begin, *(f"{t[0]} \\,{t[1:]}" for t in others))))
 
 
 def mathml(latex: str) -> str:
