@@ -30,7 +30,7 @@ def main(overrides: list[str]) -> None:
             done = subprocess.run(program, cwd=DOCS.parent, stdout=subprocess.PIPE, text=True)
             print(done.stdout)
             done.check_returncode()
-            folders[key] = DOCS.parent / done.stdout.split()[-1]
+            folders[key] = DOCS.parent / Path(done.stdout.split()[-1]).parent  # of the page
         drawn = folders[key] / "figures" / f"{name}.png"
         shutil.copyfile(drawn, DOCS / f"simulate_{name}.png")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,7 @@ def profile_figure(field: xr.Dataset) -> Figure:
     """Mean profiles with bands of 5 to 95 % and of the full range; the channel's exit is dashed."""
     profiles = profile_table(field)
     figure, axes = make_grid(
-        len(profiles), width=10 / 3, height=2.6, extra=0.4, sharex=True,
+        len(profiles), width=3.0, height=2.5, extra=0.4, sharex=True,
         x_label="distance from the anode (cm)",
     )  # fmt: skip
     z = CM * field["z"].values
@@ -109,7 +110,7 @@ def profile_figure(field: xr.Dataset) -> Figure:
         label = f"{BAND_PERCENT[0]} to {BAND_PERCENT[1]} % of the time"
         ax.fill_between(z, low, high, color=COLOURS[0], alpha=0.35, lw=0, label=label)
         ax.plot(z, mean, color=DATA, lw=1.5, label="mean")
-        ax.set_title(_words(field[name]), fontsize=TITLE)
+        ax.set_title(fill(_words(field[name]), 28), fontsize=TITLE)
         ax.set_ylabel(unit)
         _mark_exit(ax, field, along="x")
         ax.margins(x=0.0)

@@ -176,7 +176,7 @@ def _draw_rows(
                         ax, shown.x, shown.y[:, k], colour=shade, limits=frame, diverged=stops
                     )
         text = labels.get(name, name).replace(", ", ",\n")
-        row[0].set_ylabel(text, rotation=0, ha="right", va="center")
+        row[0].set_ylabel(text, rotation=0, ha="right", va="center", labelpad=10)
     for ax in axes[1:].flat:  # panels of a column share their axis and so the first row's factor
         ax.yaxis.get_offset_text().set_visible(False)
     for column, title in zip(axes.T, titles, strict=True):
