@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.export import CLOCK
 from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
 from ep2sindy.data.numbers import real_numbers, seconds
 from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
@@ -104,8 +105,6 @@ def _trajectory(run: object, which: str, partial: bool) -> Trajectory:
 
 
 def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
-    from ep2sindy.data.fields import CLOCK  # loads xarray, as the maker of a Dataset has
-
     if tuple(field.dims) != ("time",):
         raise ValueError(
             "a Dataset must have the dimension time alone to be a run: "
