@@ -223,6 +223,7 @@ class Trajectory:
 
         duration_s: None shows twenty periods of the fastest state, or all. f_max_Hz: the end of
         the spectra; None for ten times its frequency.
+        Raises ValueError for a number that is not positive.
         """
         return draw("run_plot", self, duration_s=duration_s, f_max_Hz=f_max_Hz)
 
