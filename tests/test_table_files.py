@@ -1,4 +1,4 @@
-"""Tables that are no text: Excel, Parquet, TDMS."""
+"""Tables that are no text: Excel, Parquet, TDMS, and arrays whose names hold their units."""
 
 from importlib import util
 from pathlib import Path
@@ -45,12 +45,25 @@ def write_tdms(path: Path) -> None:
         writer.write_segment([ChannelObject("Probes", "I_d", X, properties=said)])
 
 
+def write_tdms_of_named_units(path: Path) -> None:
+    with TdmsWriter(path) as writer:
+        columns = [ChannelObject("Probes", name, TABLE[name].to_numpy()) for name in NAMED]
+        writer.write_segment(columns)
+
+
+def write_npz_of_named_units(path: Path) -> None:
+    np.savez(path, **{name: TABLE[name].to_numpy() for name in NAMED})
+
+
+NAMED = ("Time (us)", "I_d [mA]")
 KINDS = {
     "a.xlsx": write_excel,
     "lab.xlsx": write_sheet_of_a_lab,
     "a.parquet": write_parquet,
     "index.parquet": write_indexed_parquet,
     "a.tdms": write_tdms,
+    "named.tdms": write_tdms_of_named_units,
+    "named.npz": write_npz_of_named_units,
 }
 
 
