@@ -1,5 +1,6 @@
 """Samples as tables and Datasets, and back: what comes from pandas and xarray is a run at once."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,15 @@ def test_a_dataset_keeps_units_and_comes_back_as_a_run() -> None:
     assert dict(again.units) == {"n_i": "m^-3", "n_n": "m^-3"}
     few = data[["n_i", "n_n"]].isel(time=slice(0, 30))
     assert ep.discover([few, data[["n_i", "n_n"]].isel(time=slice(30, 40))]).model.states
+
+
+def test_a_dataset_keeps_the_unit_in_which_times_are_shown() -> None:
+    run = ep.Trajectory(86400.0 * np.arange(40.0), RUN.states, ["x", "y"], clock=ep.Clock.of("day"))
+    (again,) = trajectories_of(run.to_xarray())
+    assert again.clock == run.clock
+    ahead = ep.lotka_volterra().model.simulate(np.linspace(0.0, 20.0, 500), [1.0, 1.0])
+    (again,) = trajectories_of(replace(ahead, clock=run.clock).to_xarray())
+    assert again.clock == run.clock
 
 
 def test_what_was_not_measured_is_nan() -> None:

@@ -59,6 +59,7 @@ def test_a_pattern_takes_signs_of_the_shell_and_a_quantity_twice(folder: Path) -
         (["a_-1.csv", "a_2.5e-3.csv"], "a_{a}.csv"),
         (["1.5.csv", "2.csv"], "{p}.csv"),
         (["x1_1.csv", "x2_2.csv"], "x{x}_{p}.csv"),
+        (["data1.csv", "data2.csv"], "data{p}.csv"),  # `data` is a key of every point
         (["a.csv", "b.csv"], None),
         (["a1.csv"], None),
         (["a1.csv", "b2.csv"], None),
@@ -80,6 +81,7 @@ def test_a_pattern_is_proposed_where_names_differ_in_numbers(
         ("runs/a.csv", "need a pattern with a placeholder for each quantity, like 'points.files="),
         ("runs/{V.csv", "need a pattern with a placeholder for each quantity"),
         ("runs/{a b}.csv", "a placeholder must be the name of a quantity, .*: 'a b' came"),
+        ("runs/{data}.csv", "a placeholder must be .* and not 'data', .*: 'data' came"),
         ("runs/W{V}.csv", r"no file fits .* 1 files beside it: runs/V1.csv \.\.\."),
         ("none/{V}.csv", "no file fits the pattern 'none/{V}.csv' in .* there are 0 files beside"),
         ("runs/V1{V}.csv", "no file fits the pattern .* a number in the place of each"),

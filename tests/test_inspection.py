@@ -123,7 +123,7 @@ def test_columns_of_one_array_are_signals_of_their_own(tmp_path: Path) -> None:
     [
         ("probe[:, 2]", r"must lie inside its array: 'probe' has shape \(40, 2\), counted from 0"),
         ("probe[:, a]", "has no variable 'probe"),
-        ("prob", "has no variable 'prob' .*, but 'probe'"),
+        ("prob", "has no variable 'prob' .*; near it is 'probe'"),
         ("probe[0:2, 1]", r"written like \[:, 1\]"),
     ],
 )
@@ -223,7 +223,7 @@ def test_all_that_is_wrong_with_a_mapping_is_told_at_once(tmp_path: Path) -> Non
         )
     text = str(caught.value)
     for part in (
-        "no variable 'nii' (wanted as n_i), but 'ni'", "no variable 'nn'", "'kg' came",
+        "no variable 'nii' (wanted as n_i); near it is 'ni'", "no variable 'nn'", "'kg' came",
         "T_e_eV must fit the grid: the file has shape (10, 7)", "ni (40, 7)",
     ):  # fmt: skip
         assert part in text, part

@@ -117,6 +117,8 @@ def test_a_setting_without_effect_is_refused(typed: list[str], reason: str) -> N
         ["+exp=trace", "embedding=rate", "harmonics=3", "selection.n_starts=4"],
         ["+exp=trace", "embedding=hidden", "degree=2", "n_states=2"],
         ["+exp=trace", "functions=[sin]", "function_degree=2"],
+        ["+exp=trace", "search=trajectory"],
+        ["+exp=trace", "search=stlsq", "selection=ebic"],
         ["+exp=trace", "bootstraps.n=4", "bootstraps.block=5"],
         ["+exp=trace", "data=file", "data.path=x", "data.r.name=r", "data.r.unit=mm"],
         ["+exp=breathing", "selection=knee", "libraries.simple.n_norm=library"],

@@ -46,6 +46,9 @@ def test_a_record_is_drawn_with_its_units_and_its_frequency() -> None:
     assert figure.axes[1].lines[1].get_xdata()[0] == pytest.approx(frequency)
     part = run.plot(duration_s=1.0, f_max_Hz=2.0)
     assert part.axes[0].lines[0].get_xdata()[-1] == pytest.approx(1.0)
+    for setting in ({"duration_s": 0.0}, {"duration_s": -1.0}, {"f_max_Hz": -2.0}):
+        with pytest.raises(ValueError, match=f"{next(iter(setting))} must be positive and finite"):
+            run.plot(**setting)
 
 
 @pytest.mark.parametrize(

@@ -122,6 +122,21 @@ def test_inputs_drive_the_states() -> None:
     assert found.score(v, t, u=u) > 0.999
 
 
+@pytest.mark.parametrize("names", [["v", "b", "a"], ["v", "b"]])
+def test_inputs_of_a_library_are_found_by_name_in_the_columns(names: list[str]) -> None:
+    t = np.linspace(0.0, 20.0, 401)
+    u = np.stack([np.cos(1.9 * t), np.sin(0.7 * t)], axis=1)  # a, then b
+    truth = model_of({"v": {"v": -0.5, "b": 2.0}}, inputs=["a", "b"])
+    v = truth.simulate(t, [1.0], u).states
+    found = SINDy(library=ep.polynomial(names, degree=1), method=ROWS)
+    found.fit(v, t, u=u, feature_names=["v", "a", "b"])
+    assert found.predict(v, u) == pytest.approx(-0.5 * v + 2.0 * u[:, 1:], abs=1e-2)
+    assert found.simulate([1.0], t, u) == pytest.approx(v, abs=1e-3)
+    assert found.score(v, t, u=u) > 0.999
+    with pytest.raises(ValueError, match=r"u must have a column for each of \['a', 'b'\]"):
+        found.predict(v, u[:, 1])
+
+
 def test_settings_are_chosen_by_cross_validation() -> None:
     run = record()
     for folds in (TimeSeriesSplit(3), KFold(3)):

@@ -97,6 +97,9 @@ def test_a_file_for_each_step_is_joined(
     pattern = f"{tmp_path}/dump_*.h5"
     assert records_of(pattern) == [pattern]
     check(ep.open_field(pattern))
+    files = list(tmp_path.glob("dump_*.h5"))
+    for each in (pattern, files, files[::-1]):
+        assert ep.open_field(each).attrs["file"] == pattern
 
 
 @pytest.mark.parametrize("ending", ["nc", "npz"])

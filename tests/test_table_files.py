@@ -1,4 +1,4 @@
-"""Tables that are no text: Excel, Parquet, TDMS."""
+"""Tables that are no text: Excel, Parquet, TDMS, and arrays whose names hold their units."""
 
 from importlib import util
 from pathlib import Path
@@ -10,6 +10,8 @@ import pytest
 from nptdms import ChannelObject, TdmsWriter
 
 import ep2sindy as ep
+from ep2sindy.data.coerce import trajectories_of
+from ep2sindy.data.fields import clock_of
 
 T = np.arange(40) * 1.5e-6
 X = 2.0 + np.sin(1e5 * T)
@@ -43,12 +45,25 @@ def write_tdms(path: Path) -> None:
         writer.write_segment([ChannelObject("Probes", "I_d", X, properties=said)])
 
 
+def write_tdms_of_named_units(path: Path) -> None:
+    with TdmsWriter(path) as writer:
+        columns = [ChannelObject("Probes", name, TABLE[name].to_numpy()) for name in NAMED]
+        writer.write_segment(columns)
+
+
+def write_npz_of_named_units(path: Path) -> None:
+    np.savez(path, **{name: TABLE[name].to_numpy() for name in NAMED})
+
+
+NAMED = ("Time (us)", "I_d [mA]")
 KINDS = {
     "a.xlsx": write_excel,
     "lab.xlsx": write_sheet_of_a_lab,
     "a.parquet": write_parquet,
     "index.parquet": write_indexed_parquet,
     "a.tdms": write_tdms,
+    "named.tdms": write_tdms_of_named_units,
+    "named.npz": write_npz_of_named_units,
 }
 
 
@@ -78,6 +93,15 @@ def test_dates_are_counted_from_the_first(
     np.testing.assert_allclose(
         ep.open_field(tmp_path / f"a.{ending}")["time"].values, expected, rtol=1e-12
     )
+
+
+def test_durations_are_times(tmp_path: Path) -> None:
+    table = pd.DataFrame({"x": X}, index=pd.timedelta_range(0, periods=len(X), freq="2h"))
+    table.to_parquet(tmp_path / "a.parquet")
+    field = ep.open_field(tmp_path / "a.parquet")
+    (run,) = trajectories_of(table)
+    np.testing.assert_allclose(field["time"].values, run.t, rtol=1e-12)
+    assert clock_of(field) == run.clock == ep.Clock.of("h")
 
 
 def test_dates_that_may_be_read_in_two_ways_are_left_out(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ Only Hydra is imported here: a command must not wait for the numerics.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Any
@@ -15,6 +15,8 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
+
+from ep2sindy.runtime.screen import listed, near_words
 
 COMMANDS = ("compare", "inspect", "warm")  # that stand first, without +exp=NAME
 QUOTED_KEY = re.compile(r"""(?<=[{,])\s*(?P<quote>["'])(?P<name>\w+)(?P=quote)\s*(?=:)""")
@@ -61,19 +63,6 @@ def mend(text: str) -> str:
     except OverrideParseException as error:
         raise ValueError(_unreadable(text, error.message.strip().partition("\n")[0])) from error
     return without
-
-
-def near_words(name: str, names: Iterable[str], *, form: str = "{}") -> str:
-    """`; near it is NAME` for the similar ones among some names; empty if there are none.
-
-    form: how a name is written.
-    """
-    near = get_close_matches(name, sorted(set(names)), n=3)
-    return f"; near it {'is' if len(near) == 1 else 'are'} {listed(near, form)}" if near else ""
-
-
-def listed(names: Iterable[str], form: str = "{}") -> str:
-    return ", ".join(form.format(name) for name in names)
 
 
 @contextmanager

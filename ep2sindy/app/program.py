@@ -29,9 +29,9 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ep2sindy.app.arguments import COMMANDS, listed, near_words, options_first
+from ep2sindy.app.arguments import COMMANDS, options_first
 from ep2sindy.app.safety import check_places, checked_loader, resolved
-from ep2sindy.runtime.screen import plain, say
+from ep2sindy.runtime.screen import listed, near_words, plain, say
 from ep2sindy.runtime.threads import start_on_one_thread
 from ep2sindy.trust.interruption import end_as_interrupted
 from ep2sindy.trust.user_code import PACKAGE, isolate_children

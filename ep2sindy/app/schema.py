@@ -18,10 +18,10 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from ep2sindy._stubs import place_of
-from ep2sindy.app.arguments import near_words
 from ep2sindy.app.targets import target_of
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.recipe import Recipe, method_of
+from ep2sindy.runtime.screen import joined, near_words
 from ep2sindy.studies.source import Source, Step
 from ep2sindy.studies.study import Check, Deferred
 
@@ -217,9 +217,10 @@ def _dataclass(kind: type, node: Any, place: str) -> Any:
         came = sorted(given) if given is not None else contents(node)
         near = "".join(near_words(each, names) for each in sorted((given or set()) - set(names)))
         if len(needed) == len(names):
-            raise ValueError(f"{place} must have {_listed(needed)}: {came} came{near}")
+            raise ValueError(f"{place} must have {joined(needed)}: {came} came{near}")
         raise ValueError(
-            f"{place} may have {sorted(names)} and needs {_listed(needed)}: {came} came{near}"
+            f"{place} may have {sorted(names)} and needs {joined(needed) or 'none'}: {came} came"
+            f"{near}"
         )
     hints = hints_of(kind)
     return kind(
@@ -229,11 +230,6 @@ def _dataclass(kind: type, node: Any, place: str) -> Any:
             if name in given
         }
     )
-
-
-def _listed(names: Sequence[str]) -> str:
-    """`a, b and c`."""
-    return " and ".join([", ".join(names[:-1]), *names[-1:]] if len(names) > 1 else names) or "none"
 
 
 def hints_of(kind: type) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from ep2sindy.data.conversion import counted_in
 from ep2sindy.data.mapping import read_array
 from ep2sindy.data.quantities import typical
 from ep2sindy.data.readers.source import FileSource
+from ep2sindy.data.readers.table_layout import unit_in_brackets
 
 MIN_GAP = 3.0  # steps; a shorter one may be a sample that came late
 
@@ -62,7 +63,8 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
         return ArrayInfo(name, problem=_short(str(error)))
     values = np.asarray(array.values, dtype=np.float64)
     finite = values[np.isfinite(values)]
-    stated = counted_in(str(array.attrs.get("units", "") or source.units.get(name, "")))
+    attribute = str(array.attrs.get("units", "") or source.units.get(name, ""))
+    stated = counted_in(attribute) or unit_in_brackets(name)
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
     is_vector = values.size in values.shape
     steps = _steps(values.ravel()) if is_vector else np.empty(0)

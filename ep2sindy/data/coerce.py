@@ -17,14 +17,15 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.export import CLOCK
 from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
-from ep2sindy.data.numbers import real_numbers, seconds
+from ep2sindy.data.numbers import count_dates, real_numbers, seconds
 from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import Relation, complete, relations_of
 from ep2sindy.library.roles import Roles
-from ep2sindy.library.units import SECONDS, Clock, calendar_unit, seconds_in, time_unit_in
+from ep2sindy.library.units import SECONDS, Clock, seconds_in, time_unit_in
 from ep2sindy.runtime.values import check_kind, check_list
 
 if TYPE_CHECKING:
@@ -104,8 +105,6 @@ def _trajectory(run: object, which: str, partial: bool) -> Trajectory:
 
 
 def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
-    from ep2sindy.data.fields import CLOCK  # loads xarray, as the maker of a Dataset has
-
     if tuple(field.dims) != ("time",):
         raise ValueError(
             "a Dataset must have the dimension time alone to be a run: "
@@ -179,15 +178,10 @@ def _time_unit(name: object) -> str | None:
 
 
 def _elapsed(column: pd.Series) -> tuple[Float[np.ndarray, " rows"], Clock]:
-    """Times of a column in s, and their clock: the unit in its name; of dates, by their steps.
-
-    Dates are counted from the first one, without their time zone.
-    """
+    """Times of a column in s, and their clock: the unit in its name; of dates, by their steps."""
     if column.dtype.kind in "mM":
-        is_date = column.dtype.kind == "M"
-        t = seconds(column.to_numpy(dtype="datetime64[ns]") if is_date else column.to_numpy())
-        step_s = float(np.median(np.abs(np.diff(t)))) if len(t) > 1 else 0.0
-        return t, Clock.of(calendar_unit(step_s)) if is_date and np.isfinite(step_s) else SECONDS
+        t, unit = count_dates(column)
+        return t, Clock.of(unit)
     unit = _time_unit(str(column.name)) or "s"
     t = seconds(column.to_numpy())
     return (t, SECONDS) if unit == "s" else (t * seconds_in(unit), Clock.of(unit))

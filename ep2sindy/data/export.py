@@ -8,9 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.library.units import Clock
+
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
+
+CLOCK = "read_in"  # attribute of the time coordinate: the unit in which times are displayed
 
 
 def as_dataframe(
@@ -29,12 +33,13 @@ def as_dataset(
     values: Float[np.ndarray, "samples variables"],
     names: Sequence[str],
     units: Mapping[str, str],
+    clock: Clock,
 ) -> xr.Dataset:
-    """A variable for each name over the coordinate `time` in s, with its unit as an attribute."""
+    """A variable for each name over `time` in s, with units and the clock's as attributes."""
     import xarray as xr
 
     columns = zip(names, values.T, strict=True)
     return xr.Dataset(
         {name: ("time", column, {"units": units[name]}) for name, column in columns},
-        coords={"time": ("time", t, {"units": "s"})},
+        coords={"time": ("time", t, {"units": "s", CLOCK: clock.unit})},
     )

@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.export import CLOCK
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.library.units import Clock
 from ep2sindy.runtime.files import read_json, write_bytes
@@ -24,8 +25,6 @@ from ep2sindy.runtime.files import read_json, write_bytes
 DIMS = ("time", "z", "r")
 
 SPACE = ("z", "r")
-
-CLOCK = "read_in"  # attribute of the time coordinate: the unit in which times are displayed
 
 COORDINATE_UNITS = {"time": "s", "z": "m", "r": "m"}
 

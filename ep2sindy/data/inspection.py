@@ -38,7 +38,7 @@ class Inspection:
 
     @property
     def path(self) -> Path:
-        """The file; the pattern or the first file of several that are joined."""
+        """The file; of several that are joined, their pattern."""
         return self.source.path
 
     @property

@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ import xarray as xr
 
 from ep2sindy.data.readers.source import FileSource, damage_named
 from ep2sindy.library.names import check_variable
+from ep2sindy.runtime.screen import near_words
 
 N_LISTED = 100  # largest number of names listed in an error
 
@@ -100,9 +100,8 @@ def read_array(source: FileSource, ours: str, name: str) -> xr.DataArray:
     """Read one array of the file, or part of one, as real numbers in the file's unit and shape."""
     whole, part = _split_selection(source, name)
     if whole is None:
-        near = get_close_matches(name, source.names, n=1)
-        hint = f", but {near[0]!r}" if near else ""
-        raise ValueError(f"{source.path} has no variable {name!r} (wanted as {ours}){hint}")
+        near = near_words(name, source.names, form="{!r}")
+        raise ValueError(f"{source.path} has no variable {name!r} (wanted as {ours}){near}")
     with damage_named(source.path):
         array = source.read(whole)
     if array.dtype.kind not in "fiub":

@@ -6,10 +6,15 @@ Values without a single clear meaning as real numbers are refused.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Shaped
+
+from ep2sindy.library.units import calendar_unit
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Below this size a product of three variables, squared in a Gram matrix, underflows to zero.
 # Terms that overflow raise their own error.
@@ -50,6 +55,18 @@ def seconds(t: object) -> np.ndarray:
         return np.where(np.isnat(array), np.nan, array / np.timedelta64(1, "s"))
     is_short = array.ndim == 1 and array.dtype in (np.float16, np.float32)
     return even_grid(array) if is_short else real_numbers(array, "t")
+
+
+def count_dates(dates: pd.Series) -> tuple[Float[np.ndarray, " rows"], str]:
+    """Dates, from the first one and without their time zone, or durations in s; and their unit.
+
+    The unit, in which they are shown, is the longest of days, hours, minutes and seconds that is no
+    longer than a usual step.
+    """
+    is_date = dates.dtype.kind == "M"
+    t = seconds(dates.to_numpy(dtype="datetime64[ns]") if is_date else dates.to_numpy())
+    steps = np.abs(np.diff(t))
+    return t, calendar_unit(float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0)
 
 
 def even_grid(t: Shaped[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:

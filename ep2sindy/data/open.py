@@ -14,7 +14,8 @@ import xarray as xr
 
 from ep2sindy.data.conversion import conversion, to_si
 from ep2sindy.data.dimensions import assign_dims, read_axes
-from ep2sindy.data.fields import CLOCK, DIMS, check_field, mask_outside, write_netcdf
+from ep2sindy.data.export import CLOCK
+from ep2sindy.data.fields import DIMS, check_field, mask_outside, write_netcdf
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.readers.netcdf import NETCDF

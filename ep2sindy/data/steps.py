@@ -25,6 +25,7 @@ STEP_WORDS = frozenset({
     "time", "t",
 })  # fmt: skip
 NUMBERED = re.compile(r"(?P<word>[A-Za-z]*)[\s_#=-]*(?P<number>\d+)")
+NUMBER = re.compile(r"(\d+)")
 LEAST_UNNAMED = 3  # numbers without such a word; two may be kinds of particles
 
 Place = tuple[FileSource, str]
@@ -60,7 +61,7 @@ def open_record(path: str | Path | Sequence[str | Path]) -> FileSource:
             f"from {files[0]} on; open each by itself. Files of the steps of one run have one name "
             "but for a number, and a single time each"
         )
-    return join_files(files, Path(path) if isinstance(path, str | Path) else Path(files[0]))
+    return join_files(files)
 
 
 def records_of(path: object) -> list[str | list[str]]:
@@ -168,7 +169,7 @@ def are_steps(files: Sequence[str]) -> bool:
 
 def _numbers(files: Sequence[str]) -> dict[int, str]:
     """Number of the step -> file, if the names of the files differ in one number alone."""
-    parts = [re.split(r"(\d+)", Path(file).name) for file in files]
+    parts = [NUMBER.split(Path(file).name) for file in files]
     if len({len(each) for each in parts}) != 1:
         return {}
     differing = [column for column in zip(*parts, strict=True) if len(set(column)) > 1]
@@ -177,8 +178,8 @@ def _numbers(files: Sequence[str]) -> dict[int, str]:
     return dict(sorted((int(n), file) for n, file in zip(differing[0], files, strict=True)))
 
 
-def join_files(files: Sequence[str], path: Path) -> FileSource:
-    """Join the files of the steps of one run along time. path: what they are called together."""
+def join_files(files: Sequence[str]) -> FileSource:
+    """Join the files of the steps of one run along time; its path has a `*` for their number."""
     sources = {number: open_source(Path(file)) for number, file in _numbers(files).items()}
     steps = {}
     for number, source in sources.items():
@@ -188,7 +189,10 @@ def join_files(files: Sequence[str], path: Path) -> FileSource:
             for place in places.values()
         }
         steps[number] = {inside.get(name, name): (source, name) for name in source.names}
-    return _joined(replace(next(iter(sources.values())), path=path), steps, {}, "files")
+    first, *_, last = sources.values()
+    parts = zip(*(NUMBER.split(source.path.name) for source in (first, last)), strict=True)
+    name = "".join(one if one == other else "*" for one, other in parts)
+    return _joined(replace(first, path=first.path.with_name(name)), steps, {}, "files")
 
 
 # Both.

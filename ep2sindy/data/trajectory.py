@@ -204,8 +204,8 @@ class Trajectory:
         return as_dataframe(self.t, self._as_measured(), self.names)
 
     def to_xarray(self) -> xr.Dataset:
-        """States and inputs over `time` in s, with their units as attributes; NaN where missing."""
-        return as_dataset(self.t, self._as_measured(), self.names, self.units)
+        """States and inputs over `time` in s, NaN where missing, with their units and clock."""
+        return as_dataset(self.t, self._as_measured(), self.names, self.units, self.clock)
 
     def _as_measured(self) -> Float[np.ndarray, "samples variables"]:
         """All values, NaN in place of those that were interpolated."""
@@ -223,6 +223,7 @@ class Trajectory:
 
         duration_s: None shows twenty periods of the fastest state, or all. f_max_Hz: the end of
         the spectra; None for ten times its frequency.
+        Raises ValueError for a number that is not positive.
         """
         return draw("run_plot", self, duration_s=duration_s, f_max_Hz=f_max_Hz)
 

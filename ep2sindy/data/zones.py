@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 
 import numpy as np
 import xarray as xr
@@ -27,6 +26,7 @@ from ep2sindy.data.quantities import MADE_FROM
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.names import split_factors
 from ep2sindy.library.units import unit_product
+from ep2sindy.runtime.screen import near_words
 
 SLAB_VALUES = 2**22  # 32 MB of float64: memory limit for one variable while averaging a zone
 
@@ -104,8 +104,7 @@ def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str])
             for name, source, step in made
             if source in field
         ]
-        near = get_close_matches(unknown[0], list(map(str, field.data_vars)), n=1)
-        hints += [f"; did you mean {near[0]!r}?"] if near and not hints else []
+        hints = hints or [near_words(unknown[0], map(str, field.data_vars))]
         raise ValueError(
             f"unknown variables {unknown}; this field has {list(field.data_vars)}{''.join(hints)}"
         )

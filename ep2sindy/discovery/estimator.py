@@ -33,7 +33,8 @@ class SINDy(BaseEstimator):
     `ep.discover`. relations: between coefficients. seed: of the search.
     In `fit` and `score`, times t take the place of y. Folds must keep them in order, as KFold() and
     TimeSeriesSplit() do.
-    Attributes after `fit`: model_, discovery_, n_features_in_, feature_names_in_ of a DataFrame.
+    Attributes after `fit`: model_, discovery_, input_names_ of the columns of u, n_features_in_,
+    feature_names_in_ of a DataFrame.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     >>> found = ep.sklearn.SINDy(degree=2).fit(run.states, run.t)
@@ -51,6 +52,7 @@ class SINDy(BaseEstimator):
     seed: int
     discovery_: Discovery
     model_: SparseModel
+    input_names_: tuple[str, ...]
 
     @no_type_check  # rule of scikit-learn: the constructor stores any value, and `fit` checks it
     def __init__(
@@ -89,6 +91,7 @@ class SINDy(BaseEstimator):
             runs, library, self.method, relations=self.relations, seed=self.seed
         )
         self.model_ = self.discovery_.model
+        self.input_names_ = tuple(runs[0].input_names)
         return self
 
     def predict(self, X: Any, u: Any = None) -> Any:
@@ -98,7 +101,7 @@ class SINDy(BaseEstimator):
             inputs = [None] * len(X) if u is None else u
             return [self.predict(*pair) for pair in zip(X, inputs, strict=True)]
         states = validate_data(self, X, reset=False, dtype=np.float64)
-        return self.model_.predict(states, None if u is None else _columns(u))
+        return self.model_.predict(states, self._inputs(u))
 
     def score(self, X: Any, t: Any, *, u: Any = None) -> float:
         """R2 of the derivative, averaged over states; of several trajectories by their samples.
@@ -107,7 +110,7 @@ class SINDy(BaseEstimator):
         reaches 1. X, t, u: as for `fit`.
         """
         check_is_fitted(self)
-        names = (*self.model_.states, *self.model_.inputs)
+        names = (*self.model_.states, *self.input_names_)
         runs = self._runs(X, t, u, names, reset=False)
         scores = [self.model_.score(run) for run in runs]
         return float(np.average(scores, weights=[run.n_samples for run in runs]))
@@ -118,7 +121,7 @@ class SINDy(BaseEstimator):
         u: (samples, n_inputs) at these times. `model_.simulate` says how a run ended.
         """
         check_is_fitted(self)
-        run = self.model_.simulate(t, x0, None if u is None else _columns(u))
+        run = self.model_.simulate(t, x0, self._inputs(u))
         states = np.full((np.size(t), len(run.state_names)), np.nan)
         states[: len(run.states)] = run.states
         return states
@@ -135,6 +138,18 @@ class SINDy(BaseEstimator):
                 f"input_features should match those of fit, {known}: {list(input_features)} came"
             )
         return np.array(self.model_.library.names, dtype=object)
+
+    def _inputs(self, u: Any) -> Float[np.ndarray, "samples n_inputs"] | None:
+        """The columns of u that the library takes, in its order."""
+        if u is None:
+            return None
+        columns = _columns(u)
+        if columns.shape[1] != len(self.input_names_):
+            raise ValueError(
+                f"u must have a column for each of {list(self.input_names_)}, as in fit: shape "
+                f"{columns.shape} came"
+            )
+        return columns[:, [self.input_names_.index(name) for name in self.model_.inputs]]
 
     def _runs(
         self, X: Any, t: Any, u: Any, names: Sequence[str] | None, *, reset: bool

@@ -29,6 +29,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
+from ep2sindy.runtime.screen import joined
 from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
@@ -409,10 +410,6 @@ def _of_collinear_states(problem: EstimationProblem, noise: Noise) -> list[str]:
     states = {k: problem.states[own[k]] for k in held}
     total = " ".join(f"{weights[k] / weights[held[0]]:+.3g} {name}" for k, name in states.items())
     return [
-        f"{_listed(list(states.values()))} hang together: {total.removeprefix('+')} varies no "
+        f"{joined(list(states.values()))} hang together: {total.removeprefix('+')} varies no "
         "more than their noise, so terms in one may stand for terms in the others"
     ]
-
-
-def _listed(names: Sequence[str]) -> str:
-    return f"{', '.join(names[:-1])} and {names[-1]}"

@@ -26,6 +26,7 @@ from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import law_map, map_points
 from ep2sindy.operating.records import OperatingRecord
 from ep2sindy.regression.front import ParetoFront
+from ep2sindy.runtime.values import check_positive
 from ep2sindy.signals.spectrum import dominant_frequency
 
 PERIODS = 20.0  # shown of a record that has more
@@ -50,6 +51,9 @@ _show_in_notebooks()
 
 def run_plot(run: Trajectory, *, duration_s: float | None, f_max_Hz: float | None) -> Figure:
     """The states of a record and their spectra; see `Trajectory.plot`."""
+    for name, value in (("duration_s", duration_s), ("f_max_Hz", f_max_Hz)):
+        if value is not None:
+            check_positive(name, value)
     whole_s, highest_Hz = float(run.t[-1] - run.t[0]), 0.5 / run.dt_s
     fastest_Hz = max(dominant_frequency(run.t, column) for column in run.states.T)
     if fastest_Hz > 0.0:

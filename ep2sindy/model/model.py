@@ -25,7 +25,7 @@ from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.screen import N_LINES
-from ep2sindy.runtime.values import check_count, read_only
+from ep2sindy.runtime.values import check_count, check_positive, read_only
 from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
 if TYPE_CHECKING:
@@ -290,8 +290,7 @@ class SparseModel:
         """
         from ep2sindy.library.code import program_text  # here, for it imports sympy
 
-        if not 0.0 < duration_s < np.inf:
-            raise ValueError(f"duration_s must be positive and finite: {duration_s} came")
+        check_positive("duration_s", duration_s)
         return program_text(
             language,
             self.library,

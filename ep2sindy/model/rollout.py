@@ -93,9 +93,9 @@ class Rollout:
         return as_dataframe(self.t, self._values, [*self.state_names, *self.input_names])
 
     def to_xarray(self) -> xr.Dataset:
-        """States and inputs over the coordinate `time` in s, with their units."""
+        """States and inputs over the coordinate `time` in s, with their units and clock."""
         names = [*self.state_names, *self.input_names]
-        return as_dataset(self.t, self._values, names, self.units)
+        return as_dataset(self.t, self._values, names, self.units, self.clock)
 
     @property
     def _values(self) -> Float[np.ndarray, "samples variables"]:

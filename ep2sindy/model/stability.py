@@ -15,7 +15,7 @@ from ep2sindy.model.many import rk4_step
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scaled import ScaledModel
 from ep2sindy.runtime.drawing import draw
-from ep2sindy.runtime.values import read_only
+from ep2sindy.runtime.values import check_positive, read_only
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,8 +70,7 @@ class LimitCycle:
         multipliers.flags.writeable = False
         object.__setattr__(self, "states", read_only(self.states))
         object.__setattr__(self, "multipliers", multipliers)
-        if not (np.isfinite(self.period_s) and self.period_s > 0.0):
-            raise ValueError(f"period_s must be positive and finite: {self.period_s} came")
+        check_positive("period_s", self.period_s)
         if self.states.ndim != 2 or multipliers.shape != self.states.shape[1:]:
             raise ValueError(
                 "a cycle has one multiplier per state: multipliers of shape "

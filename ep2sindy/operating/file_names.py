@@ -18,6 +18,7 @@ KNOWN = {
     "V_D_V": ("v", "vd", "u", "ud", "volt", "volts", "voltage"),
     "mdot_mg_s": ("m", "md", "mdot", "mg", "mgs", "mgps", "flow", "massflow"),
 }
+DATA = "data"  # key of a point's data, and so no name of a quantity
 MOST_SHOWN = 3  # names of files in an error
 
 
@@ -42,10 +43,10 @@ class FilePattern:
                 "the files of operating points need a pattern with a placeholder for each "
                 f"quantity, like {example}: {self.text!r} came"
             )
-        if wrong := [name for name in self.names if not name.isidentifier()]:
+        if wrong := [name for name in self.names if not name.isidentifier() or name == DATA]:
             raise ValueError(
-                "a placeholder must be the name of a quantity, of letters, digits and _, like "
-                f"{example}: {wrong[0]!r} came in {self.text!r}"
+                "a placeholder must be the name of a quantity, of letters, digits and _, and not "
+                f"{DATA!r}, like {example}: {wrong[0]!r} came in {self.text!r}"
             )
 
     @cached_property
@@ -132,6 +133,6 @@ def _quantity(before: str, after: str, *, taken: Sequence[str]) -> str:
         for name, called in KNOWN.items():
             if word.lower() in called and name not in taken:
                 return name
-    base = words[0] if words else "p"
+    base = next((word for word in words if word != DATA), "p")
     free = (f"{base}{k}" if k else base for k in range(len(taken) + 1))
     return next(name for name in free if name not in taken)

@@ -1,12 +1,13 @@
-"""Display of objects: text that fits a screen, or an HTML table in a notebook."""
+"""Display of objects: text that fits a screen, an HTML table in a notebook, names in messages."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from difflib import get_close_matches
 from typing import Any
 
 WIDTH, N_LINES = 100, 25
@@ -95,3 +96,25 @@ def html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{cell}</th>" for cell in header)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+# Names in messages.
+
+
+def near_words(name: str, names: Iterable[str], *, form: str = "{}") -> str:
+    """`; near it is NAME` for the similar ones among some names; empty if there are none.
+
+    form: how a name is written.
+    """
+    near = get_close_matches(name, sorted(set(names)), n=3)
+    return f"; near it {'is' if len(near) == 1 else 'are'} {listed(near, form)}" if near else ""
+
+
+def listed(names: Iterable[str], form: str = "{}") -> str:
+    """`a, b, c`. form: how a name is written."""
+    return ", ".join(form.format(name) for name in names)
+
+
+def joined(names: Sequence[str], word: str = "and") -> str:
+    """`a, b and c`, with this word before the last."""
+    return f" {word} ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))

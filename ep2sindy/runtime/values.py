@@ -47,6 +47,12 @@ def check_count(name: str, value: object, least: int = 1) -> int:
     return count
 
 
+def check_positive(name: str, value: float) -> None:
+    """Raise ValueError unless a number is positive and finite."""
+    if not 0.0 < value < np.inf:
+        raise ValueError(f"{name} must be positive and finite: {value} came")
+
+
 def set_counts(settings: object, least: Mapping[str, int]) -> None:
     """Check fields of a frozen value that hold whole numbers, and keep each as an int.
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.names import check_state
-from ep2sindy.runtime.values import check_count
+from ep2sindy.runtime.values import check_count, check_positive
 from ep2sindy.signals.spectrum import is_uniform
 
 # The chain forgets how it was started: after this many delays, e^-3 of it is left in one stage, and
@@ -49,8 +49,7 @@ class Delay:
     def __post_init__(self) -> None:
         check_state(self.state)
         check_count("n_stages", self.n_stages)
-        if not 0.0 < self.delay_s < np.inf:
-            raise ValueError(f"delay_s must be positive and finite: {self.delay_s} came")
+        check_positive("delay_s", self.delay_s)
 
     @property
     def names(self) -> tuple[str, ...]:

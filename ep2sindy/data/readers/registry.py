@@ -16,6 +16,7 @@ from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_
 from ep2sindy.data.readers.tables import EXCEL, PARQUET
 from ep2sindy.data.readers.tdms import TDMS
 from ep2sindy.data.readers.zarr import ZARR
+from ep2sindy.runtime.screen import joined
 from ep2sindy.trust.guard import look_through_first
 from ep2sindy.trust.limits import check_kind
 
@@ -58,7 +59,7 @@ def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
     if any(claims):
         return readers[claims.index(max(claims))]
     if look.form == "folder":
-        folders = _join_names([e for r in readers if r.form == "folder" for e in r.endings])
+        folders = joined([e for r in readers if r.form == "folder" for e in r.endings], "or")
         counts = Counter(each.suffix for each in path.iterdir() if each.is_file() and each.suffix)
         way_out = ", with no files in it"
         if counts:
@@ -68,13 +69,9 @@ def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
             f"a file must come, or a folder that ends in {folders}: {path} is a folder{way_out}"
         )
     by_ending = [r for r in readers if r.form in ("other", "folder")]
-    kinds = _join_names([r.name for r in readers if r not in by_ending])
-    endings = _join_names([ending for r in by_ending for ending in r.endings])
+    kinds = joined([r.name for r in readers if r not in by_ending], "or")
+    endings = joined([ending for r in by_ending for ending in r.endings], "or")
     raise ValueError(
         f"a file must be {kinds}, or end in {endings}: "
         f"{path} begins with {look.head!r}; its ending may be wrong, or its content damaged"
     )
-
-
-def _join_names(names: Sequence[str]) -> str:
-    return " or ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)

@@ -16,8 +16,8 @@ import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.fields import channel_length_m
-from ep2sindy.data.numbers import seconds
-from ep2sindy.library.units import calendar_unit, seconds_in
+from ep2sindy.data.numbers import count_dates
+from ep2sindy.library.units import seconds_in
 from ep2sindy.trust.limits import ALWAYS, check_declared
 
 # xarray must keep times as numbers, whatever their attribute `units` says.
@@ -202,11 +202,8 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
 
 
 def counted_dates(dates: pd.Series) -> xr.DataArray:
-    """Dates as numbers from the first one, in the longest of days, hours, minutes and seconds that
-    is no longer than a usual step.
-    """
-    elapsed_s = seconds(dates.to_numpy(dtype="datetime64[ns]"))
-    unit = calendar_unit(float(np.nanmedian(np.abs(np.diff(elapsed_s)))) if len(dates) > 1 else 0.0)
+    """Dates or durations as numbers in the unit that `count_dates` gives."""
+    elapsed_s, unit = count_dates(dates)
     return xr.DataArray(elapsed_s / seconds_in(unit), attrs={"units": unit})
 
 

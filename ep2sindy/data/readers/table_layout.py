@@ -419,6 +419,11 @@ def _split_name(name: str) -> tuple[str, str]:
     return (found[1].strip(), found[2].strip()) if found and is_count(found[2]) else (name, "")
 
 
+def unit_in_brackets(name: str) -> str:
+    """Unit at the end of a name, as in `Time (ms)` or `I_d [mA]`; "" if no unit stands there."""
+    return _plain(_split_name(name)[1]) if WITH_UNIT[0].fullmatch(name) else ""
+
+
 def _plain(unit: str) -> str:
     """Normalise a unit: `Volt` and `μs` become `volt` and `us`."""
     unit = unit.strip().replace("µ", "u").replace("μ", "u")

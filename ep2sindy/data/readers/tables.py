@@ -82,19 +82,20 @@ def _joined(path: Path, sheets: Mapping[str, FileSource], words: str) -> FileSou
 
 
 def read_parquet(path: Path) -> FileSource:
-    """Read a table of Parquet; its index, if it has a name or holds dates, is its first column.
+    """Read a table of Parquet.
 
-    Units may stand in names, as in `read_csv`. Dates are counted from the first one.
+    Its index, if it has a name or holds dates or durations, is its first column. Units may stand in
+    names, as in `read_csv`. Dates are counted from the first one.
     """
     frame = pd.read_parquet(path, engine="pyarrow")
-    if frame.index.name is not None or frame.index.dtype.kind == "M":
+    if frame.index.name is not None or frame.index.dtype.kind in "mM":
         frame = frame.reset_index()
     header = split_names([str(name) for name in frame.columns])
     places = {name: k for k, name in enumerate(header.names)}
 
     def read(name: str) -> xr.DataArray:
         column = frame.iloc[:, places[name]]
-        if column.dtype.kind == "M":
+        if column.dtype.kind in "mM":
             return counted_dates(column)
         attrs = {"units": header.units[places[name]]}
         if column.dtype.kind in "iufb":  # with masked ones, whose missing values become NaN
