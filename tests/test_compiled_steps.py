@@ -7,6 +7,7 @@ import torch
 import ep2sindy as ep
 from ep2sindy.model.scaled import ScaledModel
 from ep2sindy.model.stability import LimitCycle, share_reaching
+from ep2sindy.refinement.kernels import gap_sizes, squares, triangles
 from ep2sindy.refinement.ode import ODE, Augmented, Drive, augment
 from ep2sindy.refinement.steps import RungeKutta
 from tests.models import model_of
@@ -44,6 +45,34 @@ def test_compiled_steps_are_those_of_torchdiffeq(
     for ours, torchs in zip(fast, slow, strict=True):
         assert ours.shape == torchs.shape
         np.testing.assert_allclose(ours, torchs, rtol=1e-11, atol=1e-13)
+    held = system.held(torch.tensor(scaling))
+    alone = RungeKutta(n_substeps).maps(held, drive, scaling[:, :0], nodes)
+    np.testing.assert_allclose(alone, slow[0][..., [0, 1, -1]], rtol=1e-11, atol=1e-13)
+
+
+def test_triangles_are_those_of_lapack() -> None:
+    rows = np.random.default_rng(0).normal(size=(3, 9, 4))
+    rows[1, :, 2] = 0.0
+    plain = np.linalg.qr(rows, mode="r")
+    for ours, theirs in zip(triangles(rows), plain, strict=True):
+        np.testing.assert_allclose(ours.T @ ours, theirs.T @ theirs, atol=1e-13)
+        np.testing.assert_array_equal(np.tril(ours, -1), 0.0)
+    rows[2, 3, 1] = np.nan
+    assert np.isfinite(triangles(rows)).all(axis=(1, 2)).tolist() == [True, True, False]
+
+
+def test_sizes_of_residuals_and_gaps_are_those_of_arrays() -> None:
+    rng = np.random.default_rng(1)
+    nodes, data = rng.normal(size=(2, 3, 4, 5, 2))
+    maps, weights = rng.normal(size=(3, 4, 4, 2, 6)), rng.normal(size=(3, 2))
+    plain = np.square(weights[:, None, None] * (nodes - data)).sum(axis=(1, 2, 3))
+    np.testing.assert_allclose(squares(nodes, data, weights), plain, rtol=1e-14)
+    gaps = maps[..., -1] - nodes[:, :, 1:]
+    norm, largest = gap_sizes(maps, nodes)
+    np.testing.assert_allclose(norm, np.sqrt(np.square(gaps).sum(axis=(1, 2, 3))), rtol=1e-14)
+    np.testing.assert_array_equal(largest, np.abs(gaps).max(axis=(1, 2, 3)))
+    maps[1, 2, 1, 0, -1] = np.nan
+    assert np.isnan(gap_sizes(maps, nodes)).tolist() == [[False, True, False]] * 2
 
 
 def test_starts_that_a_kernel_brings_near_the_end_reach_what_a_loop_reaches(

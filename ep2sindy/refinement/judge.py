@@ -214,7 +214,7 @@ def integrate(problem: RefinementProblem, fit: RefinementFit) -> tuple[Refinemen
         maps = step_maps(problem, fit.step, fit.scaling, nodes, points) if known is None else known
         known = None
         with np.errstate(invalid="ignore", over="ignore"):
-            gaps = np.abs(maps[:, :, 0] - nodes[:, :, 1:].transpose(0, 3, 1, 2)).max(axis=(1, 2, 3))
+            gaps = np.abs(maps[..., -1] - nodes[:, :, 1:]).max(axis=(1, 2, 3))
         open_points = np.flatnonzero(finite & ~(gaps < CLOSED))
         if not open_points.size or not np.isfinite(gaps[open_points]).all():
             break
@@ -240,7 +240,7 @@ def integrate_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndar
     for _ in range(CLOSING_STEPS):
         maps = step_maps(problem, fit.step, fit.scaling, nodes, points)
         with np.errstate(invalid="ignore", over="ignore"):
-            gaps = np.abs(maps[:, :, 0] - nodes[:, :, 1:].transpose(0, 3, 1, 2)).max(axis=(1, 3))
+            gaps = np.abs(maps[..., -1] - nodes[:, :, 1:]).max(axis=(2, 3))
         is_open = np.isfinite(gaps) & ~(gaps < CLOSED)
         if not is_open.any():
             break
@@ -296,9 +296,9 @@ def step_triangles(problem: RefinementProblem, fit: RefinementFit, maps: np.ndar
 
     The error of a step is its difference from two steps of half its length.
     """
-    error = fit.step.finer(problem.system, problem.one_step, fit.scaling, fit.nodes) - maps[:, :, 0]
+    error = fit.step.finer(problem.system, problem.one_step, fit.scaling, fit.nodes) - maps[..., -1]
     shifted = maps.copy()
-    shifted[:, :, 0] = fit.nodes[:, :, 1:].transpose(0, 3, 1, 2) + error
+    shifted[..., -1] = fit.nodes[:, :, 1:] + error
     n_start, window = problem.n_start, fit.nodes.shape[2]
     condensed = condense(shifted, fit.nodes, fit.nodes, fit.weights, window, n_start)
     return condensed[..., n_start:, n_start:]

@@ -1,7 +1,7 @@
 """Compiled recurrences over windows: condense linearised trajectories, propagate their changes.
 
-maps: (points, n, 1 + n + p, windows, steps): the end of each step from its node, and the
-derivatives of this end by the node and by the p scalings. nodes: (points, windows, samples, n).
+maps: (points, windows, steps, n, n + p + 1): derivatives of the end of each step by its node and
+by the p scalings, then this end itself. nodes: (points, windows, samples, n).
 A block is a stretch of `block` samples with its own start. n_start is n if the starts are free,
 0 if they are fixed to the data. Columns of a condensed system: the block's start, the scalings,
 the right-hand side.
@@ -48,16 +48,16 @@ def _advance(
 ) -> None:
     """Propagate the columns of `x` (n, columns) over step k; the last column is the defect."""
     n, n_columns = x.shape
-    n_start = n_columns - 1 - (maps.shape[2] - 1 - n)
+    n_start = n_columns - (maps.shape[4] - n)
     for j in range(n):
         new[j] = 0.0
         for v in range(n):
-            slope = maps[p, j, 1 + v, w, k]  # read once for all columns, which then fill a vector
+            slope = maps[p, w, k, j, v]  # read once for all columns, which then fill a vector
             for c in range(n_columns):
                 new[j, c] += slope * x[v, c]
         for c in range(n_start, n_columns - 1):
-            new[j, c] += maps[p, j, 1 + n + c - n_start, w, k]
-        new[j, n_columns - 1] += maps[p, j, 0, w, k] - nodes[p, w, k + 1, j]
+            new[j, c] += maps[p, w, k, j, n + c - n_start]
+        new[j, n_columns - 1] += maps[p, w, k, j, maps.shape[4] - 1] - nodes[p, w, k + 1, j]
     for j in range(n):
         for c in range(n_columns):
             x[j, c] = new[j, c]
@@ -77,7 +77,7 @@ def condense(
     data: (points, windows, samples, n); weights: (points, n).
     Returns (points, windows, blocks, columns, columns).
     """
-    n_points, n, width, n_windows, n_steps = maps.shape
+    n_points, n_windows, n_steps, n, width = maps.shape
     n_columns = n_start + width - n
     n_blocks = (n_steps + block) // block
     out = np.zeros((n_points, n_windows, n_blocks, n_columns, n_columns))
@@ -110,6 +110,54 @@ def condense(
 
 
 @compiled
+def triangles(rows: np.ndarray) -> np.ndarray:
+    """R of QR decompositions, (problems, size, size), of rows (problems, rows, size)."""
+    n_problems, n_rows, size = rows.shape
+    out, columns = np.zeros((n_problems, size, size)), np.empty((size, n_rows))
+    for p in range(n_problems):
+        for r in range(n_rows):
+            for c in range(size):
+                columns[c, r] = rows[p, r, c]
+        _triangle(columns, n_rows, out[p])
+    return out
+
+
+@compiled(fastmath={"reassoc", "contract"})
+def squares(nodes: np.ndarray, data: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Sum of squares of weights (points, n) * (nodes - data), by point."""
+    out = np.zeros(len(nodes))
+    for p in range(len(nodes)):
+        ours, theirs = nodes[p].reshape(-1, nodes.shape[3]), data[p].reshape(-1, nodes.shape[3])
+        for j in range(nodes.shape[3]):
+            total = 0.0
+            for k in range(len(ours)):
+                total += (ours[k, j] - theirs[k, j]) ** 2
+            out[p] += weights[p, j] ** 2 * total
+    return out
+
+
+@compiled
+def gap_sizes(maps: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Root of the sum of squares of the gaps between ends of steps and nodes, and the largest gap.
+
+    (points,) each, NaN where a gap is.
+    """
+    n_points, n_windows, n_steps, n, width = maps.shape
+    norm, largest = np.empty(n_points), np.empty(n_points)
+    for p in range(n_points):
+        total = most = 0.0
+        for w in range(n_windows):
+            for k in range(n_steps):
+                for j in range(n):
+                    gap = maps[p, w, k, j, width - 1] - nodes[p, w, k + 1, j]
+                    total += gap * gap
+                    most = max(most, abs(gap))
+        norm[p] = np.sqrt(total)
+        largest[p] = total if np.isnan(total) else most  # a maximum may pass over NaN
+    return norm, largest
+
+
+@compiled
 def starts(condensed: np.ndarray, change: np.ndarray, n: int) -> np.ndarray:
     """Best change of each block's free start for a given change of the scalings (points, p).
 
@@ -137,9 +185,10 @@ def propagate(
 ) -> np.ndarray:
     """Changes of the nodes that close the linearised defects inside each block.
 
-    start: (points, windows, blocks, n), change of each block's first node; change: (points, p).
+    start: (points, windows, blocks, n), change of each block's first node; change: (points, p) and
+    more, of which the columns that the maps lack have no effect.
     """
-    n_points, n, _, n_windows, n_steps = maps.shape
+    n_points, n_windows, n_steps, n, width = maps.shape
     out = np.empty(nodes.shape)
     for p in range(n_points):
         for w in range(n_windows):
@@ -148,10 +197,10 @@ def propagate(
                     out[p, w, k] = start[p, w, k // block]
                     continue
                 for j in range(n):
-                    total = maps[p, j, 0, w, k - 1] - nodes[p, w, k, j]
+                    total = maps[p, w, k - 1, j, width - 1] - nodes[p, w, k, j]
                     for v in range(n):
-                        total += maps[p, j, 1 + v, w, k - 1] * out[p, w, k - 1, v]
-                    for i in range(change.shape[1]):
-                        total += maps[p, j, 1 + n + i, w, k - 1] * change[p, i]
+                        total += maps[p, w, k - 1, j, v] * out[p, w, k - 1, v]
+                    for i in range(width - 1 - n):
+                        total += maps[p, w, k - 1, j, n + i] * change[p, i]
                     out[p, w, k, j] = total
     return out

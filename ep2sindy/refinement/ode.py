@@ -213,6 +213,12 @@ class Augmented:
     def take(self, points: torch.Tensor) -> Augmented:
         return replace(self, basis=self.basis[points], offset=self.offset[points])
 
+    def held(self, scaling: torch.Tensor) -> Augmented:
+        """The same with scalings (points, free) as they are, without derivatives by them."""
+        shape = (len(scaling), self.n_states, self.n_columns, -1)
+        weights = self.weights(scaling).view(shape)[:, :, : 1 + self.n_states].flatten(1, 2)
+        return replace(self, basis=weights.new_zeros((*weights.shape, 0)), offset=weights)
+
     def weights(self, scaling: torch.Tensor) -> torch.Tensor:
         """Weights of the products, (points, rows, products), for scalings (points, free)."""
         return (self.basis @ scaling[:, None, :, None])[..., 0] + self.offset

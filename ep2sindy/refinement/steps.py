@@ -36,7 +36,7 @@ class Step(Protocol):
     def finer(
         self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
     ) -> np.ndarray:
-        """End of each step, taken as two half steps: (points, n_states, windows, segments)."""
+        """End of each step, taken as two half steps: (points, windows, segments, n_states)."""
         ...
 
     def halved(self) -> Step | None:
@@ -61,7 +61,12 @@ class RungeKutta:
         self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
     ) -> np.ndarray:
         if system.compiled:
-            return _compiled_ends(system, drive, scaling, nodes, self.n_substeps)
+            shape = (*nodes[:, :, 1:].shape, system.n_columns)
+            maps = np.zeros(shape)
+            columns = maps.reshape(len(maps), -1, *shape[3:])
+            ends = _compiled_ends(system, drive, scaling, nodes, self.n_substeps, columns)
+            maps[..., -1] = ends.reshape(shape[:-1])
+            return maps
         x = _batch(nodes[:, :, :-1], system)
         n = system.n_states
         z = x.new_zeros((len(x), n, system.n_columns, x.shape[-1]))
@@ -70,19 +75,20 @@ class RungeKutta:
             z[:, j, 1 + j] = 1.0
         with torch.inference_mode():
             end = _end(system.rhs(_tensor(scaling, system), drive), z, self.n_substeps)
-        return end.cpu().numpy().reshape(*end.shape[:3], nodes.shape[1], -1)
+        return _as_maps(end, nodes)
 
     def finer(
         self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
     ) -> np.ndarray:
         if system.compiled:
-            ends = _compiled_ends(system, drive, scaling, nodes, 2 * self.n_substeps, alone=True)
-            return ends[:, :, 0]
+            none = np.empty((len(nodes), nodes[0, :, 1:, 0].size, system.n_states, 0))
+            ends = _compiled_ends(system, drive, scaling, nodes, 2 * self.n_substeps, none)
+            return ends.reshape(nodes[:, :, 1:].shape)
         x = _batch(nodes[:, :, :-1], system)
         with torch.inference_mode():
             rhs = system.value_rhs(_tensor(scaling, system), drive)
             end = _end(rhs, x, 2 * self.n_substeps)
-        return end.cpu().numpy().reshape(*end.shape[:2], nodes.shape[1], -1)
+        return end.permute(0, 2, 1).cpu().numpy().reshape(nodes[:, :, 1:].shape)
 
     def halved(self) -> RungeKutta | None:
         return RungeKutta(2 * self.n_substeps) if self.n_substeps < 8 else None
@@ -104,30 +110,28 @@ def _compiled_ends(
     scaling: np.ndarray,
     nodes: np.ndarray,
     n_substeps: int,
-    *,
-    alone: bool = False,
+    slopes: np.ndarray,
 ) -> np.ndarray:
-    """Ends of the steps and their derivatives, in the layout of `Step.maps`, by the kernel.
+    """Ends of the steps by the kernel, (points, steps, n_states); derivatives go to `slopes`.
 
-    alone: the ends only, as one column.
+    slopes: (points, steps, n_states, columns), by the nodes, by the scalings, and a column that
+    stays as it is; no columns if no derivatives are wanted.
     """
-    points, n_windows, n_samples, n = nodes.shape
+    points, n = len(nodes), nodes.shape[-1]
     starts = np.ascontiguousarray(nodes[:, :, :-1]).reshape(points, -1, n)
-    n_columns = 1 if alone else system.n_columns
+    n_columns = max(1, slopes.shape[3])
     weights = system.weights(_tensor(scaling, system)).numpy()
     weights = weights.reshape(points, n, system.n_columns, -1)[:, :, :n_columns]
     steps = drive.steps[0].numpy() / n_substeps
     elapsed = np.linspace(0.0, 1.0, 3 * n_substeps + 1)
     powers = np.stack([elapsed**3, elapsed**2, elapsed, np.ones_like(elapsed)], axis=1)
     inputs = np.einsum("uk,kpib->pubi", powers, drive.inputs[0].numpy())
-    out = np.empty((points, n, n_columns, starts.shape[1]))
+    ends = np.empty_like(starts)
     for k, start in enumerate(starts):
-        ends, slopes = np.empty_like(start), np.zeros((*start.shape, n_columns - 1))
         equations = _equations(system.library.table, weights[k])
         at, length = np.ascontiguousarray(inputs[k]), np.ascontiguousarray(steps[k])
-        advance(start, at, length, THREE_EIGHTHS, equations, ends, slopes)
-        out[k, :, 0], out[k, :, 1:] = ends.T, slopes.transpose(1, 2, 0)
-    return out.reshape(points, n, n_columns, n_windows, n_samples - 1)
+        advance(start, at, length, THREE_EIGHTHS, equations, ends[k], slopes[k])
+    return ends
 
 
 def _equations(
@@ -175,7 +179,7 @@ class HermiteSimpson:
             left = _batch(nodes[:, :, :-1], system)
             right = _batch(nodes[:, :, 1:], system)
             end = _collocate(system, drive, _tensor(scaling, system), left, right)
-        return end.cpu().numpy().reshape(*end.shape[:3], nodes.shape[1], -1)
+        return _as_maps(end, nodes)
 
     def finer(
         self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
@@ -191,8 +195,7 @@ class HermiteSimpson:
             halves = halves + change
             if not np.abs(change).max() > 1e-12:
                 break
-        shape = (points, n, nodes.shape[1], -1)
-        return halves[:, :, 2].transpose(0, 2, 1).reshape(shape)
+        return halves[:, :, 2].reshape(nodes[:, :, 1:].shape)
 
     def halved(self) -> None:
         return None
@@ -206,6 +209,12 @@ def _batch(nodes: np.ndarray, system: Augmented) -> torch.Tensor:
     """Reshape (points, windows, samples, n_states) to a tensor (points, n_states, batch)."""
     flat = nodes.reshape(len(nodes), -1, nodes.shape[-1]).transpose(0, 2, 1)
     return _tensor(np.ascontiguousarray(flat), system)
+
+
+def _as_maps(end: torch.Tensor, nodes: np.ndarray) -> np.ndarray:
+    """The layout of `Step.maps` for (points, n_states, columns, batch), the ends first."""
+    columns = end.roll(-1, dims=2).permute(0, 3, 1, 2).contiguous()
+    return columns.cpu().numpy().reshape(*nodes[:, :, 1:].shape, -1)
 
 
 def _end(

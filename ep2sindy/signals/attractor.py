@@ -35,6 +35,10 @@ N_QUANTILES = 256
 
 BANDS_PER_OCTAVE = 3
 
+# Least ratio of the diagonal elements of a triangular factor that products of columns give to
+# twelve digits or more.
+WELL_CONDITIONED = 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class Cycle:
@@ -141,9 +145,10 @@ def _phase(
 def _left(phase: np.ndarray, scaled: np.ndarray, order: int) -> np.ndarray:
     """What a Fourier series in the phase leaves of the squares of every state that varies."""
     scaled = scaled[:, scaled.any(axis=0)]
-    basis = np.linalg.qr(_columns(phase, order))[0]
+    columns = _columns(phase, order)
+    known = np.linalg.solve(_triangle(columns).T, columns.T @ scaled)
     whole = np.square(scaled).sum(axis=0)
-    return np.maximum(whole - np.square(basis.T @ scaled).sum(axis=0), 1e-12 * whole)
+    return np.maximum(whole - np.square(known).sum(axis=0), 1e-12 * whole)
 
 
 def _line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
@@ -227,18 +232,21 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
     One Gauss-Newton step: the residual of the series is regressed on the change of slope.
     """
     columns = _columns(phase, order)
-    basis, triangle = np.linalg.qr(columns)
-    known = basis.T @ scaled
-    series = np.linalg.solve(triangle, known)
+    triangle = _triangle(columns)
+
+    def fitted(values: np.ndarray) -> np.ndarray:
+        return np.linalg.solve(triangle, np.linalg.solve(triangle.T, columns.T @ values))
+
+    series = fitted(scaled)
     orders = np.arange(1, order + 1)
     slope = np.zeros_like(series)  # derivative of the series by the phase
     slope[1::2] = orders[:, None] * series[2::2]
     slope[2::2] = -orders[:, None] * series[1::2]
     since = (t - t.mean()) / (t[-1] - t[0])
     direction = (columns @ slope) * since[:, None]
-    direction -= basis @ (basis.T @ direction)
+    direction -= columns @ fitted(direction)
     size = float(np.square(direction).sum())
-    change = float((direction * (scaled - basis @ known)).sum()) / size if size > 0.0 else 0.0
+    change = float((direction * (scaled - columns @ series)).sum()) / size if size > 0.0 else 0.0
     # At most half a period over the record: a larger change would reach another spectral line.
     return phase + float(np.clip(change, -np.pi, np.pi)) * since
 
@@ -253,6 +261,22 @@ def _columns(phase: np.ndarray, order: int) -> np.ndarray:
     columns = np.empty((len(phase), 1 + 2 * order))
     columns[:, 0], columns[:, 1::2], columns[:, 2::2] = 1.0, turns.real.T, turns.imag.T
     return columns
+
+
+def _triangle(columns: np.ndarray) -> np.ndarray:
+    """R of columns = Q R but for signs; the basis Q, which takes long to form, is not needed.
+
+    Harmonics over some periods are nearly orthogonal, so that R follows from the columns' products
+    (Cholesky). Where it does not, because samples cluster in the phase, it is found by reflections.
+    """
+    try:
+        triangle: np.ndarray = np.linalg.cholesky(columns.T @ columns).T
+    except np.linalg.LinAlgError:
+        triangle = np.zeros((1, 1))
+    size = np.diagonal(triangle)
+    if size.min() > WELL_CONDITIONED * size.max():
+        return triangle
+    return np.asarray(np.linalg.qr(columns, mode="r"))
 
 
 def _most_harmonics(n_samples: int, n_periods: float) -> int:
@@ -270,8 +294,9 @@ def _series(
     chosen: if true, BIC chooses the number of harmonics, up to `most`.
     """
     # The columns are ordered, so one factorisation gives the fits of every number of harmonics.
-    basis, triangle = np.linalg.qr(_columns(phase, most))
-    known = basis.T @ scaled
+    columns = _columns(phase, most)
+    triangle = _triangle(columns)
+    known = np.linalg.solve(triangle.T, columns.T @ scaled)
     whole = np.square(scaled).sum(axis=0)
     left = np.maximum(whole - np.cumsum(np.square(known), axis=0)[::2], 1e-12 * whole)
     order = most

@@ -7,8 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ep2sindy.refinement.kernels import condense, propagate, starts
-from ep2sindy.refinement.ode import Drive
+from ep2sindy.refinement.kernels import (
+    condense,
+    gap_sizes,
+    propagate,
+    squares,
+    starts,
+    triangles,
+)
+from ep2sindy.refinement.ode import Augmented, Drive
 from ep2sindy.refinement.problem import (
     Iteration,
     LawMap,
@@ -115,18 +122,20 @@ class MultipleShooting:
         window = walk.problem.data.shape[2]
         walk = walk.stage(window, points, tolerance=self.tolerance, max_iter=self.max_iter)
         walk = walk.join(points).marked(window, points)
-        return replace(walk.state, maps=walk.maps)
+        is_whole = walk.system is walk.problem.system
+        return replace(walk.state, maps=walk.maps if is_whole else None)
 
 
 @dataclass(frozen=True, eq=False)
 class _Walk:
     """State of a fit between two iterations, with the one-step maps at its nodes.
 
-    damping: (points,), zero for whole Gauss-Newton steps. price: (points,), of the gaps between
-    steps, in the sum that an iteration must lower.
+    system: the equations whose maps these are. damping: (points,), zero for whole Gauss-Newton
+    steps. price: (points,), of the gaps between steps, in the sum that an iteration must lower.
     """
 
     problem: RefinementProblem
+    system: Augmented
     state: RefinementFit
     maps: np.ndarray
     damping: np.ndarray
@@ -137,8 +146,8 @@ class _Walk:
         points = np.arange(len(state.nodes))
         maps = step_maps(problem, state.step, state.scaling, state.nodes, points)
         sound = problem.agree(np.isfinite(maps).all(axis=(1, 2, 3, 4)), np.all)
-        zeros = np.zeros(len(points))
-        return _Walk(problem, replace(state, finite=state.finite & sound), maps, zeros, zeros)
+        zeros, state = np.zeros(len(points)), replace(state, finite=state.finite & sound)
+        return _Walk(problem, problem.system, state, maps, zeros, zeros)
 
     @property
     def window(self) -> int:
@@ -173,7 +182,7 @@ class _Walk:
     def marked(self, memory: int, points: np.ndarray) -> _Walk:
         """The same with this memory noted at points that it leaves without gaps."""
         ends, nodes = self.pulled(self.maps[points], points, memory), self.state.nodes[points]
-        closed = (largest_gap(gaps(ends, nodes)) < ROUGH) & self.state.finite[points]
+        closed = (gap_sizes(ends, nodes)[1] < ROUGH) & self.state.finite[points]
         reached = self.memories.copy()
         reached[points[self.problem.agree(closed, np.all)]] = memory
         return replace(self, state=replace(self.state, memory=reached))
@@ -204,20 +213,29 @@ class _Walk:
         """Close the gaps that are left, by the nodes alone; where it fails, all stays as it was."""
         walk = replace(self, damping=np.zeros_like(self.damping))
         for _ in range(JOINING_STEPS):
-            defect = largest_gap(gaps(walk.maps[points], walk.state.nodes[points]))
+            _, defect = gap_sizes(_part(walk.maps, points), _part(walk.state.nodes, points))
             is_open = self.state.finite[points] & ~self.state.finished[points] & (defect > JOINED)
             is_open = self.problem.agree(is_open, np.any)
             if not is_open.any():
                 break
+            if walk.system is self.system:
+                walk = walk.held()
             walk = walk.iterate(points[is_open], self.window, 0.0, hold=True)
         return walk
+
+    def held(self) -> _Walk:
+        """The same with the scalings held, and without derivatives by them."""
+        scaling = torch.tensor(self.state.scaling, device=self.problem.device)
+        system, n = self.system.held(scaling), self.system.n_states
+        maps = np.concatenate([self.maps[..., :n], self.maps[..., -1:]], axis=-1)
+        return replace(self, system=system, maps=maps)
 
     def iterate(
         self, active: np.ndarray, memory: int, tolerance: float, *, hold: bool = False
     ) -> _Walk:
         """One damped step of the active points; where it gains nothing, more damping instead.
 
-        hold: leave the scalings as they are.
+        hold: leave the scalings as they are, in a walk that holds them.
         """
         problem, state, damping = self.problem, self.state, self.damping[active]
         maps = self.pulled(_part(self.maps, active), active, memory)
@@ -230,17 +248,18 @@ class _Walk:
         scaling, nodes = state.scaling.copy(), state.nodes.copy()
         scaling[active] += change
         nodes[active] += share[:, None, None, None] * moved
-        raw = step_maps(problem, state.step, scaling, nodes, active)
+        raw = step_maps(problem, state.step, scaling, nodes, active, self.system)
         ahead = self.pulled(raw, active, memory)
-        gap, gap_ahead = gaps(maps, state.nodes[active]), gaps(ahead, nodes[active])
-        better, price = self._compare(active, moved, nodes[active], gap, gap_ahead)
+        size, defect = gap_sizes(maps, state.nodes[active])
+        size_ahead, defect_ahead = gap_sizes(ahead, nodes[active])
+        better, price = self._compare(active, moved, nodes[active], size, size_ahead)
         if hold:
-            better = problem.agree(norm(gap_ahead) < norm(gap), np.all)
+            better = problem.agree(size_ahead < size, np.all)
         kept = active[~better]
         scaling[kept], nodes[kept] = state.scaling[kept], state.nodes[kept]
         size = np.maximum(np.abs(scaling[active]), 1e-3)
         relative = np.abs(change / size).max(axis=1, initial=0.0)
-        defect = largest_gap(np.where(better[:, None, None, None], gap_ahead, gap))
+        defect = np.where(better, defect_ahead, defect)
         done = better & (share == 1.0) & (relative < tolerance) & (defect < tolerance)
         finished = _put(state.finished, active, problem.agree(done, np.all))
         tell(problem, memory, scaling, nodes, active, relative=relative, defect=defect)
@@ -262,21 +281,20 @@ class _Walk:
         active: np.ndarray,
         moved: np.ndarray,
         nodes: np.ndarray,
-        gap: np.ndarray,
-        gap_ahead: np.ndarray,
+        size: np.ndarray,
+        size_ahead: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Whether the nodes lower residuals and gaps, and the price of gaps, (points,) each.
 
-        The price is never lowered, and at least twice what closing the gaps will cost.
+        size, size_ahead: norm of the gaps before and after. The price is never lowered, and at
+        least twice what closing the gaps will cost.
         """
         problem, before = self.problem, self.state.nodes[active]
-        data, weights = problem.data[active], self.state.weights[active][:, None, None]
+        data, weights = problem.data[active], self.state.weights[active]
         with np.errstate(over="ignore", invalid="ignore"):
             loss, aim, loss_ahead = (
-                np.square(weights * (x - data)).sum(axis=(1, 2, 3))
-                for x in (before, before + moved, nodes)
+                squares(x, data, weights) for x in (before, before + moved, nodes)
             )
-            size, size_ahead = norm(gap), norm(gap_ahead)
             cost = np.where(size > 0.0, 2.0 * (aim - loss) / np.maximum(size, JOINED), 0.0)
             price = np.maximum(self.price[active], np.where(np.isfinite(cost), cost, 0.0))
             price = problem.agree(price, np.max)
@@ -293,7 +311,7 @@ class _Walk:
         if memory >= self.window:
             return maps
         maps = (1.0 - 1.0 / memory) * maps
-        maps[:, :, 0] += self.problem.data[points][:, :, 1:].transpose(0, 3, 1, 2) / memory
+        maps[..., -1] += self.problem.data[points][:, :, 1:] / memory
         return maps
 
 
@@ -349,14 +367,15 @@ def step_maps(
     scaling: np.ndarray,
     nodes: np.ndarray,
     points: np.ndarray,
+    system: Augmented | None = None,
 ) -> np.ndarray:
-    """One-step maps of the given points."""
-    system, drive = problem.system, problem.one_step
+    """One-step maps of the given points, by the problem's equations unless others are given."""
+    system, drive = problem.system if system is None else system, problem.one_step
     if len(points) < len(nodes):
         index = torch.tensor(points, device=problem.device)
         system = system.take(index)
         drive = Drive(drive.steps[:, index], drive.inputs[:, :, index])
-    return step.maps(system, drive, scaling[points], nodes[points])
+    return step.maps(system, drive, scaling[points, : system.n_free], nodes[points])
 
 
 def newton_step(
@@ -375,9 +394,10 @@ def newton_step(
     nodes, data, n_start = state.nodes[active], problem.data[active], problem.n_start
     window = nodes.shape[2]
     condensed = condense(maps, nodes, data, state.weights[active], window, n_start)
-    unknowns = least_change(condensed[..., n_start:, n_start:], problem.law, damping)
     if damping is None:
-        unknowns = np.zeros_like(unknowns)
+        unknowns = np.zeros_like(state.scaling[active] if state.theta is None else state.theta)
+    else:
+        unknowns = least_change(condensed[..., n_start:, n_start:], problem.law, damping)
     change = unknowns if problem.law is None else problem.law.scaling(unknowns)
     if problem.free_start:
         first = starts(condensed, change, n_start)
@@ -387,22 +407,22 @@ def newton_step(
 
 
 def least_change(
-    triangles: np.ndarray, law: LawMap | None = None, damping: np.ndarray | None = None
+    by_block: np.ndarray, law: LawMap | None = None, damping: np.ndarray | None = None
 ) -> np.ndarray:
     """Change of the unknowns that minimises the condensed residuals of all blocks, or NaN.
 
-    triangles: (points, windows, blocks, size, size), by scaling. Without a law the unknowns are
-    the scalings, (points, free), and each point is solved separately. With a law they are theta,
-    common to all points: H = sum_p spread_p^T R_p^T R_p spread_p, by QR of each R_p, then of all.
+    by_block: triangles, (points, windows, blocks, size, size), by scaling. Without a law the
+    unknowns are the scalings, (points, free), and each point is solved separately. With a law they
+    are theta, common to all points: H = sum_p spread_p^T R_p^T R_p spread_p, by QR of each R_p,
+    then of all.
     """
-    size = triangles.shape[-1]
-    rows = triangles[..., :-1, :].reshape(len(triangles), -1, size)
+    size = by_block.shape[-1]
+    rows = by_block[..., :-1, :].reshape(len(by_block), -1, size)
     if law is None:
         return least_squares(rows, damping)
     if not np.isfinite(rows).all():
         return np.full(law.n_theta, np.nan)
-    joined: np.ndarray = np.linalg.qr(rows, mode="r")  # type: ignore[assignment]
-    rows = law.rows(joined[:, None]).reshape(1, -1, law.n_theta + 1)
+    rows = law.rows(triangles(rows)[:, None]).reshape(1, -1, law.n_theta + 1)
     return least_squares(rows, None if damping is None else damping[:1])[0]
 
 
@@ -414,7 +434,7 @@ def least_squares(rows: np.ndarray, damping: np.ndarray | None = None) -> np.nda
     The solution has the least norm if the rows do not determine a direction.
     """
     size = rows.shape[-1]
-    joined: np.ndarray = np.linalg.qr(rows, mode="r")  # type: ignore[assignment]
+    joined = triangles(rows)
     lost = ~np.isfinite(joined).all(axis=(1, 2))
     joined = np.where(lost[:, None, None], 0.0, joined)
     if damping is not None and damping.any():
@@ -422,29 +442,12 @@ def least_squares(rows: np.ndarray, damping: np.ndarray | None = None) -> np.nda
         extra = np.zeros((len(joined), size - 1, size))
         each = np.arange(size - 1)
         extra[:, each, each] = np.sqrt(damping)[:, None] * length
-        joined = np.asarray(np.linalg.qr(np.concatenate([joined, extra], axis=1), mode="r"))
+        joined = triangles(np.concatenate([joined, extra], axis=1))
     u, strength, vt = np.linalg.svd(joined[:, : size - 1, : size - 1])
     inverse = np.where(strength > RANK * strength[:, :1], 1.0, 0.0) / np.maximum(strength, 1e-300)
     seen = inverse * (u.transpose(0, 2, 1) @ joined[:, : size - 1, size - 1 :])[..., 0]
     change = -(vt.transpose(0, 2, 1) @ seen[..., None])[..., 0]
     return np.where(lost[:, None], np.nan, change)
-
-
-def gaps(maps: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Gaps between the ends of steps and the next nodes, (points, n_states, windows, steps)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return maps[:, :, 0] - nodes[:, :, 1:].transpose(0, 3, 1, 2)
-
-
-def largest_gap(gaps: np.ndarray) -> np.ndarray:
-    """Largest gap of every point, (points,)."""
-    return np.abs(gaps).max(axis=(1, 2, 3))
-
-
-def norm(gaps: np.ndarray) -> np.ndarray:
-    """Root of the sum of squares of the gaps of every point, (points,)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.sqrt(np.square(gaps).sum(axis=(1, 2, 3)))
 
 
 def step_share(moved: np.ndarray, ranges: np.ndarray) -> np.ndarray:
