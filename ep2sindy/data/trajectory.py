@@ -235,12 +235,15 @@ class Trajectory:
     def _headline(self) -> str:
         steps = np.diff(self.t)
         even = np.ptp(steps) <= max(1e-6 * self.dt_s, 2 * rounding_s(self.t))
-        step = f"{self.dt_s:.4g}" if even else f"{steps.min():.4g} to {steps.max():.4g}"
+        clock = self.clock
+        factor, unit = (1.0, "s") if clock == SECONDS else clock.scale(1.0)
+        lengths = [self.dt_s] if even else [float(steps.min()), float(steps.max())]
+        step = " to ".join(f"{factor * each:.4g}" for each in lengths)
         label = f" {self.label!r}" if self.label else ""
         lacking = "" if self.missing is None else f" ({self._lacking()})"
         return (
-            f"Trajectory{label}: {self.n_samples} samples{lacking}, t = {self.t[0]:.6g} to "
-            f"{self.t[-1]:.6g} s in steps of {step} s"
+            f"Trajectory{label}: {self.n_samples} samples{lacking}, t = {factor * self.t[0]:.6g} "
+            f"to {factor * self.t[-1]:.6g} {unit} in steps of {step} {unit}"
         )
 
     def _ranges(self) -> list[list[str]]:

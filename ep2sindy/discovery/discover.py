@@ -76,10 +76,11 @@ def _discovery(
     test = noise_test(choice, runs, estimate=found.estimate)
     # If residuals of its rows exceed the noise, intervals would not cover the truth.
     withheld = bool(choice.left is not None and test.left and test.misfit)
+    model = replace(choice.model, clock=runs[0].clock)
     return Discovery(
         fronts={front.equation: front for front in choice.fronts},
         chosen={each.equation: _as_in(choice.model, each) for each in choice.chosen},
-        model=replace(choice.model, covariance=None) if withheld else choice.model,
+        model=replace(model, covariance=None) if withheld else model,
         method=method,
         ambiguities=found.ambiguities,
         noise_test=test,

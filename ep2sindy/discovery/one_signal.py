@@ -41,7 +41,7 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.kept import Once, at_once
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
-from ep2sindy.runtime.screen import N_LINES, one_screen
+from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.embedding import (
@@ -377,7 +377,7 @@ class SignalDiscovery:
             f"{self.signal.name}: {self.best.chosen.embedding.says} ({self.best.chosen.reason})",
             f"run freely over {where}: {self.free.run.text}",
         ]
-        tail = [self.discovery.note] if self.discovery.note else []
+        tail = sentences(self.discovery.note) if self.discovery.note else []
         n_lines = N_LINES - len(head) - len(tail)
         return one_screen([*head, *model_lines(self.model, n_lines=n_lines), *tail])
 

@@ -30,7 +30,7 @@ from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
 from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.files import read_json, write_text
-from ep2sindy.runtime.screen import N_LINES, one_screen
+from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -96,7 +96,7 @@ class Discovery:
     def simulate(
         self,
         t: ArrayLike,
-        x0: ArrayLike,
+        x0: ArrayLike | Mapping[str, float],
         inputs: ArrayLike | Mapping[str, Any] | None = None,
         *,
         draws: int = 0,
@@ -181,10 +181,11 @@ class Discovery:
         return read_stored(Path(path), Discovery.from_json)
 
     def __repr__(self) -> str:
-        notes = [f"note: {each}" for each in self._notes()[:MAX_NOTES]]
-        left = len(self._notes()) - len(notes)
+        shown = self._notes()[:MAX_NOTES]
+        notes = [line for each in shown for line in sentences(f"note: {each}")]
+        left = len(self._notes()) - len(shown)
         tail = [*notes, *([f"... {left} more notes"] if left else [])]
-        head = [self._headline(), *([self.note] if self.note else [])]
+        head = [self._headline(), *(sentences(self.note) if self.note else [])]
         body = model_lines(self.model, n_lines=N_LINES - len(head) - len(tail))
         return one_screen([*head, *body, *tail])
 

@@ -348,7 +348,7 @@ def _rivals(
 
 
 def _few(problem: EstimationProblem, max_terms: int) -> str:
-    if enough_samples(problem):
+    if enough_samples(problem) or problem.candidates.required.all():  # or all terms are given
         return ""
     n_terms = len(problem.candidates.library)
     return (

@@ -389,12 +389,16 @@ class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
     def __init__(self, expression: sympy.Expr) -> None:
         self.expression = expression
 
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"it uses .{name}")
+
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *args: Any, **settings: Any) -> Any:
         import sympy
 
         name = ufunc.__name__
         if method != "__call__" or settings or name not in {**ARITHMETIC, **SYMPY_NAMES}:
-            return NotImplemented
+            used = f"np.{name}" if method == "__call__" else f"np.{name}.{method}"
+            raise TypeError(f"it uses {used}")
         of = ARITHMETIC[name] if name in ARITHMETIC else getattr(sympy, SYMPY_NAMES[name])
         return Recorded(of(*map(_recorded, args)))
 

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from ep2sindy.library.equations import equation_html, equation_parts
-from ep2sindy.library.units import unit_product
+from ep2sindy.library.units import Clock
 from ep2sindy.model.rollout import Equations
 from ep2sindy.runtime.screen import N_LINES, cut, wrap
 
@@ -22,6 +22,9 @@ class Readable(Equations, Protocol):
 
     @property
     def covariance(self) -> np.ndarray | None: ...
+
+    @property
+    def clock(self) -> Clock: ...
 
     def terms(self, state: str) -> dict[str, float]: ...
 
@@ -41,7 +44,8 @@ def model_lines(model: Readable, *, n_lines: int = N_LINES) -> list[str]:
     spare = n_lines - len(tail) - len(states)
     lines: list[str] = []
     for k, state in enumerate(states):
-        parts = equation_parts(model.terms(state), reach=half_widths(model, state)) or ["0"]
+        terms, reach = _per_time_unit(model, state)
+        parts = equation_parts(terms, reach=reach) or ["0"]
         parts[-1] += f" [{_rate_unit(model, state)}]"
         share = 1 + spare // (len(states) - k)
         own = wrap([f"{state}' =", *parts], what="terms", n_lines=share)
@@ -54,9 +58,10 @@ def model_html(model: Readable) -> str:
     """Equations with their units and the units of the variables, as HTML for a notebook."""
     lines = []
     for state in model.states:
-        terms = dict(list(model.terms(state).items())[:MAX_TERMS])
-        left = len(model.terms(state)) - len(terms)
-        text = equation_html(state, terms, reach=half_widths(model, state))
+        all_terms, reach = _per_time_unit(model, state)
+        terms = dict(list(all_terms.items())[:MAX_TERMS])
+        left = len(all_terms) - len(terms)
+        text = equation_html(state, terms, reach=reach)
         more = f" ... {left} more terms" if left else ""
         lines.append(f"<div>{text}{more} &nbsp; [{html.escape(_rate_unit(model, state))}]</div>")
     return "\n".join([*lines, f"<div><small>{html.escape(_units_text(model))}</small></div>"])
@@ -69,12 +74,19 @@ def half_widths(model: Readable, state: str) -> Mapping[str, float]:
     return {name: (high - low) / 2.0 for name, (low, high) in model.intervals(state).items()}
 
 
+def _per_time_unit(model: Readable, state: str) -> tuple[dict[str, float], Mapping[str, float]]:
+    """Coefficients and half-widths per unit of the model's clock."""
+    unit_s = model.clock.seconds
+    terms = {name: unit_s * value for name, value in model.terms(state).items()}
+    return terms, {name: unit_s * value for name, value in half_widths(model, state).items()}
+
+
 def _rate_unit(model: Readable, state: str) -> str:
-    return unit_product([(model.units[state], 1), ("s", -1)])
+    return model.clock.rate_unit(model.units[state])
 
 
 def _units_text(model: Readable) -> str:
     known = [f"{name} in {unit}" for name, unit in model.units.items() if unit != "1"]
-    return ", ".join([*known, "t in s"]) + (
+    return ", ".join([*known, f"t in {model.clock.unit}"]) + (
         "" if model.covariance is None else "; ± 95 % intervals"
     )

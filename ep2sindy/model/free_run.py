@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.coerce import Run, trajectory_of
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Verdict, record_of
@@ -17,6 +18,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import LimitCycle, limit_cycle, share_reaching
 from ep2sindy.runtime.drawing import draw
+from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.attractor import phase_along
 from ep2sindy.signals.oscillation import DIED_OUT
 from ep2sindy.signals.spectrum import dominant_frequency
@@ -108,7 +110,7 @@ class FreeCycle:
 
 def free_run(
     model: SparseModel,
-    run: Trajectory,
+    run: Run,
     *,
     n_samples: int | None = None,
     initial: Float[np.ndarray, " n_states"] | None = None,
@@ -117,10 +119,13 @@ def free_run(
 ) -> FreeRun:
     """Run a model over a record, or its first samples, and compare the attractors.
 
-    initial: the state to start from, in SI; None takes the data's. judged: states that determine
-    the verdict and f_error, such as the measured one; None takes all.
+    run: a Trajectory, or what `discover` takes as one run. initial: the state to start from, in SI;
+    None takes the data's. judged: states that determine the verdict and f_error, such as the
+    measured one; None takes all.
     Raises ValueError for a judged state that the model does not have.
     """
+    check_kind("model", model, SparseModel, "found.model")
+    run = trajectory_of(run)
     n_samples = run.n_samples if n_samples is None else min(n_samples, run.n_samples)
     rollout = model.rollout(run, n_samples=n_samples, initial=initial)
     part = run.window(0, n_samples)

@@ -17,6 +17,7 @@ from scipy.special import ndtri
 from ep2sindy.data.coerce import Run, is_run, trajectory_of
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
+from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.draws import draw_coef, draw_runs
 from ep2sindy.model.inputs import driven, inputs_at_samples
@@ -39,7 +40,8 @@ class SparseModel:
     coef: (terms, equations), zero outside the support. states: one name per equation.
     units: of the states and of the library's variables. provenance: origin of the model.
     covariance: (coefs, coefs) of the nonzero coefficients, in SI, ordered by equation and within
-    each equation in the order of the library; None if it is not known.
+    each equation in the order of the library; None if it is not known. clock: unit of time in which
+    the equations are shown; coefficients stay in SI.
 
     >>> library = ep.polynomial(["x", "v"], degree=1)
     >>> spring = ep.coef_matrix(library, [{"v": 1.0}, {"x": -4.0}])
@@ -54,6 +56,7 @@ class SparseModel:
     units: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
     covariance: Float[np.ndarray, "_ _"] | None = None
+    clock: Clock = SECONDS
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "states", tuple(self.states))
@@ -83,7 +86,7 @@ class SparseModel:
     def __eq__(self, other: object) -> bool:
         """True for the same equations, from the same library, in the same units and as certain.
 
-        Numbers are compared exactly; provenance may differ.
+        Numbers are compared exactly; provenance and clock may differ.
         """
         if not isinstance(other, SparseModel):
             return NotImplemented
@@ -176,7 +179,7 @@ class SparseModel:
     def simulate(
         self,
         t: ArrayLike,
-        x0: ArrayLike,
+        x0: ArrayLike | Mapping[str, float],
         inputs: ArrayLike | Mapping[str, Any] | None = None,
         *,
         blow_up: float = 1e12,
@@ -187,9 +190,9 @@ class SparseModel:
     ) -> Rollout:
         """Integrate freely from the state x0 at t[0]; returns the states at the times t.
 
-        t: (samples,) in s, increasing. x0: (n_states,), in SI. inputs: (samples, n_inputs) at t,
-        interpolated by cubic splines; or a mapping from name to samples, a number, or a function
-        of t in s.
+        t: (samples,) in s, increasing. x0: (n_states,), in SI, or a mapping by name. inputs:
+        (samples, n_inputs) at t, interpolated by cubic splines; or a mapping from name to samples,
+        a number, or a function of t in s.
         Returns a `Rollout`, whose `trajectory()` is the run as data. A run that diverges also
         returns one, marked `diverged` and with a message. It ends when a state exceeds `blow_up`
         times its scale, or when the solver gives up (see `rollout`). The scale of a state is its
@@ -201,6 +204,7 @@ class SparseModel:
         model without covariance.
         """
         run = simulate(self, t, x0, inputs, blow_up=blow_up, rtol=rtol, limit_s=limit_s)
+        run = replace(run, clock=self.clock)
         if not check_count("draws", draws, 0):
             return run
         if self.covariance is None:
@@ -209,7 +213,7 @@ class SparseModel:
                 "made by hand, or does not explain the data to within their noise"
             )
         coef = draw_coef(self, self.covariance, draws, np.random.default_rng(seed))
-        starts = np.tile(np.asarray(x0, dtype=np.float64), (draws, 1))
+        starts = np.tile(check_start(self.states, x0), (draws, 1))
         drive, _ = driven(self.inputs, inputs, np.asarray(t, dtype=np.float64))
         return replace(run, draws=draw_runs(self, run.t, starts, coef, drive=drive))
 
@@ -325,6 +329,7 @@ class SparseModel:
             units=self.units,
             provenance=self.provenance,
             covariance=self.covariance,
+            clock=self.clock,
         )
 
     @staticmethod

@@ -164,7 +164,7 @@ def rollout(
 def simulate(
     model: Equations,
     t: ArrayLike,
-    x0: ArrayLike,
+    x0: ArrayLike | Mapping[str, float],
     inputs: ArrayLike | Mapping[str, Any] | None,
     *,
     blow_up: float,
@@ -198,9 +198,16 @@ def simulate(
 
 
 def check_start(
-    states: Sequence[str], x0: ArrayLike, *, hint: str = ""
+    states: Sequence[str], x0: ArrayLike | Mapping[str, float], *, hint: str = ""
 ) -> Float[np.ndarray, " n_states"]:
-    """Return x0 as an array; raise ValueError unless it has a finite number for each state."""
+    """Return x0, which may be a mapping, as an array.
+
+    Raises ValueError unless it has a finite number for each state.
+    """
+    if isinstance(x0, Mapping):
+        if set(x0) != set(states):
+            raise ValueError(f"x0 must give a number for each of {list(states)}: {dict(x0)} came")
+        x0 = [x0[state] for state in states]
     start = np.asarray(x0, dtype=np.float64)
     if start.shape != (len(states),) or not np.isfinite(start).all():
         came = f"shape {start.shape}" if start.size > 8 else f"{start.tolist()}"

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
+from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.files import read_json
 from ep2sindy.trust.limits import check_kind
 
@@ -29,6 +30,7 @@ def model_text(
     units: Mapping[str, str],
     provenance: Mapping[str, str],
     covariance: Float[np.ndarray, "_ _"] | None,
+    clock: Clock,
 ) -> str:
     """JSON text of the whole model; floats in their shortest exact form."""
     content = {
@@ -41,14 +43,16 @@ def model_text(
         "provenance": dict(provenance),
         "covariance": None if covariance is None else covariance.tolist(),
     }
+    if clock != SECONDS:
+        content["clock"] = {"unit": clock.unit, "seconds": clock.seconds}
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
 def read_model(text: str, make: Callable[..., Model]) -> Model:
     """Read the text of `model_text` and build the model by `make`.
 
-    `make` is called as make(library, equations, units=, provenance=, covariance=). Terms are read
-    by name: no code from the file runs, and user functions must be registered beforehand.
+    `make` is called as make(library, equations, units=, provenance=, covariance=, clock=). Terms
+    are read by name: no code from the file runs, and user functions must be registered beforehand.
     Raises ValueError for any other text, also if `make` rejects the content.
     """
     try:
@@ -65,6 +69,7 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
             units=texts_in(content["units"], "units"),
             provenance=texts_in(content["provenance"], "provenance"),
             covariance=None if covariance is None else covariance_in(covariance),
+            clock=_clock_in(content["clock"]) if "clock" in content else SECONDS,
         )
     except UnknownFunctionError:
         raise  # the file is sound: a function must be registered before it is read
@@ -105,6 +110,13 @@ def _numbers(terms: Any, state: str) -> dict[str, float]:
                 f"the coefficient of {name} in {state}' is no finite number: {value!r}"
             )
     return {name: float(value) for name, value in terms.items()}
+
+
+def _clock_in(value: Any) -> Clock:
+    unit, seconds = value["unit"], value["seconds"]
+    if not isinstance(unit, str) or type(seconds) not in (int, float) or not 0.0 < seconds < np.inf:
+        raise ValueError(f"a clock that is no unit of time with its length in s: {value!r:.80}")
+    return Clock(unit, float(seconds))
 
 
 def texts_in(value: Any, what: str) -> dict[str, str]:

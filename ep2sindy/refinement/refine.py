@@ -37,7 +37,7 @@ from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.runtime.progress import Advance, Progress, as_progress, nothing
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.runtime.values import old_keyword
+from ep2sindy.runtime.values import check_kind, old_keyword
 
 SETTINGS = RefinementSettings()
 
@@ -187,6 +187,8 @@ def _by_model(
     if isinstance(model, SparseModel):
         models, records = [model], [trajectories_of(cast("Runs", trajectories), partial=True)]
     else:
+        for each in model if isinstance(model, Sequence) else [model]:
+            check_kind("model", each, SparseModel, "found.model")
         models = list(model)
         if is_run(trajectories) or any(map(is_run, cast("Sequence[Any]", trajectories))):
             raise ValueError(

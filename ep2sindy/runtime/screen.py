@@ -82,6 +82,11 @@ def wrap(parts: Sequence[str], *, what: str, n_lines: int, indent: str = "    ")
     return lines
 
 
+def sentences(text: str, *, n_lines: int = 3) -> list[str]:
+    """Lines of a text that is longer than one, broken between words."""
+    return wrap(text.split(" "), what="words", n_lines=n_lines)
+
+
 def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a table in plain text; each column is as wide as its longest cell."""
     cells = [[in_line(cell) for cell in row] for row in (header, *rows)]

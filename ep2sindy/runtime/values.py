@@ -80,7 +80,9 @@ def check_kind(name: str, value: object, kind: type, example: str) -> None:
         members = [m for m in vars(kind) if not m.startswith("_")]
         lacking = [m for m in members if m not in dir(value)] if Protocol in kind.__mro__ else []
         end = f", which has no {' and no '.join(lacking)}" if lacking else ""
-        raise ValueError(f"{start}: {value!r} came{end}")
+        came = repr(value)
+        came = came if "\n" not in came else f"a {type(value).__name__}"
+        raise ValueError(f"{start}: {came} came{end}")
 
 
 def old_keyword(**names: str) -> Callable[[F], F]:

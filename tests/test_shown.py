@@ -1,0 +1,52 @@
+"""What Python prints, in the unit of the record's time and to its end; what models take."""
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+
+
+def test_what_is_found_in_a_record_over_years_is_shown_per_year() -> None:
+    run = ep.datasets.hare_lynx()
+    assert "t = 0 to 20 year in steps of 1 year" in repr(run)
+    terms = {"hare": ["hare", "hare*lynx"], "lynx": ["lynx", "hare*lynx"]}
+    found = ep.discover(run, terms=terms)
+    year_s = run.clock.seconds
+    growth = found.model.terms("hare")["hare"]
+    for shown in (repr(found), str(found.model), found.model._repr_html_()):
+        assert f"{year_s * growth:.3g} (" in shown.replace(" (&plusmn;", " (")
+        assert "year^-1" in shown
+        assert "t in year" in shown
+    assert growth < 1e-7  # numbers stay in SI
+    assert "do not tell which" not in repr(found)  # all terms were given
+    again = ep.SparseModel.from_json(found.model.to_json())
+    assert again == found.model
+    assert str(again) == str(found.model)
+    assert "year" in repr(again.simulate(run.t, run.states[0]))
+    assert "year^-1" in repr(ep.refine(again, run, n_windows=4))
+    assert "clock" not in ep.lorenz().model.to_json()
+    text = found.model.to_json()
+    for wrong in ('"seconds": -1', '"seconds": "long"', '"second": 1'):
+        with pytest.raises(ValueError, match="a model file must hold"):
+            ep.SparseModel.from_json(text.replace('"seconds": 31557600.0', wrong))
+
+
+def test_notes_are_read_to_their_end() -> None:
+    text = repr(ep.discover(ep.datasets.hare_lynx()))
+    assert "or take a smaller library" in text
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_models_take_tables_and_states_by_name() -> None:
+    run = ep.lotka_volterra().trajectory()
+    model = ep.lotka_volterra().model
+    table = run.to_dataframe().reset_index()
+    assert ep.free_run(model, table).verdict == ep.free_run(model, run).verdict
+    by_name = model.simulate(run.t[:20], {"y": 0.5, "x": 1.0})
+    assert np.array_equal(by_name.states, model.simulate(run.t[:20], [1.0, 0.5]).states)
+    with pytest.raises(ValueError, match=r"a number for each of \['x', 'y'\]: {'x': 1.0} came"):
+        model.simulate(run.t[:20], {"x": 1.0})
+    found = ep.discover(run, method=ep.Regression())
+    for call in (ep.free_run, ep.refine):
+        with pytest.raises(ValueError, match=r"such as found\.model: a Discovery came"):
+            call(found, run)  # type: ignore[operator]
