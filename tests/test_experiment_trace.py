@@ -41,9 +41,8 @@ def glance(path: Path, output: Path, *more: str) -> list[str]:
     """What is said of a smoothed signal; the model, of one term, is chosen without a free run."""
     few = ("depth=1", "search.n_best=1", "search.max_terms=1", "selection=ebic")
     more = ("embedding=log_rate", *more)
-    own = ("~selection.bounds", "~selection.n_windows", "~selection.n_starts")  # of free runs
     given = [o for o in toy(path, output, *few) if not o.startswith("selection.")]
-    return [*given, *own, *more]
+    return [*given, *more]
 
 
 @pytest.fixture(scope="module")
