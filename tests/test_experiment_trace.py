@@ -204,7 +204,7 @@ def test_a_recognised_signal_without_a_unit_takes_the_one_given(tmp_path: Path) 
     found = computed(config)
     assert found.summary["data"]["units"] == {"I": "A", "g": "s^-1"}
     mean = signal(12.0)[1].mean()
-    assert found.outcome.states.states[:, 0].mean() == pytest.approx(1e-3 * mean, rel=1e-2)
+    assert found.outcome.tested.states.states[:, 0].mean() == pytest.approx(1e-3 * mean, rel=1e-2)
 
 
 def test_a_unit_that_the_data_contradict_is_refused(tmp_path: Path) -> None:
