@@ -67,7 +67,7 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     if given.write is None:
         data = ["data=recognised", f"data.path={_hydra(given.path[0])}"]
         is_certain = len(given.path) == 1 and all(each.is_certain for each in found)
-        lines = commands(found[0], data) if is_certain else []
+        lines = commands(found, data) if is_certain else []
         if pattern and not any(each.found.doubts for each in found):
             lines += point_commands(found[0], "recognised", pattern)
         say_next(lines)
@@ -79,7 +79,7 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     write_text(path, config_text(found, paths))
     say(f"written: {path}")
     of_points = point_commands(found[0], name, pattern) if pattern else []
-    say_next([*commands(found[0], [f"data={name}"]), *of_points])
+    say_next([*commands(found, [f"data={name}"]), *of_points])
 
 
 def say_next(commands: Sequence[str]) -> None:
@@ -109,7 +109,8 @@ def point_commands(found: Inspection, name: str, pattern: FilePattern) -> list[s
         aside = ["thesis=null", *([] if both else ["trends=[]"])]
         lines.append(["+exp=parametric", *more, *aside, *preparation(found)])
     elif not found.lacking(NEEDS["predict"]):
-        lines.append(["+exp=predict", *more])
+        search = [] if "mdot_mg_s" in pattern.names else ["models=null"]  # given ones need it
+        lines.append(["+exp=predict", *more, *search])
     return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]
 
 
@@ -208,15 +209,16 @@ def _word(found: Inspection, name: str) -> str:
     return "  # likely: check it" if name in found.found.guesses else ""
 
 
-def commands(found: Inspection, data: list[str]) -> list[str]:
-    """Commands that can be run with the data; placeholders in capitals are for the user."""
+def commands(records: Sequence[Inspection], data: list[str]) -> list[str]:
+    """Commands that can be run with all records; placeholders in capitals are for the user."""
+    found = records[0]
     data = data if found.has_time else [*data, "data.dt_s=STEP"]
     lines = []
     if not found.lacking(NEEDS["breathing"]):
         zone = [] if found.z is None or found.channel_m else ["data.channel_m=LENGTH"]
         lines.append(["+exp=breathing", *data, *zone, *preparation(found)])
     traces = [n for n, v in found.variables.items() if found.is_trace(v)]
-    if traces:
+    if traces and len(records) == 1:  # +exp=trace takes no more
         signal = "I_d" if "I_d" in traces else traces[0]
         lines.append(["+exp=trace", *data, f"signal={signal}"])
     states = traces[:3] if len(traces) > 1 else [n for n in ("n_i", "n_n") if n in found.variables]

@@ -10,7 +10,6 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -31,10 +30,9 @@ from ep2sindy.runtime.files import fingerprint
 from ep2sindy.runtime.kept import Kept
 from ep2sindy.runtime.parallel import Workers, run_alike
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
+from ep2sindy.trust.user_code import PACKAGE
 
 NO_FIT = "no_fit"
-
-PACKAGE = Path(__file__).resolve().parents[1]
 
 # Points and samples that are turned at once from rows to columns, few enough to stay in the cache.
 TURNED_POINTS, TURNED_SAMPLES = 16, 64

@@ -24,6 +24,7 @@ from zipfile import BadZipFile
 import numpy as np
 from scipy.sparse import csr_array
 
+from ep2sindy._stubs import PACKAGE
 from ep2sindy.runtime.files import WriteError, replacing, sweep
 from ep2sindy.runtime.parallel import ONE_BY_ONE, Workers
 
@@ -175,7 +176,6 @@ class KeptWorkers:
 # Values as arrays and text.
 
 
-PACKAGE = __name__.partition(".")[0]
 TREE = "tree"  # of the arrays, the one that holds the structure of the value, as text
 PLAIN = (type(None), bool, int, float, str)
 

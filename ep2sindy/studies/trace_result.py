@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.one_signal import Attempt, SignalDiscovery
+from ep2sindy.discovery.one_signal import SignalDiscovery
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.discovery.signal_unknowns import HiddenStates
 from ep2sindy.figures.fronts import front_figure
@@ -22,10 +21,9 @@ from ep2sindy.figures.living import (
     paths_off,
     waveform_figure,
 )
-from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.equations import equation_text
 from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeCycle, FreeRun
+from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.document import (
@@ -44,7 +42,6 @@ from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import (
     Chosen,
 )
-from ep2sindy.signals.trace import Trace
 from ep2sindy.studies.forecasts import (
     forecast_errors,
     forecast_picture,
@@ -92,30 +89,6 @@ class Outcome:
     tested: SignalDiscovery
 
     @property
-    def signal(self) -> Trace:
-        return self.tested.signal
-
-    @property
-    def attempts(self) -> Sequence[Attempt]:
-        return self.tested.attempts
-
-    @property
-    def states(self) -> Trajectory:
-        return self.tested.states
-
-    @property
-    def measured(self) -> Trajectory:
-        return self.tested.measured
-
-    @property
-    def free(self) -> FreeCycle:
-        return self.tested.free
-
-    @property
-    def skill(self) -> ForecastSkill | None:
-        return self.tested.skill
-
-    @property
     def chosen(self) -> Chosen:
         return self.tested.best.chosen
 
@@ -135,11 +108,11 @@ class Outcome:
 
     @property
     def run(self) -> FreeRun:
-        return self.free.run
+        return self.tested.free.run
 
     @property
     def cycle(self) -> LimitCycle | None:
-        return self.free.cycle
+        return self.tested.free.cycle
 
     @property
     def model(self) -> SparseModel:
@@ -147,7 +120,7 @@ class Outcome:
 
     @property
     def is_held_out(self) -> bool:
-        return self.skill is not None
+        return self.tested.skill is not None
 
     @property
     def searched(self) -> list[str]:
@@ -155,7 +128,7 @@ class Outcome:
 
     @property
     def data_frequency(self) -> str:
-        cycle = find_cycle(self.measured.t, self.measured.states[:, :1])
+        cycle = find_cycle(self.tested.measured.t, self.tested.measured.states[:, :1])
         frequency_Hz = cycle.frequency_Hz if cycle else float("nan")
         return self.run.rollout.clock.frequency_text(frequency_Hz)
 
@@ -164,13 +137,19 @@ class Outcome:
 
     def tables(self) -> dict[str, pd.DataFrame]:
         fronts = {f"front_{state}": self._front(state).csv() for state in self.searched}
-        samples = dict(zip(self.states.state_names, self.states.states.T, strict=True))
+        samples = dict(
+            zip(self.tested.states.state_names, self.tested.states.states.T, strict=True)
+        )
         return {
             **fronts,
-            **rollout_tables(self.measured, {"trace": self.run}),
-            "states": pd.DataFrame({"t_s": self.states.t, **samples}),
+            **rollout_tables(self.tested.measured, {"trace": self.run}),
+            "states": pd.DataFrame({"t_s": self.tested.states.t, **samples}),
             "coefficients": coefficients(self.models(), heading="model"),
-            **({} if self.skill is None else {"forecasts": forecast_errors(self.skill)}),
+            **(
+                {}
+                if self.tested.skill is None
+                else {"forecasts": forecast_errors(self.tested.skill)}
+            ),
         }
 
     def _front(self, state: str) -> ResultTable[CandidateRow]:
@@ -179,29 +158,31 @@ class Outcome:
         return ResultTable(candidate_rows(front), metrics)
 
     def figures(self) -> dict[str, Captioned]:
-        held, rollout = self.measured, self.run.rollout
-        period_s = self.signal.period_s
+        held, rollout = self.tested.measured, self.run.rollout
+        period_s = self.tested.signal.period_s
         drawn: dict[str, Any] = {
             "free_run": partial(free_run_figure, held, rollout, period_s=period_s)
         }
         if self.cycle is not None:
             plane, paths = held.state_names[:2], paths_off(self.cycle)
-            drawn["plane"] = partial(cycle_figure, self.states, self.cycle, paths, plane=plane)
-        if has_waveform(held, rollout) and self.signal.cycle is not None:
+            drawn["plane"] = partial(
+                cycle_figure, self.tested.states, self.cycle, paths, plane=plane
+            )
+        if has_waveform(held, rollout) and self.tested.signal.cycle is not None:
             drawn["waveform"] = partial(waveform_figure, held, rollout)
         fronts = {state: self.found.fronts[state] for state in self.searched}
         drawn["front"] = partial(front_figure, fronts, label=self.label)
         captions = CAPTIONS if self.by_runs else CAPTIONS | {"front": SCORED}
         pictures_of = {name: Captioned(draw, captions[name]) for name, draw in drawn.items()}
-        if self.skill is not None:
-            pictures_of["forecast"] = forecast_picture(self.states, self.skill)
+        if self.tested.skill is not None:
+            pictures_of["forecast"] = forecast_picture(self.tested.states, self.tested.skill)
         return pictures_of
 
     def in_short(self) -> Result:
         where = "held-out record" if self.is_held_out else "whole record, too short to hold out"
         misfit = self.found.misfit
         return found_model(
-            f"Found from {self.signal.name}",
+            f"Found from {self.tested.signal.name}",
             self.run,
             file="trace",
             picture="free_run",
@@ -210,18 +191,22 @@ class Outcome:
         )
 
     def sections(self) -> list[Section]:
-        forecasts = [] if self.skill is None else [forecast_section(self.skill)]
+        forecasts = [] if self.tested.skill is None else [forecast_section(self.tested.skill)]
         said = [self._search_section()]
         if (estimate := self.found.estimate) is not None:
             tested = self.found.noise_test.tested
-            said.append(estimate_section(self.signal.name, estimate, self.states, of_model=tested))
+            said.append(
+                estimate_section(
+                    self.tested.signal.name, estimate, self.tested.states, of_model=tested
+                )
+            )
         return [self._signal_section(), *said, self._living_section(), *forecasts]
 
     def _signal_section(self) -> Section:
-        signal, embedded = self.signal, self.chosen.embedded
-        names = self.states.state_names
+        signal, embedded = self.tested.signal, self.chosen.embedded
+        names = self.tested.states.state_names
         made = f"{self.chosen.embedding.says}, {', '.join(names[:-1])} and {names[-1]}"
-        per_period = signal.period_s / self.states.dt_s
+        per_period = signal.period_s / self.tested.states.dt_s
         is_hidden = isinstance(self.chosen.embedding, HiddenStates)
         too_fast = "" if is_hidden else ", and what is too fast to be followed"
         turns = "periods" if signal.cycle is not None else "turns, which do not repeat themselves,"
@@ -236,7 +221,7 @@ class Outcome:
                 f"{100.0 * embedded.noise_std / signal.x.std():.2g} % of the standard deviation"
             ),
             *(Text(each) for each in signal.done),
-            *(Text(each.text) for each in self.attempts),
+            *(Text(each.text) for each in self.tested.attempts),
         ]
         return Section(f"The signal {signal.name}", blocks)
 
@@ -263,7 +248,7 @@ class Outcome:
         return column_note(self.label)
 
     def _living_section(self) -> Section:
-        model, clock = self.model, self.states.clock
+        model, clock = self.model, self.tested.states.clock
         blocks: list[Block] = [Text(self.found.note)] if self.found.note else []
         for state in model.states:
             exact = "known" if state not in self.searched else ""
@@ -277,36 +262,36 @@ class Outcome:
 
     def _stability(self) -> list[tuple[str, bool]]:
         if self.cycle is None:
-            is_asked = self.signal.cycle is not None
+            is_asked = self.tested.signal.cycle is not None
             return [("the model has no cycle near its run", True)] if is_asked else []
-        return [(self.free.text, self.run.verdict is not Verdict.LIVES)]
+        return [(self.tested.free.text, self.run.verdict is not Verdict.LIVES)]
 
     def n_terms(self, *, known: bool) -> int:
         states = [s for s in self.model.states if (s not in self.searched) == known]
         return sum(len(self.model.terms(state)) for state in states)
 
     def summary(self) -> dict[str, Any]:
-        name = self.signal.name
+        name = self.tested.signal.name
         return {
-            "data": data_summary(self.states),
+            "data": data_summary(self.tested.states),
             "signal": {
                 "name": name,
-                "unit": self.signal.unit,
-                "done": list(self.signal.done),
+                "unit": self.tested.signal.unit,
+                "done": list(self.tested.signal.done),
                 "embedding": type(self.chosen.embedding).__name__,
                 "n_states": self.tested.best.n_states,
                 "reason": self.chosen.reason,
                 "noise_std": self.chosen.embedded.noise_std,
-                "period_s": self.signal.period_s,
+                "period_s": self.tested.signal.period_s,
             },
             "model": model_summary(self.model) | {"intervals": intervals(self.model)},
             "states": {
                 str(each.n_states): {"error": each.error, "unexplained": each.share}
-                for each in self.attempts
+                for each in self.tested.attempts
             },
             "misfit": self.found.misfit,
             "living": facts(self, FREE_RUN),
-            "forecast": self.skill and self.skill.summary(),
+            "forecast": self.tested.skill and self.tested.skill.summary(),
         }
 
     def headline(self) -> Mapping[str, float]:
@@ -320,14 +305,15 @@ FREE_RUN: Metrics[Outcome] = [
     Metric("held_out", lambda o: o.is_held_out, View.JSON),
     Metric("frequency of the data", lambda o: o.data_frequency, View.SCREEN),
     Metric("f_error", lambda o: o.run.f_error, View.ALL, "frequency error", percent(2)),
-    Metric("amplitude_ratio", lambda o: o.run.amplitude_ratio[o.signal.name], COMPARED),
+    Metric("amplitude_ratio", lambda o: o.run.amplitude_ratio[o.tested.signal.name], COMPARED),
     Metric(
-        "amplitude_error", lambda o: {o.signal.name: o.run.amplitude_ratio[o.signal.name] - 1.0},
+        "amplitude_error",
+        lambda o: {o.tested.signal.name: o.run.amplitude_ratio[o.tested.signal.name] - 1.0},
         View.SCREEN, "amplitude error of {}", percent(2),
     ),
-    Metric("waveform_error", lambda o: o.run.waveform_error[o.signal.name], COMPARED),
+    Metric("waveform_error", lambda o: o.run.waveform_error[o.tested.signal.name], COMPARED),
     Metric(
-        "waveform", lambda o: {o.signal.name: o.run.waveform_error[o.signal.name]},
+        "waveform", lambda o: {o.tested.signal.name: o.run.waveform_error[o.tested.signal.name]},
         View.SCREEN, "waveform error of {}", "{:.3f} std",
     ),
     Metric("n_terms", lambda o: o.n_terms(known=False), View.HEADLINE),
@@ -338,8 +324,8 @@ FREE_RUN: Metrics[Outcome] = [
         View.SCREEN,
     ),
     Metric("stability", lambda o: o.cycle.stability if o.cycle else None, View.JSON),
-    Metric("multiplier", lambda o: o.free.multiplier, COMPARED),
-    Metric("share_reaching", lambda o: o.free.share, COMPARED),
+    Metric("multiplier", lambda o: o.tested.free.multiplier, COMPARED),
+    Metric("share_reaching", lambda o: o.tested.free.share, COMPARED),
 ]  # fmt: skip
 CANDIDATES: Metrics[CandidateRow] = [
     Metric("terms", lambda row: row.candidate.n_terms, View.SHOWN),
