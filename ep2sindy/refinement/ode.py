@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from torch import nn
 from ep2sindy.library.library import Library, library_of
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.relations import constraint as build_constraint
+from ep2sindy.library.terms import Term
 from ep2sindy.model.model import SparseModel
 
 
@@ -270,6 +272,15 @@ class Augmented:
         return rate
 
 
+@lru_cache(maxsize=256)  # every fold of a selection refines the same terms
+def _products(
+    variables: tuple[str, ...], terms: tuple[Term, ...], n: int
+) -> tuple[Library, Library, np.ndarray]:
+    """A library of the terms, and their derivatives as by `Library.with_derivatives`."""
+    library = library_of(variables, terms)
+    return library, *library.with_derivatives(n)
+
+
 def augment(odes: Sequence[ODE]) -> Augmented:
     """Combine modules of the same variables into one batch of points, on the first's device.
 
@@ -287,8 +298,8 @@ def augment(odes: Sequence[ODE]) -> Augmented:
             f"{sorted({ode.variables for ode in odes})} came"
         )
     n, n_free = first.n_states, max(len(ode.free0) for ode in odes)
-    terms = library_of(first.variables, (term for ode in odes for term in ode.library.terms))
-    products, transfer = terms.with_derivatives(n)
+    distinct = tuple(dict.fromkeys(term for ode in odes for term in ode.library.terms))
+    terms, products, transfer = _products(first.variables, distinct, n)
     size = (len(odes), n, 1 + n + n_free, len(products))
     basis, offset = np.zeros((*size, n_free)), np.zeros(size)
     for ode, by_point, fixed_point in zip(odes, basis, offset, strict=True):
