@@ -20,6 +20,7 @@ ALIKE = 1e-3
 # A term is left out if it combines at most this many simpler terms. Without noise, every term on a
 # periodic orbit is nearly a combination of many others, and may itself give the shorter law.
 MAX_PARTS = 3
+MAX_SHOWN = 5  # of the terms of a longer combination, in its message
 
 # With fewer rows per term of the library than this, a search would fit the noise of its rows...
 FEW = 3
@@ -145,8 +146,14 @@ def _dependent(
     found = []
     for j, columns in _combinations(library, theta, xx):
         parts = [names[i] for i in columns]
-        left_out = " and is left out" if len(parts) <= MAX_PARTS else ""
-        message = f"{names[j]!r} is a linear combination of {parts} on every row{left_out}"
+        left_out = (
+            " and is left out"
+            if len(parts) <= MAX_PARTS
+            else ": no data of this kind tell them apart"
+        )
+        shown = ", ".join(parts if len(parts) <= MAX_SHOWN else [*parts[:MAX_SHOWN], "..."])
+        of = shown if len(parts) <= MAX_SHOWN else f"{len(parts)} other terms ({shown})"
+        message = f"{names[j]} is a linear combination of {of} on every row{left_out}"
         found.append(Ambiguity((names[j], *parts), message, True))
     return found
 

@@ -100,7 +100,7 @@ def _table(skill: ForecastSkill) -> Table:
     asked = SHOWN_PERIODS if in_periods else (1.0, 2.0, 4.0, 8.0, 16.0)
     shown = [each for each in asked if each <= 1.02 * last] or [last]
     rows = {
-        f"{each:g} {'periods' if in_periods else 'samples'} ahead": {
+        f"{each:g} {'period' if in_periods else 'sample'}{'s' if each > 1 else ''} ahead": {
             name: f"{value:.3f}" for name, value in skill.at(each * unit_s).items()
         }
         for each in shown

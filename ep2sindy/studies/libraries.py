@@ -32,17 +32,13 @@ from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.studies.balance import ModelBalance, inflows_of, model_balance
 from ep2sindy.studies.fits import Terms, split_in_time
-from ep2sindy.studies.forecasts import (
-    forecast_errors,
-    forecast_picture,
-    forecast_section,
-    skill_of,
-)
+from ep2sindy.studies.forecasts import forecast_errors, forecast_picture, forecast_section, skill_of
 from ep2sindy.studies.library_result import RECORDS, LibraryResult, frequencies, refit, run_refitted
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import Sampling, Source, balances_of, data_summary, zone_sizes_of
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
 from ep2sindy.studies.views import (
+    FROM_DERIVATIVES,
     INTEGRATED,
     PlotRange,
     best_run,
@@ -464,7 +460,10 @@ class Outcome:
                 where = "that it has seen" if result.living is None else "held out"
                 title = f"{name}: forecasts over time {where}"
                 found.append(forecast_section(result.skill, f"forecast_{name}", title=title))
-        compared = Table(self.comparison.screen("model", by_state=True), title=INTEGRATED)
+        note = FROM_DERIVATIVES if any(r.living for r in self.results.values()) else ""
+        compared = Table(
+            self.comparison.screen("model", by_state=True), title=INTEGRATED, note=note
+        )
         found.append(Section("Run freely from the first sample", [compared, *pictures(FIGURES)]))
         if len(self.files) > 1:
             records = Table(self.records.screen(), title=EVERY_RECORD)

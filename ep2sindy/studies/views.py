@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
+FROM_DERIVATIVES = (
+    "These are the equations that fits of the derivatives select; the models that live, which are "
+    "selected by free runs, stand above."
+)
 MARKS = "Carets: the model leaves the panel; cross: a run that diverged stops."
 CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",
@@ -178,7 +182,8 @@ def interval_table(
             numbers = [model.terms(state)[term], *ends]
             unit = unit_product([(model.units[state], 1), (units[term], -1)])
             row = [f"{state}'", term.replace("*", " ")]
-            row += [f"{clock.seconds * number:.4g}" for number in numbers]
+            shown = [f"{clock.seconds * number:.4g}" for number in numbers]
+            row += shown if ends[0] < ends[1] else [shown[0], "exact", ""]  # known, or a relation
             rows.append([*row, clock.rate_unit(unit)])
     columns = ["equation", "term", "coefficient", "95 % from", "to", "unit"]
     return [Table(pd.DataFrame(rows, columns=columns), page_only=page_only)] if rows else []
