@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,44 @@ def test_several_files_are_several_records(folder: Path) -> None:
     )
     one = computed(composed(*overrides, "data.path=[run0.csv]"))
     assert "records" not in one.outcome.tables()
+
+
+def test_several_records_are_shown_once_and_go_to_what_takes_several(
+    folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    for name, seed in {"a": 0, "b": 1, "c d": 2}.items():
+        lorenz_csv(folder / f"{name}.csv", seed=seed)
+    (folder / "b.csv").write_text("\n".join((folder / "b.csv").read_text().split("\n")[:900]))
+    assert not ended("inspect", "a.csv", "b.csv", "c d.csv")
+    said = capsys.readouterr().out
+    assert said.count("taken as") == 1
+    assert "\nthe other 2 files: the same arrays; 896 to 1000 samples\n" in said
+    (line,) = re.findall(r"ep2sindy (\+exp=.*)", said)
+    config = composed(*shlex.split(line))
+    assert config.experiment == "discover"
+    assert config.data.path == ["a.csv", "b.csv", "c d.csv"]
+
+
+def test_files_are_compared_with_the_first(folder: Path, capsys: pytest.CaptureFixture) -> None:
+    t = np.arange(50) * 1e-6
+    write = "t (s),I_d (A),x\n{}".format
+    for name, text in {
+        "a": write("\n".join(f"{s},{k % 7},{k % 3}" for k, s in enumerate(t))),
+        "b": write("\n".join(f"{2 * s},{k % 7},{k % 3}" for k, s in enumerate(t))),
+        "c": write("\n".join(f"{s},{k % 7},{k if k > 9 else ''}" for k, s in enumerate(t))),
+        "d": write("\n".join(f"{s},{k},{k % 5}" for k, s in enumerate(t))).replace("(A)", "(mA)"),
+        "e": write("\n".join(f"{s},{k % 5},{k % 3}" for k, s in enumerate(t))),
+    }.items():
+        (folder / f"{name}.csv").write_text(text)
+    (folder / "e.csv").write_text((folder / "e.csv").read_text().replace("x", "y", 1))
+    assert not ended("inspect", "?.csv")
+    said = capsys.readouterr().out
+    assert "b.csv: t: 2e-06 apart" in said
+    assert "c.csv: x: 10 missing" in said
+    assert "d.csv: I_d: mA, taken as I_d in mA" in said
+    assert "e.csv: without x; also y" in said
+    assert "files of one mapping must hold the same names: e.csv differs from a.csv" in said
+    assert "+exp=discover data" not in said
 
 
 def test_an_experiment_of_one_record_refuses_several(folder: Path) -> None:

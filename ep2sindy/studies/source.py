@@ -39,7 +39,8 @@ def open_prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
     if len(records) > 1:
         raise ValueError(
             f"this experiment takes one record: data.path names {len(records)} files; give "
-            "one, or take +exp=discover or +exp=breathing, which take several"
+            "one, or take +exp=discover or +exp=breathing, which take several of one system, or "
+            "+exp=parametric or +exp=predict with points.files=PATTERN for operating points"
         )
     return _prepared(records[0], prepare)
 
