@@ -117,6 +117,33 @@ def test_several_files_are_several_records(folder: Path) -> None:
     assert "records" not in one.outcome.tables()
 
 
+def proposed(capsys: pytest.CaptureFixture, *arguments: str) -> list[str]:
+    """The commands that an inspection prints, without the program's name."""
+    assert not ended("inspect", *arguments)
+    return re.findall(r"^  ep2sindy (.*)", capsys.readouterr().out, re.MULTILINE)
+
+
+def test_a_file_that_lacks_only_its_times_goes_on_with_a_step(
+    folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    np.savez("a.npz", V=np.sin(np.arange(50.0)))
+    (trace,) = proposed(capsys, "a.npz")
+    assert trace == "+exp=trace data=recognised data.path=a.npz data.dt_s=STEP signal=V"
+    settings = composed(*shlex.split(trace.replace("STEP", "1e-6"))).data
+    assert ep.open_field(settings.path, dt_s=settings.dt_s).time[1] == 1e-6
+
+
+def test_what_is_only_likely_is_written_first(folder: Path, capsys: pytest.CaptureFixture) -> None:
+    wave = np.sin(np.arange(50.0))
+    np.savez("a b.npz", time=1e-6 * np.arange(50), n_i=1e11 * (2.0 + wave))
+    write, trace, _ = proposed(capsys, "a b.npz")
+    assert (write, trace) == ("inspect 'a b.npz' --write", "+exp=trace data=a_b signal=n_i")
+    with pytest.raises(ValueError, match=f"`ep2sindy {write}` .* writes a mapping"):
+        ep.open_field("a b.npz")
+    assert not ended(*shlex.split(write))
+    assert trace in capsys.readouterr().out
+
+
 def test_several_records_are_shown_once_and_go_to_what_takes_several(
     folder: Path, capsys: pytest.CaptureFixture
 ) -> None:

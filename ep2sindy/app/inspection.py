@@ -70,8 +70,11 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         say(text)
         return
     if given.write is None:
-        if all(each.is_certain for each in found):
+        if all(each.is_certain or each.found.lacks_only_time for each in found):
             say_next(commands(found, "recognised", pattern, path=_hydra(given.path)))
+        else:  # what is only likely must be looked at in the written config
+            write = ["ep2sindy", "inspect", *given.path, "--write"]
+            say_next([shlex.join(write), *commands(found, name, pattern)])
         say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
         return
     if text := unlike(found):

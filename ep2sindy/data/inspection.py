@@ -54,16 +54,12 @@ class Inspection:
 
     @property
     def has_time(self) -> bool:
-        return self.time is not None or self.dt_s is not None
+        return self.found.has_time
 
     @property
     def is_certain(self) -> bool:
         """True if `open_field` opens the file without a mapping."""
-        try:
-            self.found.check(self.source)
-        except ValueError:
-            return False
-        return True
+        return not self.found.doubts
 
     @property
     def variables(self) -> dict[str, Variable]:

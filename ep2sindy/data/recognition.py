@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
 from math import isclose
+from shlex import quote
 
 import numpy as np
 import xarray as xr
@@ -52,11 +53,20 @@ class Recognised:
     n_samples: int | None = None
 
     @property
+    def has_time(self) -> bool:
+        return "time" in self.axes or self.dt_s is not None
+
+    @property
+    def lacks_only_time(self) -> bool:
+        """True if the step between samples is all that keeps this mapping from giving a field."""
+        return not self.has_time and len(self.doubts) == 1
+
+    @property
     def doubts(self) -> list[str]:
         """What keeps this mapping from giving a field without any doubt."""
         problems = [each.problem for each in self.held if each.problem not in ("", TEXT)]
         problems += self.guesses.values()
-        if "time" not in self.axes and self.dt_s is None:
+        if not self.has_time:
             problems.insert(0, "a field needs time: give its step dt_s, or name the file's time")
         if not self.variables:
             problems.append("no array of the file fits its axes")
@@ -67,8 +77,9 @@ class Recognised:
         if self.doubts:
             text = "; ".join([*self.doubts, *self.questions])
             raise ValueError(
-                f"{source.path} cannot be opened without a mapping: {text}; ep2sindy.inspect_file "
-                "shows what it holds"
+                f"{source.path} cannot be opened without a mapping: {text}; `ep2sindy inspect "
+                f"{quote(str(source.path))} --write` (in Python ep2sindy.inspect_file) shows what "
+                "it holds and writes a mapping"
             )
 
 
