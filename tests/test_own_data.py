@@ -13,6 +13,7 @@ import yaml
 import ep2sindy as ep
 from ep2sindy.app.inspection import NEEDS
 from ep2sindy.app.runner import run_config
+from ep2sindy.library.units import SECONDS
 from tests.programs import EXPERIMENTS, composed, computed, ended
 
 
@@ -180,6 +181,23 @@ def test_files_are_compared_with_the_first(folder: Path, capsys: pytest.CaptureF
     assert "e.csv: without x; also y" in said
     assert "files of one mapping must hold the same names: e.csv differs from a.csv" in said
     assert "+exp=discover data" not in said
+
+
+def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixture) -> None:
+    lorenz_csv(folder / "whole.csv")
+    lines = (folder / "whole.csv").read_text().splitlines()
+    (folder / "a.csv").write_text("\n".join(lines[:204] + lines[704:]))
+    step = ep.inspect_file("whole.csv").found.held[0].step
+    assert not ended("inspect", "a.csv")
+    said = capsys.readouterr().out
+    assert f"about {step:.4g} apart" in said
+    assert "have a gap: " in said
+    found = computed(composed(
+        "+exp=discover", "data=recognised", "data.path=a.csv", "trajectory.states=[x,y,z]",
+        "search=best_subset", "selection=ebic", f"output={folder}",
+    ))  # fmt: skip
+    assert f"500 samples of {SECONDS.duration_text(step, digits=4)} from" in found.log
+    assert [text for text in found.warnings if "the record has 1 gap" in text]
 
 
 def test_an_experiment_of_one_record_refuses_several(folder: Path) -> None:

@@ -204,13 +204,13 @@ def _compare_step(
 ) -> None:
     """Note times that the step in the file's preamble contradicts, or that leave out samples."""
     said = "" if step_s is None else f", and the file says steps of {step_s:.6g} s beside them"
-    usual_s = (one.usual or 0.0) * conversion("time", time.unit)[0]
+    usual_s = (one.step or 0.0) * conversion("time", time.unit)[0]
     if one.gap:
         questions.append(
             f"the times of {one.name!r} have a gap: {one.gap}, in {time.unit}{said}; the times are "
             "taken as they stand"
         )
-    elif step_s is not None and one.usual and abs(usual_s - step_s) > 0.01 * step_s:
+    elif step_s is not None and one.step and abs(usual_s - step_s) > 0.01 * step_s:
         questions.append(
             f"the times of {one.name!r} go in steps of {usual_s:.6g} s{said}; the times are taken"
         )
@@ -440,8 +440,8 @@ def with_time_unit(
     for unit in ("s", *AXES["time"].others):
         if (
             said_s
-            and one.usual
-            and isclose(one.usual * conversion("time", unit)[0], said_s, rel_tol=1e-3)
+            and one.step
+            and isclose(one.step * conversion("time", unit)[0], said_s, rel_tol=1e-3)
         ):
             return replace(time, unit=unit)
     likely = likely_time_unit(one.step, variables)
