@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import yaml
 import ep2sindy as ep
 from ep2sindy.app.inspection import NEEDS
 from ep2sindy.app.runner import run_config
+from ep2sindy.data.quantities import DoubtfulUnit
 from ep2sindy.library.units import SECONDS
 from tests.programs import EXPERIMENTS, composed, computed, ended
 
@@ -198,6 +200,54 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
     ))  # fmt: skip
     assert f"500 samples of {SECONDS.duration_text(step, digits=4)} from" in found.log
     assert [text for text in found.warnings if "the record has 1 gap" in text]
+
+
+@pytest.mark.parametrize(
+    ("header", "times", "dt_s", "said_s"),
+    [
+        ("t (ms)", 20.0 * np.arange(50), 1.0, "0.02"),
+        ("t (ms)", 20.0 * np.arange(50), 0.02, ""),
+        ("t", 20.0 * np.arange(50), 0.02, ""),  # ms, which dt_s says
+        ("t", 20.0 * np.arange(50), 0.5, "20"),
+        ("t (s)", np.round(0.0015 * np.arange(50), 3), 0.0015, ""),  # rounded
+        ("t (s)", 0.01 * np.r_[0:25, 100:125], 0.01, ""),  # with a gap
+        ("t", np.arange(50.0), 0.02, ""),  # counts the samples
+        ("frame", 10.0 * np.arange(50), 0.02, ""),  # rises, and is no time
+    ],
+)
+def test_a_step_that_contradicts_the_files_times_is_told(
+    folder: Path, header: str, times: np.ndarray, dt_s: float, said_s: str
+) -> None:
+    rows = "\n".join(f"{t:.9g},{k % 7}" for k, t in enumerate(times))
+    (folder / "a.csv").write_text(f"{header},V\n{rows}\n")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        field = ep.open_field("a.csv", dt_s=dt_s)
+    assert field.time[1] == dt_s  # taken in any case
+    texts = [str(each.message) for each in said if each.category is DoubtfulUnit]
+    assert len(texts) == bool(said_s)
+    for text in texts:
+        assert f"dt_s={dt_s:g} is taken" in text
+        assert f"'t', which go in steps of {said_s} s" in text
+
+
+def test_an_experiment_warns_of_a_step_that_contradicts_a_mapping(folder: Path) -> None:
+    lorenz_csv(folder / "a.csv")
+    field = ep.open_field(
+        "a.csv", variables={"x": {"name": "x", "unit": "1"}}, time={"name": "Time", "unit": "s"}
+    )
+    step = float(np.diff(field.time)[0])
+    data = [
+        "data=file", "data.path=a.csv", "~data.variables", "+data.variables.x={name:x,unit:'1'}",
+        "data.z.name=null", "data.time.unit=s", f"data.dt_s={50 * step}",
+    ]  # fmt: skip
+    for name, n_warnings in {"Time": 1, "null": 0}.items():
+        config = composed(
+            "+exp=discover", *data, f"data.time.name={name}", "trajectory.states=[x]",
+            "search=best_subset", "selection=ebic", f"output={folder}",
+        )  # fmt: skip
+        told = [text for text in computed(config).warnings if "contradicts" in text]
+        assert len(told) == n_warnings
 
 
 def test_an_experiment_of_one_record_refuses_several(folder: Path) -> None:

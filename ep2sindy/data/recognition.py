@@ -41,7 +41,8 @@ class Recognised:
     held: all arrays of the file. variables, axes: our name -> location in the file. dt_s: time
     step in s if the file gives it outside its time array. guesses: our name -> message about a
     unit that is only likely. questions: messages about open decisions. n_samples: number of
-    samples in time, None if it cannot be determined.
+    samples in time, None if it cannot be determined. replaced: the file's times that dt_s stands
+    for, in each unit that they may be in.
     """
 
     held: Sequence[ArrayInfo]
@@ -51,6 +52,7 @@ class Recognised:
     guesses: Mapping[str, str] = field(default_factory=dict)
     questions: Sequence[str] = ()
     n_samples: int | None = None
+    replaced: list[Variable] = field(default_factory=list)
 
     @property
     def has_time(self) -> bool:
@@ -125,7 +127,19 @@ def recognise(
         said_s = source.step_s or _stated_step_s(usable)
         axes["time"] = with_time_unit(axes["time"], one, variables, said_s, guesses)
         _compare_step(axes["time"], one, source.step_s, questions)
-    return Recognised(held, variables, axes, dt_s, guesses, questions, lengths.get("time"))
+    one = _of(held, counter.name) if counter else None
+    return Recognised(
+        held, variables, axes, dt_s, guesses, questions, lengths.get("time"),
+        _in_units(one) if one else [],
+    )  # fmt: skip
+
+
+def _in_units(one: ArrayInfo) -> list[Variable]:
+    """Times of a file in their unit, or in each that they may be in if they name none."""
+    if one.unit not in ("", "1") or _ending("time", one.name):
+        return [with_unit("time", one, AXES["time"], {})]
+    units = ("s", *AXES["time"].others) if "time" in meant_by(one.name) else ()
+    return [Variable(one.name, unit) for unit in units]
 
 
 def _of(held: Sequence[ArrayInfo], name: str | None) -> ArrayInfo | None:
