@@ -154,18 +154,36 @@ def test_a_law_of_which_no_point_lives_says_what_to_try(folder: Path) -> None:
 def test_an_inspection_of_a_glob_writes_the_list_and_the_command(
     folder: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    swing(folder, 0.6, 0.9)
+    swing(folder, 0.6, 0.9, 1.2)
     assert not ended("inspect", "a*.csv")
     said = capsys.readouterr().out
-    assert "2 operating points, if the numbers in the names are such (a; " in said
-    assert "  a=0.6: a0.6.csv\n  a=0.9: a0.9.csv\n" in said
-    command = "ep2sindy +exp=predict data=recognised 'points.files=a{a}.csv' models=null"
-    assert command in said
-    assert "+exp=trace" not in said.partition("next, for example:")[2]  # it takes one record
+    assert "3 operating points, if the numbers in the names are such (a; " in said
+    assert "  a=0.6: a0.6.csv\n  a=0.9: a0.9.csv\n  a=1.2: a1.2.csv\n" in said
+    assert "ep2sindy +exp=predict data=recognised 'points.files=a{a}.csv'" in said
     assert not ended("inspect", "a*.csv", "--write", "mine")
     assert "ep2sindy +exp=predict data=mine 'points.files=a{a}.csv'" in capsys.readouterr().out
-    swing(folder, 1.2)  # a law needs three
-    assert study_of(predict.Study, composed(*shlex.split(command)[1:])).models is None
+    config = composed("+exp=predict", "data=recognised", mend("points.files=a{a}.csv"))
+    with pytest.raises(ValueError, match="models.inflow cannot hold"):  # its inflow has mdot_mg_s
+        study_of(predict.Study, config)
+    (line,) = re.findall(r"ep2sindy (\+exp=.*)", said)  # and no experiment on all as one system
+    study = study_of(predict.Study, composed(*map(mend, shlex.split(line))))
+    assert list(study.models) == ["free"]
+
+
+def test_points_of_a_thruster_are_proposed_to_both_studies_of_points(
+    folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    for V in (200, 300, 400):
+        columns = np.random.default_rng(V).uniform(1.0, 2.0, (50, 4)) * [1e17, 1e18, 1e-14, 1e4]
+        table = pd.DataFrame(columns, columns=["n_i", "n_n", "R_ion", "u_iz"])
+        table.insert(0, "time [s]", 1e-6 * np.arange(50))
+        table.to_csv(folder / f"V{V}_m5.csv", index=False)
+    assert not ended("inspect", "V*.csv")
+    assert re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out) == [
+        "+exp=parametric data=recognised 'points.files=V{V_D_V}_m5.csv' thesis=null 'trends=[]'",
+        "+exp=predict data=recognised 'points.files=V{V_D_V}_m5.csv' '~models.inflow' "
+        "'~models.conserving' '~models.leaving'",
+    ]
 
 
 @pytest.mark.parametrize(

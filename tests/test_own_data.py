@@ -2,6 +2,8 @@
 
 import json
 import re
+import shlex
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,8 @@ import yaml
 import ep2sindy as ep
 from ep2sindy.app.inspection import NEEDS
 from ep2sindy.app.runner import run_config
+from ep2sindy.data.quantities import DoubtfulUnit
+from ep2sindy.library.units import SECONDS
 from tests.programs import EXPERIMENTS, composed, computed, ended
 
 
@@ -114,6 +118,136 @@ def test_several_files_are_several_records(folder: Path) -> None:
     )
     one = computed(composed(*overrides, "data.path=[run0.csv]"))
     assert "records" not in one.outcome.tables()
+
+
+def proposed(capsys: pytest.CaptureFixture, *arguments: str) -> list[str]:
+    """The commands that an inspection prints, without the program's name."""
+    assert not ended("inspect", *arguments)
+    return re.findall(r"^  ep2sindy (.*)", capsys.readouterr().out, re.MULTILINE)
+
+
+def test_a_file_that_lacks_only_its_times_goes_on_with_a_step(
+    folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    np.savez("a.npz", V=np.sin(np.arange(50.0)))
+    (trace,) = proposed(capsys, "a.npz")
+    assert trace == "+exp=trace data=recognised data.path=a.npz data.dt_s=STEP signal=V"
+    settings = composed(*shlex.split(trace.replace("STEP", "1e-6"))).data
+    assert ep.open_field(settings.path, dt_s=settings.dt_s).time[1] == 1e-6
+
+
+def test_what_is_only_likely_is_written_first(folder: Path, capsys: pytest.CaptureFixture) -> None:
+    wave = np.sin(np.arange(50.0))
+    np.savez("a b.npz", time=1e-6 * np.arange(50), n_i=1e11 * (2.0 + wave))
+    write, trace, _ = proposed(capsys, "a b.npz")
+    assert (write, trace) == ("inspect 'a b.npz' --write", "+exp=trace data=a_b signal=n_i")
+    with pytest.raises(ValueError, match=f"`ep2sindy {write}` .* writes a mapping"):
+        ep.open_field("a b.npz")
+    assert not ended(*shlex.split(write))
+    assert trace in capsys.readouterr().out
+
+
+def test_several_records_are_shown_once_and_go_to_what_takes_several(
+    folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    for name, seed in {"a": 0, "b": 1, "c d": 2}.items():
+        lorenz_csv(folder / f"{name}.csv", seed=seed)
+    (folder / "b.csv").write_text("\n".join((folder / "b.csv").read_text().split("\n")[:900]))
+    assert not ended("inspect", "a.csv", "b.csv", "c d.csv")
+    said = capsys.readouterr().out
+    assert said.count("taken as") == 1
+    assert "\nthe other 2 files: the same arrays; 896 to 1000 samples\n" in said
+    (line,) = re.findall(r"ep2sindy (\+exp=.*)", said)
+    config = composed(*shlex.split(line))
+    assert config.experiment == "discover"
+    assert config.data.path == ["a.csv", "b.csv", "c d.csv"]
+
+
+def test_files_are_compared_with_the_first(folder: Path, capsys: pytest.CaptureFixture) -> None:
+    t = np.arange(50) * 1e-6
+    write = "t (s),I_d (A),x\n{}".format
+    for name, text in {
+        "a": write("\n".join(f"{s},{k % 7},{k % 3}" for k, s in enumerate(t))),
+        "b": write("\n".join(f"{2 * s},{k % 7},{k % 3}" for k, s in enumerate(t))),
+        "c": write("\n".join(f"{s},{k % 7},{k if k > 9 else ''}" for k, s in enumerate(t))),
+        "d": write("\n".join(f"{s},{k},{k % 5}" for k, s in enumerate(t))).replace("(A)", "(mA)"),
+        "e": write("\n".join(f"{s},{k % 5},{k % 3}" for k, s in enumerate(t))),
+    }.items():
+        (folder / f"{name}.csv").write_text(text)
+    (folder / "e.csv").write_text((folder / "e.csv").read_text().replace("x", "y", 1))
+    assert not ended("inspect", "?.csv")
+    said = capsys.readouterr().out
+    assert "b.csv: t: 2e-06 apart" in said
+    assert "c.csv: x: 10 missing" in said
+    assert "d.csv: I_d: mA, taken as I_d in mA" in said
+    assert "e.csv: without x; also y" in said
+    assert "files of one mapping must hold the same names: e.csv differs from a.csv" in said
+    assert "+exp=discover data" not in said
+
+
+def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixture) -> None:
+    lorenz_csv(folder / "whole.csv")
+    lines = (folder / "whole.csv").read_text().splitlines()
+    (folder / "a.csv").write_text("\n".join(lines[:204] + lines[704:]))
+    step = ep.inspect_file("whole.csv").found.held[0].step
+    assert not ended("inspect", "a.csv")
+    said = capsys.readouterr().out
+    assert f"about {step:.4g} apart" in said
+    assert "have a gap: " in said
+    found = computed(composed(
+        "+exp=discover", "data=recognised", "data.path=a.csv", "trajectory.states=[x,y,z]",
+        "search=best_subset", "selection=ebic", f"output={folder}",
+    ))  # fmt: skip
+    assert f"500 samples of {SECONDS.duration_text(step, digits=4)} from" in found.log
+    assert [text for text in found.warnings if "the record has 1 gap" in text]
+
+
+@pytest.mark.parametrize(
+    ("header", "times", "dt_s", "said_s"),
+    [
+        ("t (ms)", 20.0 * np.arange(50), 1.0, "0.02"),
+        ("t (ms)", 20.0 * np.arange(50), 0.02, ""),
+        ("t", 20.0 * np.arange(50), 0.02, ""),  # ms, which dt_s says
+        ("t", 20.0 * np.arange(50), 0.5, "20"),
+        ("t (s)", np.round(0.0015 * np.arange(50), 3), 0.0015, ""),  # rounded
+        ("t (s)", 0.01 * np.r_[0:25, 100:125], 0.01, ""),  # with a gap
+        ("t", np.arange(50.0), 0.02, ""),  # counts the samples
+        ("frame", 10.0 * np.arange(50), 0.02, ""),  # rises, and is no time
+    ],
+)
+def test_a_step_that_contradicts_the_files_times_is_told(
+    folder: Path, header: str, times: np.ndarray, dt_s: float, said_s: str
+) -> None:
+    rows = "\n".join(f"{t:.9g},{k % 7}" for k, t in enumerate(times))
+    (folder / "a.csv").write_text(f"{header},V\n{rows}\n")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        field = ep.open_field("a.csv", dt_s=dt_s)
+    assert field.time[1] == dt_s  # taken in any case
+    texts = [str(each.message) for each in said if each.category is DoubtfulUnit]
+    assert len(texts) == bool(said_s)
+    for text in texts:
+        assert f"dt_s={dt_s:g} is taken" in text
+        assert f"'t', which go in steps of {said_s} s" in text
+
+
+def test_an_experiment_warns_of_a_step_that_contradicts_a_mapping(folder: Path) -> None:
+    lorenz_csv(folder / "a.csv")
+    field = ep.open_field(
+        "a.csv", variables={"x": {"name": "x", "unit": "1"}}, time={"name": "Time", "unit": "s"}
+    )
+    step = float(np.diff(field.time)[0])
+    data = [
+        "data=file", "data.path=a.csv", "~data.variables", "+data.variables.x={name:x,unit:'1'}",
+        "data.z.name=null", "data.time.unit=s", f"data.dt_s={50 * step}",
+    ]  # fmt: skip
+    for name, n_warnings in {"Time": 1, "null": 0}.items():
+        config = composed(
+            "+exp=discover", *data, f"data.time.name={name}", "trajectory.states=[x]",
+            "search=best_subset", "selection=ebic", f"output={folder}",
+        )  # fmt: skip
+        told = [text for text in computed(config).warnings if "contradicts" in text]
+        assert len(told) == n_warnings
 
 
 def test_an_experiment_of_one_record_refuses_several(folder: Path) -> None:

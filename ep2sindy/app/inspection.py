@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from ep2sindy.data.conversion import KNOWN_UNITS
-from ep2sindy.data.inspection import Inspection, check_alike, inspect_file
+from ep2sindy.data.inspection import Inspection, compare_files, inspect_file, unlike
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.steps import records_of
 from ep2sindy.operating.file_names import FilePattern, propose_pattern
@@ -38,6 +38,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "discover": (),
 }
 
+WITH_INFLOW = ("inflow", "conserving", "leaving")  # models of +exp=predict that need mdot_mg_s
 NOT_STATES = ("R_ion", "V_d")  # what drives a model
 
 
@@ -58,28 +59,31 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     given = parser.parse_args(arguments)
     paths = records_of(given.path[0] if len(given.path) == 1 else given.path)
     found = [inspect_file(path) for path in paths]
-    for each in found:
-        say("\n".join(each.lines(experiments(each))) + "\n")
+    say("\n".join(found[0].lines(experiments(found[0]))) + "\n")
+    if len(found) > 1:
+        say("\n".join(compare_files(found[0], found[1:])) + "\n")
     pattern = propose_pattern([path for path in paths if isinstance(path, str)])
     if pattern:
         say("\n".join(point_lines(pattern)))
     name = given.write or _word_for(found[0].path)
+    if given.write is None and (text := unlike(found)):
+        say(text)
+        return
     if given.write is None:
-        data = ["data=recognised", f"data.path={_hydra(given.path[0])}"]
-        is_certain = len(given.path) == 1 and all(each.is_certain for each in found)
-        lines = commands(found, data) if is_certain else []
-        if pattern and not any(each.found.doubts for each in found):
-            lines += point_commands(found[0], "recognised", pattern)
-        say_next(lines)
+        if all(each.is_certain or each.found.lacks_only_time for each in found):
+            say_next(commands(found, "recognised", pattern, path=_hydra(given.path)))
+        else:  # what is only likely must be looked at in the written config
+            write = ["ep2sindy", "inspect", *given.path, "--write"]
+            say_next([shlex.join(write), *commands(found, name, pattern)])
         say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
         return
-    check_alike(found)
+    if text := unlike(found):
+        raise ValueError(text)
     name = re.sub(r"\W+", "_", name).strip("_")
     path = own_config(name, conf)
     write_text(path, config_text(found, paths))
     say(f"written: {path}")
-    of_points = point_commands(found[0], name, pattern) if pattern else []
-    say_next([*commands(found, [f"data={name}"]), *of_points])
+    say_next(commands(found, name, pattern))
 
 
 def say_next(commands: Sequence[str]) -> None:
@@ -100,18 +104,62 @@ def point_lines(pattern: FilePattern) -> list[str]:
     ]
 
 
-def point_commands(found: Inspection, name: str, pattern: FilePattern) -> list[str]:
-    """Commands that study the files as operating points. name: of the data group."""
-    more = [f"data={name}", f"points.files={pattern.text}"]
+def commands(
+    found: Sequence[Inspection], group: str, pattern: FilePattern | None, *, path: str = ""
+) -> list[str]:
+    """Commands that can be run with the data; placeholders in capitals are for the user.
+
+    group: name in the data group. pattern: of files that are operating points, which are studied as
+    such where an experiment has all that it needs. path: for a group that names no file.
+    """
+    first = found[0]
+    step = [] if first.has_time else ["data.dt_s=STEP"]
+    lines = []
+    if pattern is not None:
+        data = [f"data={group}", f"points.files={pattern.text}", *step]
+        lines = point_commands(first, data, pattern.names, n_points=len(found))
+    if not lines:
+        data = [f"data={group}", *([f"data.path={path}"] if path else []), *step]
+        lines = record_commands(first, data, are_several=len(found) > 1)
+    return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]
+
+
+def point_commands(
+    found: Inspection, data: list[str], names: Sequence[str], *, n_points: int
+) -> list[list[str]]:
+    """Commands that study the files as operating points. names: quantities of the points."""
     lines = []
     if not found.lacking(NEEDS["parametric"]):
-        both = {"V_D_V", "mdot_mg_s"} == set(pattern.names)
+        both = {"V_D_V", "mdot_mg_s"} == set(names)
         aside = ["thesis=null", *([] if both else ["trends=[]"])]
-        lines.append(["+exp=parametric", *more, *aside, *preparation(found)])
-    elif not found.lacking(NEEDS["predict"]):
-        search = [] if "mdot_mg_s" in pattern.names else ["models=null"]  # given ones need it
-        lines.append(["+exp=predict", *more, *search])
-    return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]
+        more = [*aside, *channel(found), *preparation(found)]
+        lines.append(["+exp=parametric", *data, *more])
+    # Laws of degree one must fit, with each point left out in turn.
+    if not found.lacking(NEEDS["predict"]) and n_points >= len(names) + 2:
+        aside = [] if "mdot_mg_s" in names else [f"~models.{name}" for name in WITH_INFLOW]
+        lines.append(["+exp=predict", *data, *aside, *channel(found)])
+    return lines
+
+
+def record_commands(found: Inspection, data: list[str], *, are_several: bool) -> list[list[str]]:
+    """Commands that study one record, or several of one system."""
+    lines = []
+    if not found.lacking(NEEDS["breathing"]):
+        lines.append(["+exp=breathing", *data, *channel(found), *preparation(found)])
+    traces = [n for n, v in found.variables.items() if found.is_trace(v)]
+    if traces and not are_several:
+        signal = "I_d" if "I_d" in traces else traces[0]
+        lines.append(["+exp=trace", *data, f"signal={signal}"])
+    states = traces[:3] if len(traces) > 1 else [n for n in ("n_i", "n_n") if n in found.variables]
+    states = states or [n for n in found.signals if n not in NOT_STATES][:2] * (not traces)
+    if states:
+        lines.append(["+exp=discover", *data, f"trajectory.states=[{','.join(states)}]"])
+    return lines
+
+
+def channel(found: Inspection) -> list[str]:
+    """The setting of the channel's length, if a zone of it needs one that the file lacks."""
+    return [] if found.z is None or found.channel_m else ["data.channel_m=LENGTH"]
 
 
 def preparation(found: Inspection) -> list[str]:
@@ -128,8 +176,11 @@ def _word_for(path: Path) -> str:
     return next(filter(None, words), "own")
 
 
-def _hydra(text: str) -> str:
-    """A value as Hydra reads it on the command line; quoted unless it is plain."""
+def _hydra(paths: Sequence[str]) -> str:
+    """One path, or a list, as Hydra reads it on the command line; quoted unless it is plain."""
+    if len(paths) > 1:
+        return f"[{','.join(_hydra([path]) for path in paths)}]"
+    (text,) = paths
     return text if re.fullmatch(r"[\w/.*?-]+", text) else "'" + text.replace("'", "\\'") + "'"
 
 
@@ -207,22 +258,3 @@ def _flow(value: Any) -> str:
 
 def _word(found: Inspection, name: str) -> str:
     return "  # likely: check it" if name in found.found.guesses else ""
-
-
-def commands(records: Sequence[Inspection], data: list[str]) -> list[str]:
-    """Commands that can be run with all records; placeholders in capitals are for the user."""
-    found = records[0]
-    data = data if found.has_time else [*data, "data.dt_s=STEP"]
-    lines = []
-    if not found.lacking(NEEDS["breathing"]):
-        zone = [] if found.z is None or found.channel_m else ["data.channel_m=LENGTH"]
-        lines.append(["+exp=breathing", *data, *zone, *preparation(found)])
-    traces = [n for n, v in found.variables.items() if found.is_trace(v)]
-    if traces and len(records) == 1:  # +exp=trace takes no more
-        signal = "I_d" if "I_d" in traces else traces[0]
-        lines.append(["+exp=trace", *data, f"signal={signal}"])
-    states = traces[:3] if len(traces) > 1 else [n for n in ("n_i", "n_n") if n in found.variables]
-    states = states or [n for n in found.signals if n not in NOT_STATES][:2] * (not traces)
-    if states:
-        lines.append(["+exp=discover", *data, f"trajectory.states=[{','.join(states)}]"])
-    return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]

@@ -22,9 +22,9 @@ class ArrayInfo:
     """Summary of one array in a file: shape, unit, range, missing values, spacing.
 
     unit: "" if the file states none. low, high: range of the finite values. size: median magnitude
-    of the nonzero values. n_missing: number of NaN or infinite values. step: mean step of an
-    increasing vector, else None. even: True if the steps are equal. usual: median step. gap: where
-    steps that are otherwise even leave out samples, in words. falls: where a vector first does not
+    of the nonzero values. n_missing: number of NaN or infinite values. step: median step of
+    an increasing vector, else None. even: True if the steps are equal. gap: where steps that are
+    otherwise even leave out samples, in words. falls: where a vector first does not
     increase, in words. problem: reason why the array cannot be used, or "".
     """
 
@@ -39,7 +39,6 @@ class ArrayInfo:
     n_missing: int = 0
     step: float | None = None
     even: bool = False
-    usual: float | None = None
     gap: str = ""
     falls: str = ""
     problem: str = ""
@@ -73,9 +72,8 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
         float(finite.min()) if finite.size else np.nan,
         float(finite.max()) if finite.size else np.nan,
         typical(values), int(values.size - finite.size),
-        float(steps.mean()) if steps.size else None,
-        bool(steps.size and np.ptp(steps) <= 1e-3 * steps.mean()),
         float(np.median(steps)) if steps.size else None,
+        bool(steps.size and np.ptp(steps) <= 1e-3 * steps.mean()),
         _gap(steps),
         _fall(values.ravel()) if is_vector else "",
     )  # fmt: skip

@@ -61,10 +61,14 @@ def without_gaps(field: xr.Dataset) -> xr.Dataset:
     return field.isel(time=np.flatnonzero(present_rows(alone)))
 
 
+def usual_step(t: Float[np.ndarray, " samples"]) -> float:
+    """Median step of times, in their unit, which gaps leave as it is."""
+    return float(np.median(np.diff(t)))
+
+
 def between_gaps(t: Float[np.ndarray, " samples"]) -> list[tuple[int, int]]:
     """First and last sample (exclusive) of every stretch of times without a gap."""
-    steps = np.diff(t)
-    cuts = np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) + 1
+    cuts = np.flatnonzero(np.diff(t) > LONGEST_STEP * usual_step(t)) + 1
     return list(pairwise([0, *cuts.tolist(), len(t)]))
 
 
@@ -73,7 +77,7 @@ def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
 
     t: times of the samples that are left, in s. n_samples: number of samples before.
     """
-    longest, usual = float(np.diff(t).max()), float(np.median(np.diff(t)))
+    longest, usual = float(np.diff(t).max()), usual_step(t)
     return (
         f"{n_samples - len(t)} of {n_samples} samples are missing (NaN) and left out; the longest "
         f"gap is {longest:.4g} s, {longest / usual:.0f} steps: crop the record if that is long "
@@ -89,7 +93,7 @@ def describe_breaks(t: Float[np.ndarray, " samples"]) -> str:
     k = int(steps.argmax())
     return (
         f"the record has {n_gaps} gap{'s' * (n_gaps > 1)}: {steps[k]:.4g} s pass after sample "
-        f"{k + 1}, at {t[k]:.4g} s, where steps are {np.median(steps):.4g} s; nothing is filled in"
+        f"{k + 1}, at {t[k]:.4g} s, where steps are {usual_step(t):.4g} s; nothing is filled in"
     )
 
 

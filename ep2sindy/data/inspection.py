@@ -8,6 +8,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import isclose
 from pathlib import Path
 
 from ep2sindy.data.arrays import ArrayInfo
@@ -53,16 +54,12 @@ class Inspection:
 
     @property
     def has_time(self) -> bool:
-        return self.time is not None or self.dt_s is not None
+        return self.found.has_time
 
     @property
     def is_certain(self) -> bool:
         """True if `open_field` opens the file without a mapping."""
-        try:
-            self.found.check(self.source)
-        except ValueError:
-            return False
-        return True
+        return not self.found.doubts
 
     @property
     def variables(self) -> dict[str, Variable]:
@@ -163,6 +160,41 @@ class Inspection:
         more = [f"... {len(rows) - N_ROWS} more arrays"] * (len(rows) > N_ROWS)
         return [in_line(head), *table, *more, *notes]
 
+    def differences(self, first: Inspection) -> list[str]:
+        """In what this file differs from another of its kind: all but ranges and samples."""
+        own, other = ({e.name: e for e in file.found.held} for file in (self, first))
+        lacks, more = [n for n in other if n not in own], [n for n in own if n not in other]
+        each = [self._difference(one, first, other[n]) for n, one in own.items() if n in other]
+        texts = [
+            self.kind if self.kind != first.kind else "",
+            self.words if self.words != first.words else "",
+            f"without {', '.join(lacks)}" if lacks else "",
+            f"also {', '.join(more)}" if more else "",
+            f"steps of {self.dt_s:.6g} s" if self.dt_s and self.dt_s != first.dt_s else "",
+            *each,
+            *(text for text in self.found.questions if text not in first.found.questions),
+        ]
+        return [text for text in texts if text]
+
+    def _difference(self, one: ArrayInfo, first: Inspection, other: ArrayInfo) -> str:
+        """In what an array differs from that of its name in another file; "" for nothing."""
+        if one.problem or other.problem:
+            return f"{one.name}: {one.problem or 'numbers'}" * (one.problem != other.problem)
+        unit, role = one.unit or "no unit", self._role(one)
+        words = [
+            f"shape {one.shape}" * (self._axes_of(one) != first._axes_of(other)),
+            unit * (one.unit != other.unit),
+            f"taken as {role}" * (role != first._role(other)),
+            f"{one.n_missing} missing" * (one.n_missing != other.n_missing),
+        ]
+        if one.step and other.step and not isclose(one.step, other.step, rel_tol=1e-2):
+            words.append(f"{one.step:.4g} apart")
+        text = ", ".join(word for word in words if word)
+        return f"{one.name}: {text}" if text else ""
+
+    def _axes_of(self, one: ArrayInfo) -> list[int | str]:
+        return ["time" if n == self.found.n_samples else n for n in one.shape]
+
     def __repr__(self) -> str:
         return one_screen(self.lines(), n_lines=60)
 
@@ -217,12 +249,26 @@ def inspect_file(path: str | Path | Sequence[str | Path]) -> Inspection:
     return Inspection(kind, source, found)
 
 
-def check_alike(found: Sequence[Inspection]) -> None:
-    """Raise ValueError unless all files hold the same names, so that one mapping fits all."""
+def compare_files(first: Inspection, others: Sequence[Inspection]) -> list[str]:
+    """Lines on the files after the first: one for each that differs, and one for all the rest."""
+    differing = {each.path: texts for each in others if (texts := each.differences(first))}
+    same = [each for each in others if each.path not in differing]
+    lines = [in_line(f"{path}: {'; '.join(texts)}") for path, texts in differing.items()]
+    if same:
+        counts = sorted({each.found.n_samples or 0 for each in same})
+        span = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
+        which = f"the other {len(same)} files" if len(same) > 1 else str(same[0].path)
+        lines.append(in_line(f"{which}: the same arrays{f'; {span} samples' * bool(counts[0])}"))
+    return lines
+
+
+def unlike(found: Sequence[Inspection]) -> str:
+    """Why one mapping does not fit all files, which hold different names; "" if it does."""
     names = [{v.name for v in each.variables.values()} for each in found]
     for each, held in zip(found, names, strict=True):
         if held != names[0]:
-            raise ValueError(
+            return (
                 f"files of one mapping must hold the same names: {each.path} differs from "
                 f"{found[0].path} in {sorted(map(str, held ^ names[0]))}; give each its own"
             )
+    return ""

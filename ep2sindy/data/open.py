@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from math import isclose
 from pathlib import Path
 
 import xarray as xr
 
+from ep2sindy.data.arrays import describe_array
 from ep2sindy.data.conversion import conversion, to_si
 from ep2sindy.data.dimensions import assign_dims, read_axes
 from ep2sindy.data.export import CLOCK
 from ep2sindy.data.fields import DIMS, check_field, mask_outside, write_netcdf
+from ep2sindy.data.gaps import usual_step
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
-from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
+from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit, unit_doubts
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import reader_of
 from ep2sindy.data.readers.source import UNDECODED, FileSource, damage_named, file_named
@@ -51,10 +54,9 @@ def open_field(
     chunks: our dimension -> length, to stream data that exceed memory (needs dask; NetCDF, Zarr).
     Values from NetCDF and Zarr are read when they are used; without dask, this holds for variables
     in SI without a mask. Other kinds of file are read at once.
-    Warns with `DoubtfulUnit` if numbers look like another unit.
-    Raises one ValueError for all names that the file does not hold, all shapes that do not fit
-    their dimensions, and all units that cannot be converted; also for a file that is missing,
-    damaged or of another kind.
+    Warns with `DoubtfulUnit` if numbers look like another unit, or dt_s contradicts the times.
+    Raises one ValueError for all names not in the file, shapes that do not fit their dimensions,
+    and units that cannot be converted; also for a missing or damaged file, or one of another kind.
 
     >>> field = ep.open_field("run.nc")  # its names, units and shapes leave no doubt
     >>> field["n_i"].attrs["units"]
@@ -62,19 +64,43 @@ def open_field(
     """
     source = open_record(path)
     axes = {"time": time, "z": z, "r": r}
+    times = [*in_file({"time": time}, Problems()).values()]
     if variables is None:
         found = recognise(source, dt_s=dt_s, given={n: v for n, v in axes.items() if v})
         found.check(source)
-        variables, dt_s = found.variables, found.dt_s
+        variables, dt_s, times = found.variables, found.dt_s, times or found.replaced
         axes = {axis: given or found.axes.get(axis) for axis, given in axes.items()}
     with file_named(source.path):
         field = _field(source, variables, axes, dt_s, mask, chunks)
-    if (length := channel_m or source.channel_m) is not None:
-        field.attrs["channel_m"] = length
-    field.attrs["file"] = str(source.path)
+    doubt = _step_doubt(source, times, field, dt_s)
+    said = {"channel_m": channel_m or source.channel_m, "file": str(source.path), STEP_DOUBT: doubt}
+    field.attrs |= {name: value for name, value in said.items() if value}
     for text in unit_doubts(field):
         warnings.warn(text, DoubtfulUnit, stacklevel=2)
     return field
+
+
+def _step_doubt(
+    source: FileSource, times: Sequence[Variable], field: xr.Dataset, dt_s: float | None
+) -> str:
+    """How a step contradicts the file's own times, whichever of these they are; "" if not at all.
+
+    The mean step counts as well as the median: times may be rounded, or have gaps.
+    """
+    if dt_s is None or not times:
+        return ""
+    one, taken_s = describe_array(source, str(times[0].name)), usual_step(field["time"].values)
+    if one.step is None or one.is_counter:
+        return ""
+    mean = (one.high - one.low) / (max(one.shape) - 1)
+    factors = [conversion("time", each.unit)[0] for each in times]
+    if any(isclose(f * s, taken_s, rel_tol=0.01) for f in factors for s in (one.step, mean)):
+        return ""
+    return (
+        f"dt_s={dt_s:.6g} is taken, in s, and contradicts the file's own times {one.name!r}, which "
+        f"go in steps of {factors[0] * one.step:.6g} s: leave dt_s out to take these; if dt_s is "
+        "right, give a mapping with time.name=null, such as `ep2sindy inspect FILE --write` makes"
+    )
 
 
 def _field(

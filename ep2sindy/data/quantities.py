@@ -12,6 +12,8 @@ import xarray as xr
 from ep2sindy.data.conversion import KNOWN_UNITS, conversion
 from ep2sindy.data.fields import COORDINATE_UNITS
 
+STEP_DOUBT = "step_doubt"  # attribute of a field: how dt_s contradicts the file's own times
+
 
 class DoubtfulUnit(UserWarning):
     """Warns that numbers look like another unit than the stated one."""
@@ -200,9 +202,9 @@ def unit_doubts(field: xr.Dataset) -> list[str]:
     """Messages about quantities whose numbers look like another unit.
 
     Densities of 1e12 m^-3, for example, suggest that the file uses cm^-3. On a grid only the
-    middle sample in time is examined.
+    middle sample in time is examined. A step that contradicts the file's times comes first.
     """
-    found = []
+    found = [str(field.attrs[STEP_DOUBT])] if STEP_DOUBT in field.attrs else []
     step = float(np.diff(field["time"].values[:2])[0])
     if (unit := likely_time_unit(step, map(str, field.data_vars))) is not None:
         found.append(

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
 from math import isclose
+from shlex import quote
 
 import numpy as np
 import xarray as xr
@@ -40,7 +41,8 @@ class Recognised:
     held: all arrays of the file. variables, axes: our name -> location in the file. dt_s: time
     step in s if the file gives it outside its time array. guesses: our name -> message about a
     unit that is only likely. questions: messages about open decisions. n_samples: number of
-    samples in time, None if it cannot be determined.
+    samples in time, None if it cannot be determined. replaced: the file's times that dt_s stands
+    for, in each unit that they may be in.
     """
 
     held: Sequence[ArrayInfo]
@@ -50,13 +52,23 @@ class Recognised:
     guesses: Mapping[str, str] = field(default_factory=dict)
     questions: Sequence[str] = ()
     n_samples: int | None = None
+    replaced: list[Variable] = field(default_factory=list)
+
+    @property
+    def has_time(self) -> bool:
+        return "time" in self.axes or self.dt_s is not None
+
+    @property
+    def lacks_only_time(self) -> bool:
+        """True if the step between samples is all that keeps this mapping from giving a field."""
+        return not self.has_time and len(self.doubts) == 1
 
     @property
     def doubts(self) -> list[str]:
         """What keeps this mapping from giving a field without any doubt."""
         problems = [each.problem for each in self.held if each.problem not in ("", TEXT)]
         problems += self.guesses.values()
-        if "time" not in self.axes and self.dt_s is None:
+        if not self.has_time:
             problems.insert(0, "a field needs time: give its step dt_s, or name the file's time")
         if not self.variables:
             problems.append("no array of the file fits its axes")
@@ -67,8 +79,9 @@ class Recognised:
         if self.doubts:
             text = "; ".join([*self.doubts, *self.questions])
             raise ValueError(
-                f"{source.path} cannot be opened without a mapping: {text}; ep2sindy.inspect_file "
-                "shows what it holds"
+                f"{source.path} cannot be opened without a mapping: {text}; `ep2sindy inspect "
+                f"{quote(str(source.path))} --write` (in Python ep2sindy.inspect_file) shows what "
+                "it holds and writes a mapping"
             )
 
 
@@ -114,7 +127,19 @@ def recognise(
         said_s = source.step_s or _stated_step_s(usable)
         axes["time"] = with_time_unit(axes["time"], one, variables, said_s, guesses)
         _compare_step(axes["time"], one, source.step_s, questions)
-    return Recognised(held, variables, axes, dt_s, guesses, questions, lengths.get("time"))
+    one = _of(held, counter.name) if counter else None
+    return Recognised(
+        held, variables, axes, dt_s, guesses, questions, lengths.get("time"),
+        _in_units(one) if one else [],
+    )  # fmt: skip
+
+
+def _in_units(one: ArrayInfo) -> list[Variable]:
+    """Times of a file in their unit, or in each that they may be in if they name none."""
+    if one.unit not in ("", "1") or _ending("time", one.name):
+        return [with_unit("time", one, AXES["time"], {})]
+    units = ("s", *AXES["time"].others) if "time" in meant_by(one.name) else ()
+    return [Variable(one.name, unit) for unit in units]
 
 
 def _of(held: Sequence[ArrayInfo], name: str | None) -> ArrayInfo | None:
@@ -193,13 +218,13 @@ def _compare_step(
 ) -> None:
     """Note times that the step in the file's preamble contradicts, or that leave out samples."""
     said = "" if step_s is None else f", and the file says steps of {step_s:.6g} s beside them"
-    usual_s = (one.usual or 0.0) * conversion("time", time.unit)[0]
+    usual_s = (one.step or 0.0) * conversion("time", time.unit)[0]
     if one.gap:
         questions.append(
             f"the times of {one.name!r} have a gap: {one.gap}, in {time.unit}{said}; the times are "
             "taken as they stand"
         )
-    elif step_s is not None and one.usual and abs(usual_s - step_s) > 0.01 * step_s:
+    elif step_s is not None and one.step and abs(usual_s - step_s) > 0.01 * step_s:
         questions.append(
             f"the times of {one.name!r} go in steps of {usual_s:.6g} s{said}; the times are taken"
         )
@@ -429,8 +454,8 @@ def with_time_unit(
     for unit in ("s", *AXES["time"].others):
         if (
             said_s
-            and one.usual
-            and isclose(one.usual * conversion("time", unit)[0], said_s, rel_tol=1e-3)
+            and one.step
+            and isclose(one.step * conversion("time", unit)[0], said_s, rel_tol=1e-3)
         ):
             return replace(time, unit=unit)
     likely = likely_time_unit(one.step, variables)

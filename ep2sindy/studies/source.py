@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import xarray as xr
 
 from ep2sindy.data.fields import clock_of, grid_points
-from ep2sindy.data.gaps import describe_breaks, describe_gaps
+from ep2sindy.data.gaps import describe_breaks, describe_gaps, usual_step
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.sampling import ZoneAverage
 from ep2sindy.data.steps import records_of
@@ -39,7 +39,8 @@ def open_prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
     if len(records) > 1:
         raise ValueError(
             f"this experiment takes one record: data.path names {len(records)} files; give "
-            "one, or take +exp=discover or +exp=breathing, which take several"
+            "one, or take +exp=discover or +exp=breathing, which take several of one system, or "
+            "+exp=parametric or +exp=predict with points.files=PATTERN for operating points"
         )
     return _prepared(records[0], prepare)
 
@@ -155,7 +156,7 @@ def say_field(run: Run, field: xr.Dataset) -> None:
     words = [
         field.attrs.get("file", ""),
         describe_zone(None, field),
-        f"{len(t)} samples of {clock.duration_text((t[-1] - t[0]) / (len(t) - 1), digits=4)} "
+        f"{len(t)} samples of {clock.duration_text(usual_step(t), digits=4)} "
         f"from {clock.duration_text(t[0], digits=4)}",
     ]
     run.say(in_line(f"data: {'; '.join(word for word in words if word)}"))
@@ -179,7 +180,7 @@ def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
     )
     words = [
         *(text for text in where if text),
-        f"{data.n_samples} samples of {data.clock.duration_text(data.dt_s, digits=4)} "
+        f"{data.n_samples} samples of {data.clock.duration_text(usual_step(data.t), digits=4)} "
         f"from {data.clock.duration_text(data.t[0], digits=4)}",
         units,
         f"dominant frequency {frequencies}",
