@@ -17,7 +17,7 @@ from ep2sindy.discovery.recipe import method_of
 from ep2sindy.estimation import cost, explanation
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, fit_paths, gram, squares
-from ep2sindy.estimation.noise import noise_beside
+from ep2sindy.estimation.noise import _shown_by_samples, noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import Solution, from_smooth
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
@@ -316,6 +316,20 @@ def lasting(run: ep.Trajectory, size: float, memory: float, seed: int) -> ep.Tra
         noise[k] = memory * noise[k - 1] + np.sqrt(1 - memory**2) * noise[k]
     rms = np.sqrt(np.square(run.states).mean(axis=0))
     return ep.Trajectory(run.t, run.states + size * rms * noise, run.state_names)
+
+
+def test_samples_that_a_fit_follows_exactly_show_no_noise_of_any_size() -> None:
+    t = np.arange(40.0)
+    run = ep.Trajectory(t, np.square(t)[:, None], ["x"])
+    problem = scale_problem([run], ep.polynomial(["x"], degree=1))
+    n_free = 2
+    fit = TrajectoryFit(
+        tuple(record.values for record in problem.records),
+        np.zeros(n_free), np.zeros(n_free, dtype=np.bool_), np.zeros(1),
+    )  # fmt: skip
+    with np.errstate(all="raise", under="ignore"):
+        shown = _shown_by_samples(problem, fit, np.array([1e9]), np.array([0.5]))
+    assert not shown.any()
 
 
 def test_lasting_noise_is_told_from_signal_and_buys_no_terms() -> None:

@@ -125,10 +125,21 @@ def test_every_rival_makes_a_variant() -> None:
             assert isinstance(instantiate(definition), Variant)
 
 
-def test_a_rival_without_pysindy_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def no_pysindy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pysindy", None)
+    monkeypatch.delitem(sys.modules, "ep2sindy.studies.pysindy_variants", raising=False)
+
+
+@pytest.mark.usefixtures("no_pysindy")
+def test_other_variants_run_without_pysindy(tmp_path: Path) -> None:
+    settings = ["systems=[oscillator]", "noises=[0]", "variants=[STLSQ]"]
+    finished = run_config(composed(*toy(tmp_path), *settings))
+    assert (finished.folder / "summary.json").is_file()
+
+
+@pytest.mark.usefixtures("no_pysindy")
+def test_a_rival_without_pysindy_is_refused(tmp_path: Path) -> None:
     config = composed(*toy(tmp_path), "variants=[ours,PySINDy_SSR]")
     message = r"'PySINDy_SSR' needs PySINDy: pip install \"ep2sindy\[benchmark\]\".*variants=\[ours"
     with pytest.raises(ValueError, match=message):

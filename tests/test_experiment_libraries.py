@@ -226,6 +226,22 @@ def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
     assert found["v"]["terms"]["x"] == pytest.approx(-9.0, rel=0.05)
 
 
+def test_a_record_too_short_for_forecasts_is_searched_without(tmp_path: Path) -> None:
+    t = np.arange(21.0)
+    table = np.column_stack([t, np.cos(0.5 * t), np.sin(0.5 * t)])
+    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="time,x,y", comments="")
+    found = computed(
+        composed(
+            "+exp=discover", "data=recognised", f"data.path={tmp_path / 'run.csv'}",
+            "trajectory.states=[x,y]", "libraries.model.degree=1", f"output={tmp_path}",
+        )
+    )  # fmt: skip
+    assert set(found.outcome.models()["model"].terms("x")) == {"y"}
+    assert not found.outcome.skills
+    log = " ".join(found.log.split())
+    assert "no forecasts: they need 20 samples or more to fit and as many to test, and" in log
+
+
 @pytest.fixture(scope="module")
 def years(tmp_path_factory: pytest.TempPathFactory) -> Computed:
     """Predator and prey over thirty years, counted three times a year with 2 % of noise."""

@@ -8,6 +8,7 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.one_signal import SignalSearch, method_by_runs
+from ep2sindy.library.units import Clock
 from ep2sindy.signals.embedding import DROWNED, unexplained
 from ep2sindy.signals.kalman import ratio_bounds
 from ep2sindy.signals.spectrum import signal_memory_s
@@ -253,7 +254,7 @@ def test_a_signal_named_as_the_rate_keeps_its_name():
 @pytest.mark.parametrize(
     ("run", "message"),
     [
-        (sine(5.0), r"must hold 6 periods or more: x holds about 5\.0 in 0\.00\d+ s; record"),
+        (sine(5.0), r"must hold 6 periods or more: x holds about 5\.0 in [\d.]+ ms; record"),
         (
             recorded(np.arange(2000.0), np.random.default_rng(0).standard_normal(2000)),
             "a trace must oscillate: no period explains a quarter of the variance of x",
@@ -267,6 +268,15 @@ def test_a_signal_named_as_the_rate_keeps_its_name():
 )
 def test_what_does_not_oscillate_is_refused(run, message):
     with pytest.raises(ValueError, match=message):
+        ep.signals.prepare_signal(run)
+
+
+def test_a_short_record_is_refused_in_its_own_unit_of_time():
+    clock = Clock.of("year")
+    t = np.arange(21.0) * clock.seconds
+    x = np.sin(2.0 * np.pi * np.arange(21.0) / 8.0)
+    run = ep.Trajectory(t, x[:, None], ["x"], clock=clock)
+    with pytest.raises(ValueError, match=r"x holds about [\d.]+ in 20 years"):
         ep.signals.prepare_signal(run)
 
 

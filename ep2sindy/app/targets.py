@@ -26,17 +26,23 @@ def target_of(node: DictConfig, place: str) -> Callable[..., Any]:
 
     Raises ValueError for a name that configs may not use, before anything of it is imported.
     """
+    name = _current_name(node, place)
+    return dotted_names()[name].load() if name in FOR_CONFIGS else _own(name, place)
+
+
+def _current_name(node: DictConfig, place: str) -> str:
+    """The name of a node's `_target_` today: one of FOR_CONFIGS, or of a module of the user's."""
     name = str(node["_target_"])
     new = new_name(name) or name
     if new in FOR_CONFIGS:
         if new != name:
             # Of this line, so that it shows once, though a target is checked before it is built.
             warn(f"{place}: {moved_text(name)}", FutureWarning, stacklevel=1)
-        return dotted_names()[new].load()
+        return new
     module, _, last = name.rpartition(".")
     room = module.partition(".")[0]
     if room and room != "ep2sindy":
-        return _own(name, place)
+        return name
     raise ValueError(
         f"{place} must name a _target_ that there is, such as ep2sindy.EBIC, and that is for "
         f"configs: {name!r} came; {gone_text(name) or _near(last)}"
@@ -74,10 +80,13 @@ def _own(name: str, place: str) -> Callable[..., Any]:
 def check_targets(node: Any, place: str = "") -> None:
     """Raise ValueError for a `_target_`, at any depth, that configs may not name.
 
-    Interpolated values are checked where they are defined, and again when they are built.
+    Interpolated values are checked where they are defined, and again when they are built. Targets
+    of this package are not imported yet: a definition that a run leaves out may need an extra.
     """
     if isinstance(node, DictConfig) and "_target_" in node and _is_there(node, "_target_"):
-        target_of(node, place or "the config")
+        name = _current_name(node, place or "the config")
+        if name not in FOR_CONFIGS:
+            _own(name, place or "the config")
     keys: Any = node if isinstance(node, DictConfig) else range(len(node))
     for key in keys:
         if _is_there(node, key) and OmegaConf.is_config(node[key]):

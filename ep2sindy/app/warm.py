@@ -76,7 +76,7 @@ def _compiled_side_by_side() -> bool:
 
 
 def _search() -> None:
-    """Compile smoothers, rows, searches, estimates and free runs."""
+    """Compile smoothers, rows, searches, estimates, free runs, forecasts and runs to a cycle."""
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     found = ep.discover(run)
     for method in (ep.AdaptiveLasso(), ep.STLSQ(), ep.BestSubset()):
@@ -84,6 +84,11 @@ def _search() -> None:
             run, method=ep.Regression(ep.Differential(), method, ep.Knee(), ep.Bootstraps(n=2))
         )
     found.model.simulate(run.t, run.states[0])
+    found.forecast(run, 1.0)
+    oscillator = ep.systems.van_der_pol(mu=2.0).model
+    cycle = ep.limit_cycle(oscillator, np.array([2.0, 0.0]), period_s=7.63)
+    assert cycle is not None
+    ep.share_reaching(oscillator, cycle, n_starts=1)
 
 
 def _refinement() -> None:
@@ -105,6 +110,18 @@ def _refinement() -> None:
     )
 
 
+def _points() -> None:
+    """Compile the search at the points of a field."""
+    system = ep.lotka_volterra()
+    field = system.trajectory(noise=0.02, rng=0).to_xarray().expand_dims(z=[0.0, 1.0], axis=1)
+    for block in (1, 50):  # long blocks are summed in another way
+        method = ep.Regression(
+            ep.Differential(), ep.BestSubset(), ep.Knee(), ep.Bootstraps(n=2, block=block)
+        )
+        search = ep.discovery.PointSearch(system.model.states, system.model.library, method)
+        ep.pointwise(field, search, workers=ep.parallel.Serial())
+
+
 def _plane() -> None:
     """Compile the (z, r) simulator."""
     step_s = 1e-6
@@ -115,6 +132,7 @@ def _plane() -> None:
 PARTS: Mapping[str, Callable[[], None]] = {
     "search": _search,
     "refinement": _refinement,
+    "points": _points,
     "plane": _plane,
 }
 

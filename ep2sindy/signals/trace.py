@@ -211,27 +211,29 @@ def _spare(t: np.ndarray, x: np.ndarray) -> int:
 
 def _check_oscillation(signal: Trace) -> None:
     """Raise ValueError for a signal that does not oscillate, or not often or not finely enough."""
-    name, duration_s = signal.name, float(signal.t[-1] - signal.t[0])
+    name, clock = signal.name, signal.clock
+    duration = clock.duration_text(float(signal.t[-1] - signal.t[0]), digits=4)
     n_periods = signal.n_periods
     if 0.5 < n_periods < MIN_PERIODS:
         doubt = " if it oscillates at all" if signal.cycle is None else ""
         raise ValueError(
             f"a trace must hold {MIN_PERIODS:g} periods or more: {name} holds about "
-            f"{n_periods:.1f} in {duration_s:.4g} s{doubt}; record longer, or crop less"
+            f"{n_periods:.1f} in {duration}{doubt}; record longer, or crop less"
         )
     is_noise = white_variance(signal.t, signal.x) > ALL_NOISE * signal.x.var()
     if n_periods < MIN_PERIODS or (signal.cycle is None and is_noise):
         raise ValueError(
             f"a trace must oscillate: no period explains a quarter of the variance of {name} over "
-            f"its {duration_s:.4g} s (strongest line: {signal.frequency_Hz:.4g} Hz), and most of "
-            "it is white noise; crop transients, prepare it with ep2sindy.prepare.low_pass, or "
-            "take another signal"
+            f"its {duration} (strongest line: {clock.frequency_text(signal.frequency_Hz)}), and "
+            "most of it is white noise; crop transients, prepare it with "
+            "ep2sindy.prepare.low_pass, or take another signal"
         )
     if signal.per_period < MIN_SAMPLES:
         raise ValueError(
             f"a trace must be sampled {MIN_SAMPLES:g} times a period or more: {name} has "
-            f"{signal.per_period:.1f} samples to a period of {signal.period_s:.4g} s, so that all "
-            f"above its harmonic number {signal.per_period / 2.0:.1f} is aliased to lower "
+            f"{signal.per_period:.1f} samples to a period of "
+            f"{clock.duration_text(signal.period_s, digits=4)}, so that all above "
+            f" its harmonic number {signal.per_period / 2.0:.1f} is aliased to lower "
             "frequencies; sample faster"
         )
 

@@ -31,6 +31,7 @@ from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned, Result, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.studies.forecasts import LEAST_SAMPLES, is_short
 from ep2sindy.studies.source import data_summary
 from ep2sindy.studies.study import Check
 from ep2sindy.studies.views import (
@@ -111,15 +112,20 @@ class Evaluation:
     loss: float
 
 
+def n_before(run: Trajectory, held_out: float) -> int:
+    """Number of samples before the last `held_out` share of a record."""
+    return round(run.n_samples * (1.0 - held_out))
+
+
 def split_in_time(run: Trajectory, held_out: float) -> tuple[Trajectory, Trajectory]:
     """The first part of a record, and the last `held_out` share of its samples.
 
-    Raises ValueError if either part would have fewer than 20 samples.
+    Raises ValueError if either part would have fewer than LEAST_SAMPLES samples.
     """
-    n_train = round(run.n_samples * (1.0 - held_out))
-    if min(n_train, run.n_samples - n_train) < 20:
+    n_train = n_before(run, held_out)
+    if is_short(run, n_train):
         raise ValueError(
-            f"held_out={held_out} must leave 20 samples on either side: the data have "
+            f"held_out={held_out} must leave {LEAST_SAMPLES} samples on either side: the data have "
             f"{run.n_samples}"
         )
     return run.window(0, n_train), run.window(n_train, run.n_samples)

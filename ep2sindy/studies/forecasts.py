@@ -27,12 +27,26 @@ CAPTION = (
 )
 
 
+def is_short(run: Trajectory, n_fitted: int) -> bool:
+    """Whether the fitted part of a record or the rest has fewer than LEAST_SAMPLES samples."""
+    return min(n_fitted, run.n_samples - n_fitted) < LEAST_SAMPLES
+
+
+def why_none(run: Trajectory, n_fitted: int) -> str:
+    """Why a record is too short for forecasts; empty if it is not."""
+    if not is_short(run, n_fitted):
+        return ""
+    return (
+        f"no forecasts: they need {LEAST_SAMPLES} samples or more to fit and as many to test, and "
+        f"the {run.n_samples} of the record leave {n_fitted} and {run.n_samples - n_fitted}"
+    )
+
+
 def skill_of(
     model: SparseModel, run: Trajectory, *, n_fitted: int, starts: int, progress: Progress = SILENT
 ) -> ForecastSkill | None:
     """Skill of a model of measured states; None for a driven or empty model, or a short record."""
-    is_short = min(n_fitted, run.n_samples - n_fitted) < LEAST_SAMPLES
-    if not starts or model.inputs or is_short or not model.coef.any():
+    if not starts or model.inputs or is_short(run, n_fitted) or not model.coef.any():
         return None
     with progress.stage(starts, "start", "forecasts") as advance:
         return forecast_skill(model, run, n_fitted=n_fitted, starts=starts, advance=advance)

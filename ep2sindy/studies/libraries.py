@@ -31,8 +31,14 @@ from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.studies.balance import ModelBalance, inflows_of, model_balance
-from ep2sindy.studies.fits import Terms, split_in_time
-from ep2sindy.studies.forecasts import forecast_errors, forecast_picture, forecast_section, skill_of
+from ep2sindy.studies.fits import Terms, n_before, split_in_time
+from ep2sindy.studies.forecasts import (
+    forecast_errors,
+    forecast_picture,
+    forecast_section,
+    skill_of,
+    why_none,
+)
 from ep2sindy.studies.library_result import RECORDS, LibraryResult, frequencies, refit, run_refitted
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import Sampling, Source, balances_of, data_summary, zone_sizes_of
@@ -194,6 +200,9 @@ class Study:
             run.say(f"{len(runs)} records in one search; figures show the first")
         if not self.hidden and (hint := alone(runs[0])):
             run.warn(hint)
+        n_fitted = n_before(runs[0], self.held_out or HELD_OUT)
+        if self.forecasts and (reason := why_none(runs[0], n_fitted)):
+            run.say(reason)
         # Each case has its own random stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         pairs = list(zip(libraries.items(), streams, strict=True))
@@ -239,10 +248,9 @@ class Study:
             lives, beside = self._lives(
                 data, library, rows, found.model, zones, rng=rng, progress=progress
             )
-        train = split_in_time(data, self.held_out or HELD_OUT)[0]
         skill = skill_of(
-            found.model if lives is None else lives.model, measured,
-            n_fitted=train.n_samples, starts=self.forecasts, progress=progress,
+            found.model if lives is None else lives.model, measured, starts=self.forecasts,
+            n_fitted=n_before(measured, self.held_out or HELD_OUT), progress=progress,
         )  # fmt: skip
         with progress.stage(None, "", "free runs"):
             return LibraryResult(
