@@ -16,7 +16,7 @@ STEP_DOUBT = "step_doubt"  # attribute of a field: how dt_s contradicts the file
 
 
 class DoubtfulUnit(UserWarning):
-    """Warns that numbers look like another unit than the stated one."""
+    """Warns that numbers look like another unit than the stated one, or contradict a step."""
 
 
 @dataclass(frozen=True)
