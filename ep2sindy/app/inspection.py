@@ -78,7 +78,7 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
         return
     if text := unlike(found):
-        raise ValueError(text)
+        raise ValueError(f"no mapping is written: {text}")
     name = re.sub(r"\W+", "_", name).strip("_")
     path = own_config(name, conf)
     write_text(path, config_text(found, paths))

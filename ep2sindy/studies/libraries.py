@@ -192,10 +192,8 @@ class Study:
         sampling = self.source.trajectory
         seen = [case.library(opened[0], sampling) for case in self.libraries.values()]
         runs = [self.source.sampled(field, seen, run) for field in opened]
-        libraries = {
-            name: case.library(opened[0], sampling, self.hidden)
-            for name, case in self.libraries.items()
-        }
+        cases = self.libraries.items()
+        libraries = {name: case.library(opened[0], sampling, self.hidden) for name, case in cases}
         if len(runs) > 1:
             run.say(f"{len(runs)} records in one search; figures show the first")
         if not self.hidden and (hint := alone(runs[0])):
@@ -207,11 +205,10 @@ class Study:
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         pairs = list(zip(libraries.items(), streams, strict=True))
         zones = Zones.of(self.source, opened[0], run) if self.living is not None else Zones()
+        watch = run.watch
         results = {
-            name: self._result(
-                runs, name, library, methods[name], zones, rng=rng, progress=run.watch
-            )
-            for (name, library), rng in count_pieces(run.watch, pairs, "library")
+            name: self._result(runs, name, library, methods[name], zones, rng=rng, progress=watch)
+            for (name, library), rng in count_pieces(watch, pairs, "library")
         }
         files = [str(field.attrs.get("file", "")) for field in opened]
         estimated = [result.discovery.estimate for result in results.values()]
@@ -469,9 +466,8 @@ class Outcome:
                 title = f"{name}: forecasts over time {where}"
                 found.append(forecast_section(result.skill, f"forecast_{name}", title=title))
         note = FROM_DERIVATIVES if any(r.living for r in self.results.values()) else ""
-        compared = Table(
-            self.comparison.screen("model", by_state=True), title=INTEGRATED, note=note
-        )
+        rows = self.comparison.screen("model", by_state=True)
+        compared = Table(rows, title=INTEGRATED, note=note)
         found.append(Section("Run freely from the first sample", [compared, *pictures(FIGURES)]))
         if len(self.files) > 1:
             records = Table(self.records.screen(), title=EVERY_RECORD)
