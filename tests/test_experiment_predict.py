@@ -201,7 +201,9 @@ def test_own_records_over_one_parameter_make_a_law_and_its_line(tmp_path: Path) 
     assert set(found.outcome.figures()) == {"laws_all", "left_out", "map_all"}
     found.check_figures(*found.outcome.figures())
     log = " ".join(found.log.split())
-    assert "3 of 3 live, diverging: 0." in log
+    assert "Left out one at a time, 3 of 3 points live, diverging: 0." in log
+    assert "Found: a law over a; left out one at a time, 3 of 3 points live" in log
+    assert re.search(r"at a=[\d.]+: n_i' = [^=]* \[m\^-3 s\^-1\]", log)
     assert "f (mHz)" in log
     assert "also: other cycles" not in log
     said_by_the_empty(found.outcome)

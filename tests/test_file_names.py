@@ -122,12 +122,13 @@ def swing(folder: Path, *values: float) -> None:
         table.to_csv(folder / f"a{a}.csv", index=False)
 
 
-def predicted(folder: Path, terms: str) -> Computed:
+def predicted(folder: Path, terms: str, *more: str) -> Computed:
     return computed(
         composed(
             "+exp=predict", "data=recognised", mend("points.files=a{a}.csv"), "~models",
             f"+models.own.terms={terms}", "degrees=[1]", "windows.n_windows=4", "map_points=2",
             "forecasts=0", "parallel=serial", f"output={folder}",
+            *more,
         )
     )  # fmt: skip
 
@@ -141,6 +142,15 @@ def test_files_make_a_law_over_the_quantity_of_their_names(folder: Path) -> None
     assert branch.law.model_at({"a": 1.0}).terms("n_i")["n_i"] == pytest.approx(1.0, abs=1e-3)
     assert "left out, for their names hold no number there: aold.csv" in found.log
     assert not [text for text in found.warnings if "lives by the law" in text]
+    assert "known inflow" not in found.log
+
+
+def test_known_coefficients_beside_files_are_said_with_the_way_to_change_them(folder: Path) -> None:
+    swing(folder, 0.6, 0.9, 1.2)
+    terms = "{n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}"
+    log = " ".join(predicted(folder, terms, "+models.own.known={n_i:{n_i:{a:1.0}}}").log.split())
+    assert "that of the package's thruster: models.own.known.n_i.n_i.a=1; set it to" in log
+    assert "leave such models out: ~models.own" in log
 
 
 def test_a_law_of_which_no_point_lives_says_what_to_try(folder: Path) -> None:

@@ -2,6 +2,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from functools import partial
@@ -325,3 +326,12 @@ def test_workers_end_with_their_run(tmp_path: Path, name: str, work: str) -> Non
         said = run.stdout.read()
     assert not alive
     assert said == ("" if name == "SIGKILL" else f"interrupted by {name}\n")
+
+
+def test_workers_that_are_replaced_cause_no_warning_and_others_still_do() -> None:
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        assert sorted(Loky(2).run(abs, [-1, -2])) == [(0, 1), (1, 2)]
+        warnings.warn("A worker stopped while some jobs were given to the executor.", stacklevel=1)
+        warnings.warn("a piece was lost", stacklevel=1)
+    assert [str(each.message) for each in heard] == ["a piece was lost"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -151,6 +152,9 @@ class Loky:
         if effective_n_jobs(self.n_jobs) == 1:
             yield from ONE_BY_ONE.run(function, pieces)
             return
+        # Workers without work end after a while; joblib starts others when work comes again, with
+        # this warning, and no piece is lost.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         # max_nbytes=None, or joblib would keep a copy of every large array on disk.
         workers = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered", max_nbytes=None)
         code, numbered = _with_its_code(function), enumerate(pieces)

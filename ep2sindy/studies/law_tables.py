@@ -55,6 +55,26 @@ class LawModel:
         return StructureCase(library, structure, self.relations, self.known, name)
 
 
+def known_beside_files(models: Mapping[str, LawModel]) -> str:
+    """What the models hold for known beside data of files, and how to change it; may be empty."""
+    known = [
+        (f"models.{name}.known.{state}.{term}.{function}", factor)
+        for name, model in models.items()
+        for state, terms in model.known.items()
+        for term, factors in terms.items()
+        for function, factor in factors.items()
+    ]
+    if not known:
+        return ""
+    place, factor = known[-1]
+    name = place.split(".")[1]
+    return (
+        f"data are files, and the known inflow of the models shipped is that of the package's "
+        f"thruster: {place}={factor:g}; set it to that of yours, for each model that has one, or "
+        f"leave such models out: ~models.{name}"
+    )
+
+
 def points_table(
     points: Sequence[Parameters],
     statuses: Mapping[str, str],
@@ -308,8 +328,9 @@ def left_out_text(branch: Branch) -> str:
     if not np.isfinite(found["f_90"]):
         most = "more than one in ten do not oscillate"
     return (
-        f"{found['n_lives']} of {found['n']} live, diverging: {found['diverging']}. Errors in the "
-        f"median: frequency {text(found['f_median'])} ({most}), the worst state's amplitude "
+        f"Left out one at a time, {found['n_lives']} of {found['n']} points live, diverging: "
+        f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} "
+        f"({most}), the worst state's amplitude "
         f"{text(found['amplitude_median'])} and waveform {places(found['waveform_median'], 3)}. "
         "The records' own frequencies and amplitudes, interpolated by the same functions, miss by "
         f"{text(float(np.median(smooth_f)))} and {text(float(np.median(smooth_amplitude)))} in the "

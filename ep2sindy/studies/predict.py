@@ -27,7 +27,6 @@ from ep2sindy.operating.records import OperatingRecord, most_central, point_labe
 from ep2sindy.report.document import (
     Block,
     Captioned,
-    Equation,
     Picture,
     Result,
     Section,
@@ -45,6 +44,7 @@ from ep2sindy.studies.law_tables import (
     advice_if_none_lives,
     agreement,
     coefficients_table,
+    known_beside_files,
     laws_table,
     left_out_metrics,
     left_out_text,
@@ -70,6 +70,7 @@ from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.simulated import compile_kernels
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.study import Count, Counts, Positive
+from ep2sindy.studies.views import display_equation
 
 INTERVALS = (
     "In SI units, and the parameters in theirs. ±: half the 95 % interval, from a sandwich with "
@@ -183,6 +184,8 @@ class Study:
         how = self._how(run.seed)
         given = self._given
         given.tell(run)
+        if "path" in self.source.data.settings and (words := known_beside_files(self.models or {})):
+            run.say(words)
         sources = given.sources(self.source)
         with run.progress(None, "", "kernels, compiled once"):
             compile_kernels([source.source.data for source in sources])
@@ -346,12 +349,9 @@ class Outcome:
         model, drawn = branch.law.model_at(middle.parameters), self.figures()
         return Result(
             f"Found: a law over {', '.join(self.parameters)}; "
-            f"{numbers['n_lives']} of {numbers['n']} points left out live",
+            f"left out one at a time, {numbers['n_lives']} of {numbers['n']} points live",
             [
-                *(
-                    Equation(s, model.terms(s), lead=f"at {middle.label}", on_screen=True)
-                    for s in model.states
-                ),
+                *(display_equation(model, s, lead=f"at {middle.label}") for s in model.states),
                 Text(left_out_text(branch).partition(". The records")[0]),
                 Text(f"Oscillating or not, right at {right} of {n} points"),
             ],
@@ -405,9 +405,7 @@ class Outcome:
         law, found = branch.law, branch.tied
         middle = most_central(branch.fit.records)
         model = law.model_at(middle.parameters)
-        equations: list[Block] = [
-            Equation(state, model.terms(state), on_screen=True) for state in model.states
-        ]
+        equations: list[Block] = [display_equation(model, state) for state in model.states]
         rows = self._of("laws", name)
         shown = [
             {
