@@ -1,4 +1,5 @@
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -148,6 +149,7 @@ def test_tables_figures_and_page_are_written(folder: Path) -> None:
     assert ">free, refined</h3>" in page  # the thesis refined nothing
     assert ">Model: constrained, at V_D_V = 200, mdot_mg_s = 5</h2>" in page
     assert "<th>L_m</th><th>g_inj (m<sup>−3</sup> s<sup>−1</sup>)</th><th>eps</th>" in page
+    assert re.search(r"g_inj = [^=\[]* \[m\^-3 s\^-1\] \(", " ".join(log.split()))
     assert "V_D_V=200, mdot_mg_s=5: oscillating" in log
     assert "Errors are RMS over the mean, at points left out" in " ".join(log.split())
     assert "<math>" not in (folder / "tables" / "laws.csv").read_text()

@@ -52,7 +52,7 @@ from ep2sindy.studies.law_tables import (
 from ep2sindy.studies.points import QUIET, GivenPoints, given_points, open_points
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.study import Check, Count
-from ep2sindy.studies.views import coefficients, with_error
+from ep2sindy.studies.views import coefficients, display_equation, with_error
 
 MOST_LAWS = 3  # on the screen
 
@@ -307,11 +307,22 @@ class Outcome:
         draw = partial(trends_figure, table, laws, trends=self.along, labels=self.labels)
         return Captioned(draw, f"{CAPTION.format(_spoken(case))}{published}{lines}.")
 
+    def _units(self, fit: str) -> dict[str, str]:
+        """Unit of every quantity of a fit."""
+        units = next(each.fits[fit].model.units for each in self.results if each.fits)
+        quantities = self.study.fits[fit].quantities
+        return {name: each.unit(self.study.library, units) for name, each in quantities.items()}
+
     def in_short(self) -> Result:
         """How many points oscillate, and the laws of their coefficients."""
         n_fitted = sum(bool(result.fits) for result in self.results)
         shown = [
-            replace(row["law"], mark=f" ({_spoken(row['fit'])})", on_screen=True)
+            replace(
+                row["law"],
+                unit=self._units(row["fit"])[row["quantity"]],
+                mark=f" ({_spoken(row['fit'])})",
+                on_screen=True,
+            )
             for row in control_laws_table(self.laws).to_dict("records")
             if not row["fit"].endswith(REFINED)
         ]
@@ -337,11 +348,7 @@ class Outcome:
     def _fit(self, fit: str) -> Section:
         """One row per point: quantities with half their interval widths, and published values."""
         estimates = rows_at(self._tables["quantities"], {"fit": fit})
-        units = next(each.fits[fit].model.units for each in self.results if each.fits)
-        headings = {
-            name: _heading(name, quantity.unit(self.study.library, units))
-            for name, quantity in self.study.fits[fit].quantities.items()
-        }
+        headings = {name: _heading(name, unit) for name, unit in self._units(fit).items()}
         rows = []
         for result in self.results:
             here = rows_at(estimates, result.parameters).to_dict("records")
@@ -396,7 +403,7 @@ class Outcome:
 def _model(result: PointResult, case: str) -> Section:
     at = ", ".join(f"{name} = {value:g}" for name, value in result.parameters.items())
     model = result.fits[case].model
-    equations = [Equation(state, model.terms(state)) for state in model.states]
+    equations = [display_equation(model, state, on_screen=False) for state in model.states]
     return Section(f"Model: {case}, at {at}", equations)
 
 
