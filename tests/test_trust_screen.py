@@ -70,7 +70,7 @@ def test_a_config_for_odd_names_reads_back_as_they_are(odd: Path) -> None:
     assert config._target_ == "ep2sindy.open_field"
     names = {variable.name for variable in config.variables.values() if variable.name}
     assert names == {*ODD}
-    assert commands([found], ["data=mine"])[-1].startswith("ep2sindy +exp=discover data=mine")
+    assert commands([found], "mine", None)[-1].startswith("ep2sindy +exp=discover data=mine")
 
 
 def test_a_run_says_odd_names_without_obeying_them(

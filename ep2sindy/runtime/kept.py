@@ -39,6 +39,7 @@ def at_once(function: Callable[[], Any]) -> Any:
     return function()
 
 
+@runtime_checkable
 class Named(Protocol):
     """A piece, with a name that serves in a file's name."""
 
