@@ -79,7 +79,6 @@ def laws_figure(
             _draw_law(ax, here, law, (state, term), along, held, colour)
         ax.grid(alpha=0.3)
         ax.set_xlabel(name_label(along, labels))
-        ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 4), useOffset=False)
         _focus(ax, coefficients[(coefficients["state"] == state) & (coefficients["term"] == term)])
     if others:
         entries = [

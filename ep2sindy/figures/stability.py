@@ -20,7 +20,6 @@ from ep2sindy.figures.style import (
     COLOURS,
     DATA,
     GREY,
-    LABEL,
     TITLE,
     WIDTH,
     legend_above,
@@ -72,8 +71,8 @@ def stability_figure(
         ax.set_xticks(np.arange(len(x)) + 0.5, x)
         ax.set_yticks(np.arange(len(y)) + 0.5, y)
         ax.tick_params(length=0)
-    figure.supxlabel(labels[along], fontsize=LABEL)
-    figure.supylabel(fill(labels[up], 26), fontsize=LABEL, multialignment="center")
+    figure.supxlabel(labels[along], fontsize=TITLE)
+    figure.supylabel(fill(labels[up], 26), fontsize=TITLE, multialignment="center")
     bar = figure.colorbar(ScalarMappable(scale, colormaps["Blues"]), ax=panels, pad=0.02)
     bar.set_label("standard deviation of the\ndischarge current (A)")
     seen = [name for name in HATCHES if (points["status"] == name).any()]

@@ -29,9 +29,9 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 # For separate panels, whose colours need not differ from all others.
 MORE_COLOURS = (*COLOURS, "#7F3C8D", "#666666")
 
-# One width and three sizes of type in all figures: in inches, which a page shows at 96 px, and in
-# points. Ticks, marks in panels and legends are small, titles and labels of axes are larger.
-WIDTH, TITLE, LABEL, SMALL = 9.0, 10.0, 10.0, 9.0
+# One width in inches, of 96 px on a page, and two sizes of type in points: ticks, marks in panels
+# and legends are small; titles are as large as the labels of axes.
+WIDTH, TITLE, SMALL = 9.0, 10.0, 9.0
 
 Limits = tuple[float, float]
 
@@ -71,7 +71,8 @@ def make_panels(
     for ax in axes.flat:
         ax.tick_params(labelsize=SMALL)
         for axis in (ax.xaxis, ax.yaxis):
-            formatter = ScalarFormatter(useMathText=True)  # 2 with 10^5 above the axis, not 200000
+            # 2 with 10^5 above the axis, not 200000; and no number that is to be added.
+            formatter = ScalarFormatter(useOffset=False, useMathText=True)
             formatter.set_powerlimits((-3, 4))
             axis.set_major_formatter(formatter)
             axis.get_offset_text().set_size(SMALL)

@@ -70,9 +70,8 @@ def trends_figure(
             ax.grid(alpha=0.3)
         row[0].set_ylabel(f"at {held_label(at, labels)}" if at else "")
     for ax, quantity in zip(axes[0], quantities, strict=True):
-        ax.set_title(
-            name_label(quantity, labels), fontsize=TITLE, y=1.0, pad=14.0
-        )  # the factor is lower
+        title = name_label(quantity, labels)
+        ax.set_title(title, fontsize=TITLE, y=1.0, pad=14.0)  # above the ordinate's factor
     legend_above(figure, _list_entries(colours, labels, laws=bool(laws)))
     return figure
 

@@ -69,8 +69,8 @@ def known_beside_files(models: Mapping[str, LawModel]) -> str:
     place, factor = known[-1]
     name = place.split(".")[1]
     return (
-        f"data are files, and the known inflow of the models shipped is that of the package's "
-        f"thruster: {place}={factor:g}; set it to that of yours, for each model that has one, or "
+        f"data are files, and models hold a known inflow, {place}={factor:g}, which as shipped is "
+        "that of the package's thruster; set it to that of yours, for each model that has one, or "
         f"leave such models out: ~models.{name}"
     )
 

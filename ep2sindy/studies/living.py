@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -44,9 +44,6 @@ from ep2sindy.studies.views import (
     intervals,
     rollout_tables,
 )
-
-if TYPE_CHECKING:
-    pass
 
 WAVEFORM = "One period by phase, shown twice: samples, their waveform, and the model's."
 CAPTIONS = {

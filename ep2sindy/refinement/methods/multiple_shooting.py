@@ -417,7 +417,8 @@ def least_change(
     then of all.
     """
     size = by_block.shape[-1]
-    rows = by_block[..., :-1, :].reshape(len(by_block), -1, size)
+    # Of a single block this would be a view, and the kernel compiled again for its strides.
+    rows = np.ascontiguousarray(by_block[..., :-1, :].reshape(len(by_block), -1, size))
     if law is None:
         return least_squares(rows, damping)
     if not np.isfinite(rows).all():
