@@ -149,7 +149,7 @@ def test_known_coefficients_beside_files_are_said_with_the_way_to_change_them(fo
     swing(folder, 0.6, 0.9, 1.2)
     terms = "{n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}"
     log = " ".join(predicted(folder, terms, "+models.own.known={n_i:{n_i:{a:1.0}}}").log.split())
-    assert "that of the package's thruster: models.own.known.n_i.n_i.a=1; set it to" in log
+    assert "models hold a known inflow, models.own.known.n_i.n_i.a=1, which as shipped is" in log
     assert "leave such models out: ~models.own" in log
 
 

@@ -23,7 +23,7 @@ from ep2sindy.runtime.progress import Bars
 from ep2sindy.runtime.screen import say
 from ep2sindy.trust.user_code import isolate
 
-ABOUT = """Compiles all kernels of the package, once after installation: half a minute on two cores.
+ABOUT = """Compiles all kernels of the package, once after installation: a minute on two cores.
 Runs of the command line do so by themselves; in Python, a call compiles what it uses."""
 
 
