@@ -141,14 +141,14 @@ def test_even_steps_give_what_nearly_even_ones_give(ratio: float) -> None:
     rng = np.random.default_rng(0)
     values = np.cumsum(rng.normal(size=(3000, 1)), axis=0) / 100.0
     even, nearly = np.ones(2999), 1.0 + 2e-9 * (-1.0) ** np.arange(2999)
-    for route in (likelihood, smooth):
+    for route, samples in ((likelihood, values[:, 0].copy()), (smooth, values)):
         for found, plain in zip(
-            route(even, values, ratio), route(nearly, values, ratio), strict=True
+            route(even, samples, ratio), route(nearly, samples, ratio), strict=True
         ):
             np.testing.assert_allclose(found, plain, rtol=1e-6, atol=1e-7)
 
 
-def test_nearly_settled_steps_tell_the_same_residuals() -> None:
+def test_steps_that_are_left_out_hardly_change_the_residuals() -> None:
     """Least squares at the coefficients, so their last digits do not show in chi-squared."""
     run = ep.lorenz().trajectory(noise=0.1, rng=1).window(0, 1500)
     library = ep.named_terms(run.state_names, ["x", "y", "x*z"])

@@ -25,7 +25,7 @@ from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.whitening import NEARLY_SETTLED, SETTLED, whitened_rows
+from ep2sindy.regression.whitening import NEGLIGIBLE, whitened_rows
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.rule import (
     Decision,
@@ -350,7 +350,7 @@ def reweight(
 
 def _left_of_terms(problem: RegressionRows, fit: EquationFit) -> LeftOver:
     """Residuals of a fit's terms, fitted again with weights as by `reweight`."""
-    theta, target, _ = _whitened_terms(problem, fit, settled=NEARLY_SETTLED)
+    theta, target, _ = _whitened_terms(problem, fit, negligible=NEGLIGIBLE)
     fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
     return _compare_with_noise(target - theta @ fitted, n_free=len(fitted))
 
@@ -362,7 +362,7 @@ def _left_of_fit(problem: RegressionRows, fit: EquationFit, *, n_free: int) -> L
     not by coefficients that the data may contradict. n_free: number of free coefficients.
     """
     free = fit_support(problem, fit.equation, fit.terms)
-    theta, target, scale = _whitened_terms(problem, free, settled=NEARLY_SETTLED)
+    theta, target, scale = _whitened_terms(problem, free, negligible=NEGLIGIBLE)
     order = [fit.terms.index(name) for name in free.terms]
     return _compare_with_noise(target - theta @ (fit.coef[order] / scale), n_free=n_free)
 
@@ -372,7 +372,7 @@ def _whitened_terms(
     candidate: Candidate | EquationFit,
     *,
     n_steps: int = 8,
-    settled: float = SETTLED,
+    negligible: float = 0.0,
 ) -> tuple[
     Float[np.ndarray, "rows terms"], Float[np.ndarray, " rows"], Float[np.ndarray, " terms"]
 ]:
@@ -382,7 +382,7 @@ def _whitened_terms(
     coef = np.zeros(len(terms))
     order = [problem.library.index(name) for name in candidate.terms]
     coef[order] = candidate.coef / scale[order]
-    rows = whitened_rows(problem, terms, coef, n_steps=n_steps, settled=settled, kept=terms)
+    rows = whitened_rows(problem, terms, coef, n_steps=n_steps, negligible=negligible, kept=terms)
     return rows.theta[:, order], rows.target, scale[order]
 
 

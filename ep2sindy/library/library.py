@@ -58,7 +58,7 @@ class Library:
             raise ValueError(f"variables must be unique: {list(self.variables)}")
         if not len(exponents):
             raise ValueError("a library needs at least one term: none came")
-        if len(np.unique(exponents, axis=0)) < len(exponents):
+        if len(set(map(tuple, exponents.tolist()))) < len(exponents):
             raise ValueError(f"terms must be unique: {list(self.names)}")
 
     def __len__(self) -> int:

@@ -43,22 +43,24 @@ class NoisyRows:
     """Dependence of the training rows of one equation on the noisy samples x.
 
     Targets are slope @ x[state], terms are mean @ library(x); both matrices are sparse, (rows,
-    samples), with sorted columns. values: (samples, variables), the library's variables, then
-    states that it lacks.
+    samples), with sorted columns. target: of the samples as they are. values: (samples, variables),
+    the library's variables, then states that it lacks.
     smoothed: an estimate of their true values. noise_std: standard deviation of their independent
     noise.
     """
 
     mean: csr_array
     slope: csr_array
+    target: Float[np.ndarray, " rows"]
     state: int
     values: Float[np.ndarray, "samples variables"]
     smoothed: Float[np.ndarray, "samples variables"]
     noise_std: Float[np.ndarray, "samples variables"]
 
     @cached_property
-    def target(self) -> Float[np.ndarray, " rows"]:
-        return self.slope @ self.values[:, self.state]
+    def columns(self) -> tuple[Float[np.ndarray, "variables samples"], ...]:
+        """Values, smoothed values and noise, each variable contiguous in memory."""
+        return tuple(map(np.ascontiguousarray, (self.values.T, self.smoothed.T, self.noise_std.T)))
 
     @cached_property
     def stretches(self) -> Stretches:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -153,8 +154,9 @@ class Bumps:
         fall = s * (1.0 - s**2) ** (power - 1.0)
         # Scaled so that the slope of a straight line is exact however few samples a bump spans.
         fall /= fall @ s * half_width * dt_s
-        first = np.arange(0, len(x) - 2 * half_width, max(1, half_width // self.overlap))
-        inside = first[:, None] + np.arange(2 * half_width + 1)
+        stride = max(1, half_width // self.overlap)
+        first = np.arange(0, len(x) - 2 * half_width, stride, dtype=np.int32)
+        inside = first[:, None] + np.arange(2 * half_width + 1, dtype=np.int32)
         return WindowRows(
             mean=_rows(inside, np.broadcast_to(phi / phi.sum(), inside.shape), len(x)),
             slope=_rows(inside, np.broadcast_to(fall, inside.shape), len(x)),
@@ -185,11 +187,22 @@ def spectral_half_width(x: Float[np.ndarray, " samples"], *, tau_hat: float) -> 
     n sqrt(2p + 3) / (2 pi half_width) bins; `tau_hat` standard deviations must lie below the
     change point between signal and noise.
     """
-    n = len(x)
-    widths = np.arange(2, max(3, (n - 1) // 4))
-    deviation = n * np.sqrt(2.0 * bump_power(widths) + 3.0) / (2.0 * np.pi * widths)
+    widths, deviation = _spectral_deviations(len(x))
     fits = tau_hat * deviation <= spectral_change_point(x)
     return int(widths[np.argmax(fits)] if fits.any() else widths[-1])
+
+
+@lru_cache(maxsize=8)
+def _spectral_deviations(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Half-widths of bumps in a record of n samples, and deviations of their spectra in bins."""
+    widths = np.arange(2, max(3, (n - 1) // 4))
+    return widths, n * np.sqrt(2.0 * bump_power(widths) + 3.0) / (2.0 * np.pi * widths)
+
+
+@lru_cache(maxsize=8)
+def _corners(last: int) -> np.ndarray:
+    """Two hundred trial corners up to a bin, denser at low ones, locate a bend well enough."""
+    return np.unique(np.geomspace(1, last - 1, 200).astype(int))
 
 
 def spectral_change_point(x: Float[np.ndarray, " samples"]) -> int:
@@ -202,14 +215,18 @@ def spectral_change_point(x: Float[np.ndarray, " samples"]) -> int:
     last = len(total) - 1
     if last < 2:
         return 1
-    # Two hundred trial corners, denser at low bins, locate the bend well enough.
-    corners = np.unique(np.geomspace(1, last - 1, 200).astype(int))
-    bins = np.arange(last + 1.0)
-    sums = np.cumsum([np.ones_like(bins), bins, bins**2, total, bins * total, total**2], axis=1)
+    corners, bins = _corners(last), np.arange(last + 1.0)
+    until = np.concatenate([[0], corners, [last]])
+    at = until.astype(float)
+    sums = np.array([
+        at, at * (at + 1.0) / 2.0, at * (at + 1.0) * (2.0 * at + 1.0) / 6.0,
+        *(np.cumsum(each)[until] for each in (total, bins * total, total**2)),
+    ])  # fmt: skip
     misfit = np.zeros(len(corners))
-    for first, end in ((np.zeros_like(corners), corners), (corners, np.full_like(corners, last))):
-        rise = (total[end] - total[first]) / (end - first)
-        start = total[first] - rise * first
+    for first, end in ((np.s_[:1], np.s_[1:-1]), (np.s_[1:-1], np.s_[-1:])):
+        low = total[until[first]]
+        rise = (total[until[end]] - low) / (at[end] - at[first])
+        start = low - rise * at[first]
         # Squares of the bins after the first one; at both ends of a chord there is no misfit.
         n, k, kk, y, ky, yy = sums[:, end] - sums[:, first]
         misfit += yy + n * start**2 + kk * rise**2

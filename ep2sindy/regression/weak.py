@@ -137,9 +137,10 @@ class Weak:
         test = np.concatenate([part.test for part in parts])
         mean, slope = _stack(p.mean for p in parts), _stack(p.slope for p in parts)
         n_segments = np.cumsum([0, *(run.segment[-1] + 1 for run in runs)])
+        target = slope @ np.concatenate([run.run.states[:, state] for run in runs])
         return RegressionRows(
             theta=mean @ np.concatenate([run.terms for run in runs]),
-            target=(slope @ np.concatenate([run.run.states[:, state] for run in runs]))[:, None],
+            target=target[:, None],
             library=library,
             equations=(name,),
             groups=np.concatenate(
@@ -147,7 +148,7 @@ class Weak:
             ),
             test=test,
             trajectories=tuple(trajectories),
-            noisy=_noisy_rows(name, runs, _taken(mean, ~test), _taken(slope, ~test))
+            noisy=_noisy_rows(name, runs, _taken(mean, ~test), _taken(slope, ~test), target[~test])
             if self.errors_in_variables
             else None,
         )
@@ -213,13 +214,14 @@ def _stack(blocks: Iterable[csr_array]) -> csr_array:
 
 
 def _noisy_rows(
-    name: str, runs: Sequence[_Sampled], mean: csr_array, slope: csr_array
+    name: str, runs: Sequence[_Sampled], mean: csr_array, slope: csr_array, target: np.ndarray
 ) -> NoisyRows:
     names = runs[0].names
     estimates = [run.estimate for run in runs if run.estimate is not None]
     return NoisyRows(
         mean=mean,
         slope=slope,
+        target=target,
         state=names.index(name),
         values=np.concatenate([run.run.columns(names) for run in runs]),
         smoothed=np.concatenate([estimate.smoothed for estimate in estimates]),

@@ -36,9 +36,12 @@ RISE = 10.0
 
 MAX_HALVED = 6
 
-# Change of the scaled coefficients, as a share of them, that ends the steps. For residuals alone a
-# larger one serves: they are least there, so chi-squared changes by its square.
-SETTLED, NEARLY_SETTLED = 1e-8, 1e-3
+# Change of the scaled coefficients, as a share of them, after which no step follows.
+SETTLED = 1e-8
+
+# Change of them by a step that is not worth making if only the residuals are wanted: these are
+# least there, so chi-squared changes by its square.
+NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +65,7 @@ def whitened_rows(
     coef: Float[np.ndarray, " terms"],
     *,
     n_steps: int = 2,
-    settled: float = SETTLED,
+    negligible: float = 0.0,
     kept: Bool[np.ndarray, " terms"] | None = None,
 ) -> WhitenedRows:
     """Whiten the rows of one equation by their covariance under the model with these terms.
@@ -72,48 +75,56 @@ def whitened_rows(
     most likely coefficients and samples: fit the coefficients with weights, correct the samples by
     the most likely noise, linearise again. Without the correction, the noise in the terms would
     bias the coefficients. A step that raises the misfit too far is halved.
-    coef: (terms,), a first guess in scaled columns. settled: change of the coefficients, as a share
-    of them, that ends the steps. kept: terms whose columns are wanted, at least those of the model;
-    None for all.
+    coef: (terms,), a first guess in scaled columns. negligible: change of the coefficients, as a
+    share of them, for which no step is made. kept: terms whose columns are wanted, at least those
+    of the model; None for all.
     Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance;
     Britt & Luecke 1973, Technometrics 15, 233, for the steps.
     """
     assert problem.noisy is not None
     kept = np.ones_like(terms) if kept is None else kept
     sums, terms = _Sums.of(problem, kept), terms[kept]
-    rows = _Linearised.at(problem, sums, problem.noisy.smoothed, coef[kept], noisy=False)
+    rows = _Linearised.at(problem, sums, problem.noisy.columns[1], coef[kept], noisy=False)
     least = rows.misfit
     for _ in range(n_steps):
-        before = rows.coef
-        following = _following(problem, sums, rows, terms, limit=least + RISE * len(rows.target))
+        before, coef = rows.coef, rows.fit(terms)
+        if _near(before, coef, negligible):
+            break
+        following = _following(problem, sums, rows, coef, limit=least + RISE * len(rows.target))
         if following is None:
             break
         rows, least = following, min(least, following.misfit)
-        if np.linalg.norm(rows.coef - before) <= settled * np.linalg.norm(rows.coef):
+        if _near(before, rows.coef, SETTLED):
             break
     theta = np.zeros((len(rows.target), len(kept)))
     theta[:, kept] = rows.theta
     return WhitenedRows(
         theta=theta,
         target=rows.target - (rows.drifted - rows.theta) @ rows.coef,
-        corrected=rows.x,
+        corrected=rows.x.T,
     )
+
+
+def _near(
+    before: Float[np.ndarray, " terms"], after: Float[np.ndarray, " terms"], share: float
+) -> bool:
+    """Whether coefficients differ by less than a share of the latter; never for a share of 0."""
+    return bool(np.linalg.norm(after - before) < share * np.linalg.norm(after))
 
 
 def _following(
     problem: RegressionRows,
     sums: _Sums,
     rows: _Linearised,
-    terms: Bool[np.ndarray, " kept"],
+    coef: Float[np.ndarray, " kept"],
     *,
     limit: float,
 ) -> _Linearised | None:
-    """One Gauss-Newton step, halved until the misfit decreases; None if it never does.
+    """One Gauss-Newton step to coefficients, halved until the misfit decreases; None if never.
 
     limit: largest misfit allowed after a whole step.
     """
-    coef = rows.fit(terms)
-    x = keep_inside(problem.library, rows.correct(coef), rows.x)
+    x = np.ascontiguousarray(keep_inside(problem.library, rows.correct(coef).T, rows.x.T).T)
     whole = _Linearised.at(problem, sums, x, coef)
     if whole.misfit <= limit:
         return whole
@@ -154,12 +165,12 @@ class _Sums(NamedTuple):
 class _Linearised:
     """Whitened rows, linearised about samples x and coefficients, with their noise model.
 
-    x: (samples, variables). coef: (kept,), in scaled columns.
+    x: (variables, samples). coef: (kept,), in scaled columns.
     drifted: the terms at x plus their change from x to the raw samples, to first order.
     sensitivity: (variables, samples), change of the model's rate per unit noise of each variable.
     """
 
-    x: Float[np.ndarray, "samples variables"]
+    x: Float[np.ndarray, "variables samples"]
     coef: Float[np.ndarray, " kept"]
     theta: Float[np.ndarray, "rows kept"]
     drifted: Float[np.ndarray, "rows kept"]
@@ -173,7 +184,7 @@ class _Linearised:
     def at(
         problem: RegressionRows,
         sums: _Sums,
-        x: Float[np.ndarray, "samples variables"],
+        x: Float[np.ndarray, "variables samples"],
         coef: Float[np.ndarray, " kept"],
         *,
         noisy: bool = True,
@@ -185,18 +196,18 @@ class _Linearised:
         """
         rows, library = problem.noisy, problem.library
         assert rows is not None
-        n, n_samples = len(library.variables), len(x)
+        (values, _, noise_std), n, n_samples = rows.columns, len(library.variables), x.shape[1]
         columns = np.ones((n + 1, n_samples))
-        columns[:n] = x[:, :n].T
-        departure = rows.values[:, :n].T - columns[:n]
-        terms, sensitivity = np.empty((2, len(coef), n_samples)), np.zeros((x.shape[1], n_samples))
+        columns[:n] = x[:n]
+        departure = values[:n] - x[:n]
+        terms, sensitivity = np.empty((2, len(coef), n_samples)), np.zeros(x.shape)
         linearise(
             sums.products.with_functions(columns, axis=0), sums.table, *sums.entries,
             departure, coef, terms, sensitivity[:n],
         )  # fmt: skip
         if noisy and library.functions:
-            terms -= (_lift(problem, x[:, :n]) / problem.theta_scale).T[sums.kept]
-        sensitivity *= rows.noise_std.T
+            terms -= (_lift(problem, x[:n].T) / problem.theta_scale).T[sums.kept]
+        sensitivity *= noise_std
         target_scale = float(problem.target_scale[0])
         factor = _banded_cholesky(_covariance(rows, sensitivity, target_scale))
         windows = rows.stretches
@@ -230,17 +241,18 @@ class _Linearised:
         )
         return coef
 
-    def correct(self, coef: Float[np.ndarray, " terms"]) -> Float[np.ndarray, "samples variables"]:
+    def correct(self, coef: Float[np.ndarray, " terms"]) -> Float[np.ndarray, "variables samples"]:
         """Samples minus their most likely noise."""
         weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
         rows, windows = self.source, self.source.stretches
-        by_mean, by_slope = np.empty((2, len(self.x)))
+        values, _, noise_std = rows.columns
+        by_mean, by_slope = np.empty((2, values.shape[1]))
         for weights, sums in ((windows.mean, by_mean), (windows.slope, by_slope)):
             spread_windows(windows.starts, windows.first, weights, weighted, sums)
-        noise = (by_mean * self.sensitivity).T
-        noise[:, rows.state] -= by_slope / self.target_scale * rows.noise_std[:, rows.state]
-        limited = np.clip(noise, -LARGEST_CORRECTION, LARGEST_CORRECTION)
-        return rows.values - limited * rows.noise_std
+        noise = by_mean * self.sensitivity
+        noise[rows.state] -= by_slope / self.target_scale * noise_std[rows.state]
+        np.clip(noise, -LARGEST_CORRECTION, LARGEST_CORRECTION, out=noise)
+        return values - noise * noise_std
 
 
 def _lift(
@@ -274,7 +286,7 @@ def _covariance(
 ) -> Float[np.ndarray, "band rows"]:
     """Covariance of the rows by the samples' noise, from its diagonal downwards."""
     windows = rows.stretches
-    own, std = sensitivity[rows.state], rows.noise_std[:, rows.state] / target_scale
+    own, std = sensitivity[rows.state], rows.columns[2][rows.state] / target_scale
     band = np.zeros((len(windows.first), windows.width))
     banded_covariance(
         windows.starts, windows.first, windows.mean, windows.slope,
@@ -296,8 +308,11 @@ def _banded_cholesky(band: Float[np.ndarray, "band rows"]) -> Float[np.ndarray, 
 
 
 def _solve(factor: np.ndarray, values: np.ndarray, *, transposed: bool = False) -> np.ndarray:
-    """Solve with the banded factor L: returns L^-1 values, or L^-T values if transposed."""
-    columns = values.reshape(len(values), -1)
-    solution, info = dtbtrs(factor, columns, uplo="L", trans="T" if transposed else "N")
+    """Solve with the banded factor L: returns L^-1 values, or L^-T values if transposed.
+
+    The values may be overwritten.
+    """
+    columns, trans = values.reshape(len(values), -1), "T" if transposed else "N"
+    solution, info = dtbtrs(factor, columns, uplo="L", trans=trans, overwrite_b=True)
     assert info == 0
     return solution.reshape(values.shape)

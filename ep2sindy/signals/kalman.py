@@ -85,9 +85,9 @@ class KalmanSmoother:
         signal, slope = np.empty((2, *values.shape))
         noise_std, log10_ratio = np.empty(values.shape[1]), self._ratios(steps, scaled, step_s)
         for j, ratio in enumerate((10.0**log10_ratio).tolist()):
-            column = np.ascontiguousarray(scaled[:, j])[:, None]
-            signal[:, j : j + 1], slope[:, j : j + 1] = smooth(steps, column, ratio)
-            noise_std[j] = np.sqrt(likelihood(steps, column, ratio)[1][0])
+            column = np.ascontiguousarray(scaled[:, j])
+            signal[:, j : j + 1], slope[:, j : j + 1] = smooth(steps, column[:, None], ratio)
+            noise_std[j] = np.sqrt(likelihood(steps, column, ratio)[1])
         return KalmanEstimate(
             smoothed=values[0] + spread * signal,
             derivative=spread * slope / step_s,
@@ -148,7 +148,7 @@ def most_likely_ratios(
     on_grid = -likelihoods(steps, values, 10.0**decades)
     ratios = decades[on_grid.argmin(axis=1)]
     for j, best in enumerate(on_grid.argmin(axis=1).tolist()):
-        column = np.ascontiguousarray(values[:, j])[:, None]
+        column = np.ascontiguousarray(values[:, j])
         found = minimize_scalar(
             partial(_misfit, steps, column),
             bounds=(decades[max(best - 1, 0)], decades[min(best + 1, len(decades) - 1)]),
@@ -162,7 +162,7 @@ def most_likely_ratios(
 
 
 def _misfit(steps: np.ndarray, column: np.ndarray, log10_ratio: float) -> float:
-    return float(-likelihood(steps, column, 10.0**log10_ratio)[0][0])
+    return -likelihood(steps, column, 10.0**log10_ratio)[0]
 
 
 def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> None:

@@ -197,27 +197,45 @@ def _filter(steps, values, known):
 
 @compiled(**CHAIN)
 def likelihood(steps, values, ratio):
-    """Log-likelihood (columns,) of the samples after the third, and the noise variance (columns,).
+    """Log-likelihood of the samples (samples,) after the third, and the variance of their noise.
 
     The variance of the measurement noise is profiled out: its most likely value is returned. A
-    constant that depends on neither the values nor the ratio is left out.
+    constant that depends on neither the values nor the ratio is left out. `gains` and `_filter` in
+    one loop that stores nothing, for a search tries many ratios.
     """
-    known = gains(steps, ratio)
-    innovation, _ = _filter(steps, values, known)
-    n_samples, n_columns = values.shape
-    total, noise = np.zeros(n_columns), np.empty(n_columns)
-    log, log_variance = 0.0, 0.0
+    n_samples, slope_cov = len(values), np.empty((3, 3))
+    parabola, lower, diagonal = _start(steps, ratio, slope_cov)
+    signal = slope = bend = 0.0
+    for i in range(3):
+        signal += parabola[0, i] * values[i]
+        slope += parabola[1, i] * values[i]
+        bend += parabola[2, i] * values[i]
+    weight = gain0 = gain1 = gain2 = log = total = log_variance = 0.0
+    settled = False
     for k in range(3, n_samples):
-        weight = 1.0 / known.variance[k]
-        if known.variance[k] != known.variance[k - 1]:
-            log = np.log(known.variance[k])
+        h = steps[k - 1]
+        even = abs(h - steps[k - 2]) <= EVEN
+        if not (settled and even):
+            before = diagonal
+            lower, (d0, d1, d2) = _predict(h, ratio, lower, diagonal)
+            variance = d0 + 1.0
+            weight, log = 1.0 / variance, np.log(variance)
+            d0 /= variance
+            diagonal = (d0, d1, d2)
+            gain0, gain1, gain2 = d0, lower[0] * d0, lower[1] * d0
+            settled = even
+            for i in range(3):
+                settled = settled and abs(diagonal[i] - before[i]) <= SETTLED * diagonal[i]
+        turned = slope + h * bend
+        predicted = signal + 0.5 * h * (slope + turned)
+        missed = values[k] - predicted
+        signal = predicted + gain0 * missed
+        slope = turned + gain1 * missed
+        bend += gain2 * missed
+        total += weight * missed**2
         log_variance += log
-        for j in range(n_columns):
-            total[j] += weight * innovation[k, j] ** 2
-    for j in range(n_columns):
-        noise[j] = max(total[j] / (n_samples - 3), ROUNDING)
-        total[j] = -0.5 * ((n_samples - 3) * np.log(noise[j]) + log_variance)
-    return total, noise
+    noise = max(total / (n_samples - 3), ROUNDING)
+    return -0.5 * ((n_samples - 3) * np.log(noise) + log_variance), noise
 
 
 @compiled(**SIDE_BY_SIDE)
