@@ -384,13 +384,16 @@ def test_a_linear_library_of_what_is_not_linear_is_called_a_misfit() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("term", ["x^3", "x"])
-def test_a_library_without_a_true_term_is_called_a_misfit(term: str) -> None:
+@pytest.mark.parametrize(
+    ("term", "words"),
+    [("x^3", "no law of this library explains x"), ("x", "no model of this library fits")],
+)
+def test_a_library_without_a_true_term_is_called_a_misfit(term: str, words: str) -> None:
     system = ep.systems.van_der_pol()
     full = system.model.library
     library = full.take(np.arange(len(full)) != full.index(term))
     found = ep.estimate([system.trajectory(noise=0.05, rng=0)], library)
-    assert "no model of this library fits these data" in found.misfit
+    assert words in found.misfit
 
 
 def test_an_equation_with_all_the_terms_that_it_may_have_is_a_misfit() -> None:

@@ -6,12 +6,26 @@ the coefficients. Everything is linearised about a path: `misses` (n - 1, d) is 
 next state of the path, `residuals` (n, d) is the samples minus the path, and the unknowns are
 departures from the path.
 
-The kernels are loops because array expressions take seconds more to compile.
+A filter keeps one row for each state: its mean, the derivatives of the mean by the p coefficients,
+and its row of the covariance. The observation of a sample subtracts a multiple of one row from all
+rows, and a step replaces each row by a sum of rows, so both are sums of contiguous numbers. The
+kernels are loops because array expressions take seconds more to compile.
 """
+
+from typing import Any
 
 import numpy as np
 
 from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
+
+KERNEL: dict[str, Any] = {
+    "fastmath": {"contract"}, "error_model": "numpy", **SEPARATE_ARRAYS,
+}  # fmt: skip
+INLINED = {**KERNEL, "forceinline": True}  # a call would cost as much as the few numbers of a row
+
+VECTOR = 4  # numbers; rows are padded to whole ones
+PIECE = 2**15  # numbers that wait for their product of matrices, few enough to stay in the cache
+TINY, HUGE = 1e-100, 1e100  # bounds of a product of variances before its logarithm is taken
 
 
 @compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
@@ -55,61 +69,66 @@ def sensitivities(jacobians, terms, equation, column, leads, weights, steps, slo
                 slopes[k, i, c] = total[i, c]
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def _observe(i, residual, variance, mean, by_coef, cov, gain):
-    """Update with one sample of state i; returns its innovation and the innovation's variance."""
-    d, p = by_coef.shape
-    spread = cov[i, i] + variance
-    innovation = residual - mean[i]
-    for j in range(d):
-        gain[j] = cov[j, i] / spread
-    for j in range(d):
-        mean[j] += gain[j] * innovation
-        if j != i:
-            for a in range(p):
-                by_coef[j, a] -= gain[j] * by_coef[i, a]
-    for a in range(p):
-        by_coef[i, a] *= 1.0 - gain[i]
-    for j in range(d):
-        for m in range(j + 1):
-            cov[j, m] -= gain[j] * gain[m] * spread
-            cov[m, j] = cov[j, m]
-    return innovation, spread
+@compiled(**INLINED)
+def _add(row, factor, total):
+    for c in range(len(row)):
+        total[c] += factor * row[c]
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def _step(flow, miss, mean, by_coef, cov, process, buffer):
-    """Propagate mean, its derivatives by the coefficients, and covariance over one step."""
-    d, p = by_coef.shape
+@compiled(**INLINED)
+def _copy(row, out):
+    for c in range(len(out)):
+        out[c] = row[c]
+
+
+@compiled(**INLINED)
+def _observe(i, residual, variance, state, cov, row, gain):
+    """Update all rows with one sample of state i; returns the innovation's variance and its weight.
+
+    cov: first column of the covariance. `row` becomes the row of state i before the update, with
+    minus the innovation in place of its mean.
+    """
+    _copy(state[i], row)
+    row[0] -= residual
+    spread = row[cov + i] + variance
+    weight = 1.0 / spread
+    for j in range(len(state)):
+        gain[j] = weight * state[j, cov + i]
+    for j in range(len(state)):
+        _add(row, -gain[j], state[j])
+    return spread, weight
+
+
+@compiled(**INLINED)
+def _step(flow, miss, process, state, cov, ahead, row):
+    """Write to `ahead` the rows of all states, propagated over one step."""
+    d = len(flow)
     for i in range(d):
-        value = miss[i]
+        new = ahead[i]
+        new[0] = miss[i]
+        _copy(flow[i, d:], new[1:cov])
+        for c in range(cov, len(new)):
+            new[c] = 0.0
         for j in range(d):
-            value += flow[i, j] * mean[j]
-        buffer[i, 0] = value
-        for a in range(p):
-            buffer[i, 1 + a] = flow[i, d + a]
-        for j in range(d):
-            for a in range(p):  # innermost, where it is a sum of vectors
-                buffer[i, 1 + a] += flow[i, j] * by_coef[j, a]
-        for m in range(d):
-            value = 0.0
-            for j in range(d):
-                value += flow[i, j] * cov[j, m]
-            buffer[i, 1 + p + m] = value
-    for i in range(d):
-        mean[i] = buffer[i, 0]
-        for a in range(p):
-            by_coef[i, a] = buffer[i, 1 + a]
+            _add(state[j], flow[i, j], new)
         for m in range(i + 1):
-            value = 0.0
+            row[m] = 0.0
             for j in range(d):
-                value += buffer[i, 1 + p + j] * flow[m, j]
-            cov[i, m] = value
-            cov[m, i] = value
-        cov[i, i] += process[i]
+                row[m] += new[cov + j] * flow[m, j]
+        for m in range(i + 1):
+            new[cov + m] = row[m]
+            ahead[m, cov + i] = row[m]
+        new[cov + i] += process[i]
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
+def _at_start(d, p, free_start):
+    """Rows of d states that nothing is known of, and the first column of their covariance."""
+    cov = 1 + p
+    state = np.zeros((d, -(-(cov + d) // VECTOR) * VECTOR))
+    state[:, cov : cov + d] = free_start * np.eye(d)
+    return state, cov
+
+
 def eliminate(flow, misses, residuals, variance, process, free_start):
     """Eliminate all states: the squares as a quadratic function of the coefficients alone.
 
@@ -120,38 +139,46 @@ def eliminate(flow, misses, residuals, variance, process, free_start):
     c. Exact for the linearised problem (de Jong 1991, doi:10.1214/aos/1176348139).
     """
     n, d = residuals.shape
-    p = flow.shape[2] - d
-    hessian, gradient = np.zeros((p, p)), np.zeros(p)
-    mean, by_coef, cov, gain = np.zeros(d), np.zeros((d, p)), np.zeros((d, d)), np.empty(d)
-    row, buffer = np.empty(p), np.empty((d, 1 + p + d))
-    least, log_spread = 0.0, 0.0
-    for i in range(d):
-        cov[i, i] = free_start
-    for k in range(n):
-        for i in range(d):
-            if not np.isfinite(residuals[k, i]):
-                continue
-            for a in range(p):
-                row[a] = by_coef[i, a]
-            innovation, spread = _observe(
-                i, residuals[k, i], variance[k, i], mean, by_coef, cov, gain
-            )
-            least += innovation * innovation / spread
-            log_spread += np.log(spread)
-            for a in range(p):
-                share = row[a] / spread
-                gradient[a] += share * innovation
-                for b in range(a + 1):
-                    hessian[a, b] += share * row[b]
-        if k < n - 1:
-            _step(flow[k], misses[k], mean, by_coef, cov, process[k], buffer)
-    for a in range(p):
-        for b in range(a):
-            hessian[b, a] = hessian[a, b]
-    return hessian, gradient, least, log_spread
+    state, cov = _at_start(d, flow.shape[2] - d, free_start)
+    told = np.empty((min(n, max(1, PIECE // (d * cov))), d, cov))
+    room = np.empty_like(state), np.empty(state.shape[1]), np.empty(d)
+    gram, log_spread = np.zeros((cov, cov)), 0.0
+    for first in range(0, n, len(told)):
+        log_spread += _tell(first, flow, misses, residuals, variance, process, state, *room, told)
+        rows = told[: n - first].reshape(-1, cov)
+        gram += rows.T @ rows
+    return gram[1:, 1:], -gram[0, 1:], gram[0, 0], log_spread
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
+@compiled(**KERNEL)
+def _tell(first, flow, misses, residuals, variance, process, state, ahead, row, gain, told):
+    """Filter the samples from `first` on, as many as `told` (samples, d, 1 + p) has room for.
+
+    Writes to `told` minus the innovation and its derivatives by the coefficients, in its standard
+    deviation; zero where nothing was measured. Returns the sum of the logarithms of the variances.
+    """
+    cov, product, log_spread = told.shape[2], 1.0, 0.0
+    for k in range(first, min(first + len(told), len(residuals))):
+        for i in range(len(state)):
+            out, root = told[k - first, i], 0.0
+            if np.isfinite(residuals[k, i]):
+                spread, weight = _observe(i, residuals[k, i], variance[k, i], state, cov, row, gain)
+                root = np.sqrt(weight)
+                product *= spread
+                if not TINY < product < HUGE:  # fewer logarithms
+                    log_spread += np.log(product)
+                    product = 1.0
+            else:
+                row[:] = 0.0
+            for c in range(len(out)):
+                out[c] = root * row[c]
+        if k < len(flow):
+            _step(flow[k], misses[k], process[k], state, cov, ahead, row)
+            for i in range(len(state)):
+                _copy(ahead[i], state[i])
+    return log_spread + np.log(product)
+
+
 def filtered(flow, misses, residuals, variance, process, free_start):
     """Innovations (n, d), and mean (d,) and covariance (d, d) of the last departure from the path.
 
@@ -159,22 +186,13 @@ def filtered(flow, misses, residuals, variance, process, free_start):
     where nothing was measured. Arguments as for `departures`.
     """
     n, d = residuals.shape
-    found = np.full((n, d), np.nan)
-    mean, none, cov = np.zeros(d), np.zeros((d, 0)), np.zeros((d, d))
-    gain, buffer = np.empty(d), np.empty((d, 1 + d))
-    for i in range(d):
-        cov[i, i] = free_start
-    for k in range(n):
-        for i in range(d):
-            if np.isfinite(residuals[k, i]):
-                value, spread = _observe(i, residuals[k, i], variance[k, i], mean, none, cov, gain)
-                found[k, i] = value / np.sqrt(spread)
-        if k < n - 1:
-            _step(flow[k], misses[k], mean, none, cov, process[k], buffer)
-    return found, mean, cov
+    state, cov = _at_start(d, 0, free_start)
+    told, room = np.empty((n, d, cov)), (np.empty_like(state), np.empty(state.shape[1]))
+    _tell(0, flow, misses, residuals, variance, process, state, *room, np.empty(d), told)
+    found = np.where(np.isfinite(residuals), -told[:, :, 0], np.nan)
+    return found, state[:, 0], state[:, cov : cov + d]
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
 def departures(flow, misses, residuals, variance, process, free_start):
     """Departures (n, d) of all states from the path that minimise the squares.
 
@@ -183,41 +201,53 @@ def departures(flow, misses, residuals, variance, process, free_start):
     doi:10.1016/0005-1098(73)90089-3).
     """
     n, d = residuals.shape
-    means, covs = np.empty((n, d)), np.empty((n, d, d))
-    gains, innovations = np.zeros((n, d, d)), np.zeros((n, d))
-    mean, none, cov = np.zeros(d), np.zeros((d, 0)), np.zeros((d, d))
-    buffer = np.empty((d, 1 + d))
-    for i in range(d):
-        cov[i, i] = free_start
+    state, cov = _at_start(d, 0, free_start)
+    states, gains, innovations = np.empty((n, *state.shape)), np.zeros((n, d, d)), np.zeros((n, d))
+    states[0] = state
+    _look_back(
+        flow, misses, residuals, variance, process, cov, states, state, np.empty(state.shape[1]),
+        gains, innovations, np.zeros((2, d)),
+    )  # fmt: skip
+    return innovations
+
+
+@compiled(**KERNEL)
+def _look_back(
+    flow, misses, residuals, variance, process, cov, states, state, row, gains, found, adjoints
+):
+    """Filter forwards, then go backwards; `found` (n, d) holds innovations, then departures.
+
+    states: (n, d, columns), the rows before each sample, of which the first are given.
+    """
+    n, d = residuals.shape
+    adjoint, carried = adjoints[0], adjoints[1]
     for k in range(n):
         for i in range(d):
-            means[k, i] = mean[i]
-            for j in range(d):
-                covs[k, i, j] = cov[i, j]
+            _copy(states[k, i], state[i])
         for i in range(d):
             if np.isfinite(residuals[k, i]):
-                innovation, spread = _observe(
-                    i, residuals[k, i], variance[k, i], mean, none, cov, gains[k, i]
+                _, weight = _observe(
+                    i, residuals[k, i], variance[k, i], state, cov, row, gains[k, i]
                 )
-                innovations[k, i] = innovation / spread
+                found[k, i] = -weight * row[0]
         if k < n - 1:
-            _step(flow[k], misses[k], mean, none, cov, process[k], buffer)
-    adjoint, carried = np.zeros(d), np.zeros(d)
+            _step(flow[k], misses[k], process[k], state, cov, states[k + 1], row)
     for k in range(n - 1, -1, -1):
         for j in range(d):
             carried[j] = 0.0
+        if k < n - 1:
             for i in range(d):
-                if k < n - 1:
+                for j in range(d):
                     carried[j] += flow[k, i, j] * adjoint[i]
-        for j in range(d):
-            adjoint[j] = carried[j]
+        _copy(carried, adjoint)
         for i in range(d - 1, -1, -1):
             if np.isfinite(residuals[k, i]):
-                value = innovations[k, i]
+                value = found[k, i]
                 for j in range(d):
                     value += gains[k, i, j] * adjoint[j]
                 adjoint[i] -= value
         for i in range(d):
+            value = states[k, i, 0]
             for j in range(d):
-                means[k, i] -= covs[k, i, j] * adjoint[j]
-    return means
+                value -= states[k, i, cov + j] * adjoint[j]
+            found[k, i] = value
