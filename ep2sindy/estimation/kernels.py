@@ -9,26 +9,21 @@ departures from the path.
 A filter keeps one row for each state: its mean, the derivatives of the mean by the p coefficients,
 and its row of the covariance. The observation of a sample subtracts a multiple of one row from all
 rows, and a step replaces each row by a sum of rows, so both are sums of contiguous numbers. The
-kernels are loops because array expressions take seconds more to compile.
+kernels are loops, and are given all arrays that they fill, because array expressions and new arrays
+take seconds more to compile.
 """
-
-from typing import Any
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
+from ep2sindy.runtime.compilation import LOOPS, compiled
 
-KERNEL: dict[str, Any] = {
-    "fastmath": {"contract"}, "error_model": "numpy", **SEPARATE_ARRAYS,
-}  # fmt: skip
-INLINED = {**KERNEL, "forceinline": True}  # a call would cost as much as the few numbers of a row
+INLINED = {**LOOPS, "forceinline": True}  # a call would cost as much as the few numbers of a row
 
 VECTOR = 4  # numbers; rows are padded to whole ones
 PIECE = 2**15  # numbers that wait for their product of matrices, few enough to stay in the cache
 TINY, HUGE = 1e-100, 1e100  # bounds of a product of variances before its logarithm is taken
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
 def sensitivities(jacobians, terms, equation, column, leads, weights, steps, slopes):
     """One Runge-Kutta step of the sensitivities; `slopes` (n, d, d + p) is advanced in place.
 
@@ -39,9 +34,16 @@ def sensitivities(jacobians, terms, equation, column, leads, weights, steps, slo
     Coefficient c multiplies terms[..., column[c]] in equation[c]. A sample passes all stages before
     the next one comes, so that what it needs stays in the cache.
     """
-    n, d, width = len(slopes), slopes.shape[1], slopes.shape[1] + len(equation)
-    here, slope, total = np.empty((d, width)), np.empty((d, width)), np.empty((d, width))
-    for k in range(n):
+    buffers = np.empty((3, slopes.shape[1], slopes.shape[1] + len(equation)))
+    _sensitivities(jacobians, terms, equation, column, leads, weights, steps, slopes, *buffers)
+
+
+@compiled(**LOOPS)
+def _sensitivities(
+    jacobians, terms, equation, column, leads, weights, steps, slopes, here, slope, total
+):
+    d, width = here.shape
+    for k in range(len(slopes)):
         for i in range(d):
             for c in range(width):
                 slope[i, c] = 0.0
@@ -150,7 +152,7 @@ def eliminate(flow, misses, residuals, variance, process, free_start):
     return gram[1:, 1:], -gram[0, 1:], gram[0, 0], log_spread
 
 
-@compiled(**KERNEL)
+@compiled(**LOOPS)
 def _tell(first, flow, misses, residuals, variance, process, state, ahead, row, gain, told):
     """Filter the samples from `first` on, as many as `told` (samples, d, 1 + p) has room for.
 
@@ -169,7 +171,8 @@ def _tell(first, flow, misses, residuals, variance, process, state, ahead, row, 
                     log_spread += np.log(product)
                     product = 1.0
             else:
-                row[:] = 0.0
+                for c in range(len(row)):
+                    row[c] = 0.0
             for c in range(len(out)):
                 out[c] = root * row[c]
         if k < len(flow):
@@ -211,7 +214,7 @@ def departures(flow, misses, residuals, variance, process, free_start):
     return innovations
 
 
-@compiled(**KERNEL)
+@compiled(**LOOPS)
 def _look_back(
     flow, misses, residuals, variance, process, cov, states, state, row, gains, found, adjoints
 ):

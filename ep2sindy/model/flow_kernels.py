@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
+from ep2sindy.runtime.compilation import LOOPS, compiled
 
 LANES = 64
 
@@ -59,9 +59,9 @@ def reach_of(d, row, factor):
     return np.linalg.matrix_power(one, 4) > 0.0
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def _sum_products(columns, table, product, target, weight, values, sums):
-    """Values of the products, and their weighted sums."""
+@compiled(inline="always")
+def _sum_products(s, columns, table, product, target, weight, values, sums):
+    """Values of the products, and their weighted sums, at stage s."""
     one = len(columns) - 1
     for m in range(len(table)):
         for i in range(LANES):
@@ -70,25 +70,48 @@ def _sum_products(columns, table, product, target, weight, values, sums):
             if table[m, k] != one:
                 for i in range(LANES):
                     values[m, i] *= columns[table[m, k], i]
-    for e in range(len(sums)):
+    for e in range(sums.shape[1]):
         for i in range(LANES):
-            sums[e, i] = 0.0
+            sums[s, e, i] = 0.0
     for e in range(len(product)):
         for i in range(LANES):
-            sums[target[e], i] += weight[e] * values[product[e], i]
+            sums[s, target[e], i] += weight[e] * values[product[e], i]
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def _add_product(matrix, jacobian, row, factor, scale, total):
-    """Add scale (lanes,) times a matrix (d, d, lanes) times the sparse Jacobian to the total."""
-    for j in range(len(matrix)):
-        for q in range(len(row)):
+@compiled(inline="always")
+def _stages(
+    here, inputs, place, first, h, leads, weights, places, table, product, target, weight, columns,
+    values, sums, total,
+):  # fmt: skip
+    """The stages of one step from `here`; its end goes to `total`, both (d, lanes).
+
+    place, first: of the step and the first lane among the inputs.
+    """
+    d, last = len(here), inputs.shape[1] - 1
+    for j in range(d):
+        for i in range(LANES):
+            total[j, i] = here[j, i]
+    for s in range(4):
+        for m in range(inputs.shape[2]):
             for i in range(LANES):
-                total[j, factor[q], i] += scale[i] * matrix[j, row[q], i] * jacobian[q, i]
+                sample = first + i if first + i < last else last
+                columns[d + m, i] = inputs[place + places[s], sample, m]
+        for j in range(d):
+            for i in range(LANES):
+                columns[j, i] = here[j, i]
+            for earlier in range(s):
+                lead = leads[s, earlier]
+                if lead != 0.0:
+                    for i in range(LANES):
+                        columns[j, i] += lead * h[i] * sums[earlier, j, i]
+        _sum_products(s, columns, table, product, target, weight, values, sums)
+        for j in range(d):
+            for i in range(LANES):
+                total[j, i] += weights[s] * h[i] * sums[s, j, i]
 
 
-@compiled
-def _gains(sums, row, factor, tableau, h, scale, gains, by_state):
+@compiled(inline="always")
+def _gains(sums, row, factor, leads, weights, h, gains, by_state):
     """Change of the end of a step per change of the slope at each stage, and of its start."""
     d = len(by_state)
     for j in range(d):
@@ -96,20 +119,23 @@ def _gains(sums, row, factor, tableau, h, scale, gains, by_state):
             for i in range(LANES):
                 by_state[j, k, i] = 1.0 if j == k else 0.0
                 for s in range(4):
-                    gains[s, j, k, i] = tableau.weights[s] * h[i] if j == k else 0.0
+                    gains[s, j, k, i] = weights[s] * h[i] if j == k else 0.0
     for s in range(3, -1, -1):
         for later in range(s + 1, 4):
-            lead = tableau.leads[later, s]
+            lead = leads[later, s]
             if lead != 0.0:
+                for j in range(d):
+                    for q in range(len(row)):
+                        for i in range(LANES):
+                            product = lead * h[i] * gains[later, j, row[q], i]
+                            gains[s, j, factor[q], i] += product * sums[later, d + q, i]
+        for j in range(d):
+            for q in range(len(row)):
                 for i in range(LANES):
-                    scale[i] = lead * h[i]
-                _add_product(gains[later], sums[later, d:], row, factor, scale, gains[s])
-        for i in range(LANES):
-            scale[i] = 1.0
-        _add_product(gains[s], sums[s, d:], row, factor, scale, by_state)
+                    by_state[j, factor[q], i] += gains[s, j, row[q], i] * sums[s, d + q, i]
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
+@compiled(inline="always")
 def _carry(by, by_state, reach, first, total):
     """Carry all derivatives (columns, d, lanes) over a step; before the first they are trivial."""
     d = len(by_state)
@@ -127,49 +153,23 @@ def _carry(by, by_state, reach, first, total):
                 by[c, j, i] = total[j, i]
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def _add_sources(by, gains, sources, reach, equation, column):
+@compiled(inline="always")
+def _add_sources(by, gains, sums, n_jacobian, reach, equation, column):
     """Add what the coefficients change directly within the step."""
     d = gains.shape[1]
     for r in range(len(equation)):
-        c, e = d + column[r], equation[r]
+        c, e, at = d + column[r], equation[r], d + n_jacobian + r
         for j in range(d):
             if reach[j, e]:
                 for i in range(LANES):
                     by[c, j, i] += (
-                        gains[0, j, e, i] * sources[0, r, i]
-                        + gains[1, j, e, i] * sources[1, r, i]
-                        + gains[2, j, e, i] * sources[2, r, i]
-                        + gains[3, j, e, i] * sources[3, r, i]
+                        gains[0, j, e, i] * sums[0, at, i]
+                        + gains[1, j, e, i] * sums[1, at, i]
+                        + gains[2, j, e, i] * sums[2, at, i]
+                        + gains[3, j, e, i] * sums[3, at, i]
                     )
 
 
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
-def _stages(here, inputs, h, tableau, columns, table, product, target, weight, values, sums, total):
-    """The stages of one step from `here`; its end goes to `total`, both (d, lanes)."""
-    d, last = len(here), inputs.shape[1] - 1
-    for j in range(d):
-        for i in range(LANES):
-            total[j, i] = here[j, i]
-    for s in range(4):
-        for m in range(inputs.shape[2]):
-            for i in range(LANES):
-                columns[d + m, i] = inputs[tableau.places[s], min(i, last), m]
-        for j in range(d):
-            for i in range(LANES):
-                columns[j, i] = here[j, i]
-            for earlier in range(s):
-                lead = tableau.leads[s, earlier]
-                if lead != 0.0:
-                    for i in range(LANES):
-                        columns[j, i] += lead * h[i] * sums[earlier, j, i]
-        _sum_products(columns, table, product, target, weight, values, sums[s])
-        for j in range(d):
-            for i in range(LANES):
-                total[j, i] += tableau.weights[s] * h[i] * sums[s, j, i]
-
-
-@compiled(fastmath={"contract"}, **SEPARATE_ARRAYS)
 def advance(states, inputs, steps, tableau, equations, ends, slopes):
     """Write the states at the end of every step to `ends` (n, d), and derivatives to `slopes`.
 
@@ -177,36 +177,44 @@ def advance(states, inputs, steps, tableau, equations, ends, slopes):
     if none are asked for; by the states at the start, then by the coefficients. steps: (n,), length
     of one substep. inputs: (stride * substeps + 1, n, inputs), at the positions of the tableau.
     """
-    table, product, target, weight, row, factor, equation, column, reach = equations
-    n, d = states.shape
-    n_columns = min(slopes.shape[2], d)
-    for c in column:
-        n_columns = max(n_columns, d + c + 1)
-    columns = np.ones((d + inputs.shape[2] + 1, LANES))
-    values, sums = np.empty((len(table), LANES)), np.empty((4, d + len(row) + len(column), LANES))
-    here, total = np.empty((d, LANES)), np.empty((d, LANES))
-    h, scale = np.empty(LANES), np.empty(LANES)
-    by, by_state = np.empty((n_columns, d, LANES)), np.empty((d, d, LANES))
-    gains = np.empty((4, d, d, LANES))
+    d, column = states.shape[1], equations.column
+    n_columns = d + column.max(initial=-1) + 1 if slopes.shape[2] else 0
+    n_sums = d + len(equations.row) + len(column)
+    _advance(
+        states, inputs, steps, *tableau, *equations, ends, slopes,
+        np.ones((d + inputs.shape[2] + 1, LANES)), np.empty((len(equations.table), LANES)),
+        np.empty((4, n_sums, LANES)), *np.empty((2, d, LANES)), np.empty(LANES),
+        np.empty((n_columns, d, LANES)), np.empty((d, d, LANES)), np.empty((4, d, d, LANES)),
+    )  # fmt: skip
+
+
+@compiled(**LOOPS)
+def _advance(
+    states, inputs, steps, leads, weights, places, stride,
+    table, product, target, weight, row, factor, equation, column, reach, ends, slopes,
+    columns, values, sums, here, total, h, by, by_state, gains,
+):  # fmt: skip
+    """`advance`, with the fields of its tuples one by one and with what it computes in between."""
+    (n, d), n_columns = states.shape, len(by)
     for first in range(0, n, LANES):
-        n_here = min(LANES, n - first)
-        for i in range(LANES):  # lanes beyond the end repeat the last sample
-            h[i] = steps[first + min(i, n_here - 1)]
+        for i in range(LANES):
+            k = first + i if first + i < n else n - 1  # lanes beyond the end repeat the last sample
+            h[i] = steps[k]
             for j in range(d):
-                here[j, i] = states[first + min(i, n_here - 1), j]
-        for place in range(0, len(inputs) - 1, tableau.stride):
-            at = inputs[place : place + tableau.stride + 1, first : first + n_here]
+                here[j, i] = states[k, j]
+        for place in range(0, len(inputs) - 1, stride):
             _stages(
-                here, at, h, tableau, columns, table, product, target, weight, values, sums, total
-            )
+                here, inputs, place, first, h, leads, weights, places, table, product, target,
+                weight, columns, values, sums, total,
+            )  # fmt: skip
             for j in range(d):
                 for i in range(LANES):
                     here[j, i] = total[j, i]
             if n_columns:
-                _gains(sums, row, factor, tableau, h, scale, gains, by_state)
+                _gains(sums, row, factor, leads, weights, h, gains, by_state)
                 _carry(by, by_state, reach, place == 0, total)
-                _add_sources(by, gains, sums[:, d + len(row) :], reach, equation, column)
-        for i in range(n_here):
+                _add_sources(by, gains, sums, len(row), reach, equation, column)
+        for i in range(min(LANES, n - first)):
             for j in range(d):
                 ends[first + i, j] = here[j, i]
                 for c in range(n_columns):
