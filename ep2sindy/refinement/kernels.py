@@ -9,10 +9,13 @@ the right-hand side.
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
+from ep2sindy.runtime.compilation import LOOPS, compiled
+
+SUMS = {**LOOPS, "fastmath": {"reassoc", "contract"}}
+INLINED = {**SUMS, "forceinline": True}  # a call would cost as much as the few numbers of a row
 
 
-@compiled(fastmath={"reassoc", "contract"}, **SEPARATE_ARRAYS)
+@compiled(**INLINED)
 def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
     """Write R of a QR decomposition by Householder reflections.
 
@@ -42,28 +45,33 @@ def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
             out[i, j] = columns[j, i]
 
 
-@compiled(fastmath={"reassoc", "contract"}, **SEPARATE_ARRAYS)
-def _advance(
-    maps: np.ndarray, nodes: np.ndarray, p: int, w: int, k: int, x: np.ndarray, new: np.ndarray
-) -> None:
-    """Propagate the columns of `x` (n, columns) over step k; the last column is the defect."""
+@compiled(**INLINED)
+def _add(row: np.ndarray, factor: float, total: np.ndarray) -> None:
+    for c in range(len(row)):
+        total[c] += factor * row[c]
+
+
+@compiled(**INLINED)
+def _advance(by: np.ndarray, nodes: np.ndarray, x: np.ndarray, new: np.ndarray) -> None:
+    """Propagate the columns of `x` (n, columns) over a step; the last column is the defect.
+
+    by: (n, n + p + 1), of the step; nodes: (n,), at its end.
+    """
     n, n_columns = x.shape
-    n_start = n_columns - (maps.shape[4] - n)
+    n_start = n_columns - (by.shape[1] - n)
     for j in range(n):
-        new[j] = 0.0
+        for c in range(n_start):
+            new[j, c] = 0.0
+        for c in range(n_start, n_columns):
+            new[j, c] = by[j, n + c - n_start]
+        new[j, n_columns - 1] -= nodes[j]
         for v in range(n):
-            slope = maps[p, w, k, j, v]  # read once for all columns, which then fill a vector
-            for c in range(n_columns):
-                new[j, c] += slope * x[v, c]
-        for c in range(n_start, n_columns - 1):
-            new[j, c] += maps[p, w, k, j, n + c - n_start]
-        new[j, n_columns - 1] += maps[p, w, k, j, maps.shape[4] - 1] - nodes[p, w, k + 1, j]
+            _add(x[v], by[j, v], new[j])
     for j in range(n):
         for c in range(n_columns):
             x[j, c] = new[j, c]
 
 
-@compiled
 def condense(
     maps: np.ndarray,
     nodes: np.ndarray,
@@ -78,19 +86,24 @@ def condense(
     Returns (points, windows, blocks, columns, columns).
     """
     n_points, n_windows, n_steps, n, width = maps.shape
-    n_columns = n_start + width - n
-    n_blocks = (n_steps + block) // block
+    n_columns, n_blocks = n_start + width - n, (n_steps + block) // block
     out = np.zeros((n_points, n_windows, n_blocks, n_columns, n_columns))
-    columns = np.empty((n_columns, block * n))
-    x = np.empty((n, n_columns))
-    new = np.empty((n, n_columns))
-    for p in range(n_points):
-        for w in range(n_windows):
-            for b in range(n_blocks):
+    columns, (x, new) = np.empty((n_columns, block * n)), np.empty((2, n, n_columns))
+    _condense(maps, nodes, data, weights, block, n_start, out, columns, x, new)
+    return out
+
+
+@compiled(**SUMS)
+def _condense(maps, nodes, data, weights, block, n_start, out, columns, x, new):
+    n_samples, (n, n_columns) = nodes.shape[2], x.shape
+    for p in range(len(maps)):
+        for w in range(maps.shape[1]):
+            for b in range(out.shape[2]):
                 first = b * block
-                last = min(first + block, n_steps + 1)
-                x[:] = 0.0
+                last = min(first + block, n_samples)
                 for j in range(n):
+                    for c in range(n_columns):
+                        x[j, c] = 0.0
                     if n_start:
                         x[j, j] = 1.0
                     else:
@@ -104,22 +117,25 @@ def condense(
                             nodes[p, w, k, j] - data[p, w, k, j]
                         )
                     if k + 1 < last:
-                        _advance(maps, nodes, p, w, k, x, new)
+                        _advance(maps[p, w, k], nodes[p, w, k + 1], x, new)
                 _triangle(columns, (last - first) * n, out[p, w, b])
-    return out
 
 
-@compiled
 def triangles(rows: np.ndarray) -> np.ndarray:
     """R of QR decompositions, (problems, size, size), of rows (problems, rows, size)."""
     n_problems, n_rows, size = rows.shape
-    out, columns = np.zeros((n_problems, size, size)), np.empty((size, n_rows))
-    for p in range(n_problems):
-        for r in range(n_rows):
-            for c in range(size):
-                columns[c, r] = rows[p, r, c]
-        _triangle(columns, n_rows, out[p])
+    out = np.zeros((n_problems, size, size))
+    _triangles(rows, np.empty((size, n_rows)), out)
     return out
+
+
+@compiled(**SUMS)
+def _triangles(rows, columns, out):
+    for p in range(len(rows)):
+        for r in range(rows.shape[1]):
+            for c in range(rows.shape[2]):
+                columns[c, r] = rows[p, r, c]
+        _triangle(columns, rows.shape[1], out[p])
 
 
 @compiled(fastmath={"reassoc", "contract"})
