@@ -60,6 +60,24 @@ def reach_of(d, row, factor):
 
 
 @compiled(inline="always")
+def _place(s, here, inputs, position, first, h, leads, sums, columns):
+    """Columns at stage s: the state, then the inputs, at `position` and from sample `first`."""
+    d, last = len(here), inputs.shape[1] - 1
+    for m in range(inputs.shape[2]):
+        for i in range(LANES):
+            sample = first + i if first + i < last else last
+            columns[d + m, i] = inputs[position, sample, m]
+    for j in range(d):
+        for i in range(LANES):
+            columns[j, i] = here[j, i]
+        for earlier in range(s):
+            lead = leads[s, earlier]
+            if lead != 0.0:
+                for i in range(LANES):
+                    columns[j, i] += lead * h[i] * sums[earlier, j, i]
+
+
+@compiled(inline="always")
 def _sum_products(s, columns, table, product, target, weight, values, sums):
     """Values of the products, and their weighted sums, at stage s."""
     one = len(columns) - 1
@@ -76,38 +94,6 @@ def _sum_products(s, columns, table, product, target, weight, values, sums):
     for e in range(len(product)):
         for i in range(LANES):
             sums[s, target[e], i] += weight[e] * values[product[e], i]
-
-
-@compiled(inline="always")
-def _stages(
-    here, inputs, place, first, h, leads, weights, places, table, product, target, weight, columns,
-    values, sums, total,
-):  # fmt: skip
-    """The stages of one step from `here`; its end goes to `total`, both (d, lanes).
-
-    place, first: of the step and the first lane among the inputs.
-    """
-    d, last = len(here), inputs.shape[1] - 1
-    for j in range(d):
-        for i in range(LANES):
-            total[j, i] = here[j, i]
-    for s in range(4):
-        for m in range(inputs.shape[2]):
-            for i in range(LANES):
-                sample = first + i if first + i < last else last
-                columns[d + m, i] = inputs[place + places[s], sample, m]
-        for j in range(d):
-            for i in range(LANES):
-                columns[j, i] = here[j, i]
-            for earlier in range(s):
-                lead = leads[s, earlier]
-                if lead != 0.0:
-                    for i in range(LANES):
-                        columns[j, i] += lead * h[i] * sums[earlier, j, i]
-        _sum_products(s, columns, table, product, target, weight, values, sums)
-        for j in range(d):
-            for i in range(LANES):
-                total[j, i] += weights[s] * h[i] * sums[s, j, i]
 
 
 @compiled(inline="always")
@@ -203,13 +189,13 @@ def _advance(
             for j in range(d):
                 here[j, i] = states[k, j]
         for place in range(0, len(inputs) - 1, stride):
-            _stages(
-                here, inputs, place, first, h, leads, weights, places, table, product, target,
-                weight, columns, values, sums, total,
-            )  # fmt: skip
+            for s in range(4):
+                _place(s, here, inputs, place + places[s], first, h, leads, sums, columns)
+                _sum_products(s, columns, table, product, target, weight, values, sums)
             for j in range(d):
-                for i in range(LANES):
-                    here[j, i] = total[j, i]
+                for s in range(4):
+                    for i in range(LANES):
+                        here[j, i] += weights[s] * h[i] * sums[s, j, i]
             if n_columns:
                 _gains(sums, row, factor, leads, weights, h, gains, by_state)
                 _carry(by, by_state, reach, place == 0, total)

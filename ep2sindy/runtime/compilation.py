@@ -51,6 +51,10 @@ LOOPS: dict[str, Any] = {
     **GIVEN_ARRAYS,
 }
 
+# The same for kernels that only kernels call, from several places: they are compiled once and then
+# inlined. Where there is one place, `inline="always"` is faster to compile.
+INNER = {**LOOPS, "no_cpython_wrapper": True, "forceinline": True}
+
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
     """Compile by `numba.njit` with a cache on disk: `@compiled` or `@compiled(inline="always")`.
