@@ -39,6 +39,9 @@ def _separate_arrays() -> dict[str, Any]:
 
 SEPARATE_ARRAYS = _separate_arrays()
 
+# Options of kernels whose sums may be taken in any order, which lets them fill the vector units.
+REORDERED = {"fastmath": {"reassoc", "contract"}, "error_model": "numpy", **SEPARATE_ARRAYS}
+
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
     """Compile by `numba.njit` with a cache on disk: `@compiled` or `@compiled(inline="always")`.
