@@ -59,8 +59,8 @@ class Bootstraps:
         The terms are chosen among the usable `terms`.
         """
         if self.n == 0:
-            products = problem.train_products
-            return products[np.triu_indices(len(products))][None], terms[None]
+            triangle = [row[k:] for k, row in enumerate(problem.train_products)]
+            return np.concatenate(triangle)[None], terms[None]
         if self.block > 1 and len(problem.trajectories) > 1:
             raise ValueError(
                 f"blocks of {self.block} would cross from one trajectory to the next: "

@@ -133,7 +133,9 @@ class ParetoFront:
     def with_scores(self, scores: Float[np.ndarray, " candidates"]) -> ParetoFront:
         """Copy of the front whose candidates have these scores."""
         pairs = zip(self.candidates, scores.tolist(), strict=True)
-        return replace(self, candidates=[replace(each, score=score) for each, score in pairs])
+        # `replace` would look at each of hundreds of fields one by one.
+        scored = [Candidate(**(vars(each) | {"score": score})) for each, score in pairs]
+        return replace(self, candidates=scored)
 
     @property
     def errors(self) -> Float[np.ndarray, " candidates"]:
