@@ -11,15 +11,15 @@ from ep2sindy.discovery import pointwise as module
 from ep2sindy.discovery.point_kernels import (
     add_steps,
     alike,
-    all_usable,
     differentiate,
-    fill_products,
     fill_running_sums,
     smooth,
 )
 from ep2sindy.discovery.point_search import PointSearch, _filter, compiled_points
 from ep2sindy.discovery.pointwise import pointwise
 from ep2sindy.library.library import named_terms
+from ep2sindy.regression.gram_kernels import all_usable
+from ep2sindy.regression.row_kernels import fill_products
 from ep2sindy.runtime.parallel import Serial
 from ep2sindy.signals.smoothers import difference
 
@@ -197,7 +197,7 @@ def test_running_sums_give_the_sums_of_weighted_products() -> None:
     first, second = np.triu_indices(4)
     plain = counts @ (rows[first] * rows[second]).T
     products = np.empty((10, n_rows))
-    fill_products(rows, products)
+    fill_products(rows, 0, n_rows, products)
     np.testing.assert_allclose(counts @ products.T, plain, rtol=1e-14)
     padded = np.pad(counts, ((0, 0), (1, 1)))
     draw, place = np.nonzero(padded[:, :-1] - padded[:, 1:])

@@ -70,9 +70,9 @@ def test_gram_matrix_is_the_weighted_product_of_unit_columns() -> None:
     assert np.diag(problem.train_gram.xx[0]) == pytest.approx(1.0)
     counts = rng.integers(0, 3, size=30).astype(float)
     repeated = np.repeat(theta / np.linalg.norm(theta, axis=0), counts.astype(int), axis=0)
-    assert np.allclose(
-        problem.resampled_grams(counts[None]).xx[0], repeated.T @ repeated, atol=1e-14
-    )
+    (sums,) = problem.resampled_sums(counts[None])
+    plain = np.column_stack([repeated, np.repeat(problem.train_rows[:, 3], counts.astype(int))])
+    assert np.allclose(sums, (plain.T @ plain)[np.triu_indices(4)], atol=1e-14)
 
 
 def test_columns_at_the_edge_of_the_number_format_keep_finite_norms() -> None:
@@ -198,7 +198,7 @@ def test_a_long_record_in_blocks_gives_the_same_regression(monkeypatch: pytest.M
     for module in (rows, differential):
         monkeypatch.setattr(module, "MOST_ROWS", 300)
     for one, other in zip(whole, method.search_equations(Task(runs, library), rng=0), strict=True):
-        assert "train_rows" not in vars(other.front.rows)  # no scaled copy of all rows was made
+        assert "train_columns" not in vars(other.front.rows)  # no scaled copy of all rows was made
         assert one.supports.masks.tolist() == other.supports.masks.tolist()
         for a, b in zip(one.front.candidates, other.front.candidates, strict=True):
             assert a.terms == b.terms

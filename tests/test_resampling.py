@@ -48,8 +48,9 @@ def test_bootstraps_draw_neighbours_together() -> None:
     # A block of all training rows, drawn whole: every draw is the training set itself.
     n_train = len(problem.train_rows)
     whole = Bootstraps(n=2, n_culled=0, smallest=1.0, largest=1.0, block=n_train)
-    grams, _ = whole.draw(problem, terms, np.random.default_rng(0))
-    np.testing.assert_allclose(grams.xx, np.repeat(problem.train_gram.xx, 2, axis=0), rtol=1e-12)
+    sums, _ = whole.draw(problem, terms, np.random.default_rng(0))
+    once = problem.train_products[np.triu_indices(len(problem.train_products))]
+    np.testing.assert_allclose(sums, np.array([once, once]), rtol=1e-12, atol=1e-14)
 
 
 def test_blocks_never_cross_trajectories() -> None:

@@ -6,8 +6,8 @@ from sklearn.linear_model import Lasso, lars_path_gram
 
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.regression.rows import Grams, RegressionRows
-from ep2sindy.regression.search_kernels import lasso_supports
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.search_kernels import lasso_path
 from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, BestSubset, Search
 
 SEARCHES = [AdaptiveLasso(), STLSQ(), BestSubset(max_terms=8)]
@@ -32,7 +32,9 @@ def test_lasso_path_matches_an_independent_implementation(seed: int) -> None:
     xx, xy, _ = random_gram(9, seed, correlation=1.0)
     _, _, path = lars_path_gram(xy, xx, n_samples=200, method="lasso")
     at_knots = {tuple(np.flatnonzero(column)) for column in path.T}
-    found = {tuple(np.flatnonzero(m)) for m in lasso_supports(xx, xy, 9)}
+    masks, scratch = np.empty((80, 9), dtype=bool), (np.empty((9, 9)), np.empty((5, 9)))
+    n_masks = lasso_path(xx, xy, 9, *scratch, np.empty((2, 9), dtype=np.int64), masks, 0)
+    found = {tuple(np.flatnonzero(m)) for m in masks[:n_masks]}
     # The support between two knots is ours; at the knot itself a leaving term is zero already.
     assert at_knots <= found
     assert len(found) == len({tuple(c != 0) for c in (path[:, 1:] + path[:, :-1]).T}) + 1
@@ -158,11 +160,11 @@ def test_bootstraps_draw_whole_groups() -> None:
     problem = noisy_problem(np.ones(6))
     seen: list[np.ndarray] = []
 
-    def record(weights: np.ndarray) -> Grams:
+    def record(weights: np.ndarray) -> np.ndarray:
         seen.append(weights)
-        return problem.train_gram
+        return np.ones((len(weights), 28))
 
-    object.__setattr__(problem, "resampled_grams", record)
+    object.__setattr__(problem, "resampled_sums", record)
     Bootstraps(n=5).draw(problem, np.ones(6, dtype=bool), np.random.default_rng(0))
     assert len(seen[0]) == 5
     for drawn in seen[0]:

@@ -296,11 +296,11 @@ class Regression:
         fronts = [equation.front for equation in equations]
         choice = self.choose(fronts, task, progress=progress)
         found: list[Ambiguity] = []
-        for front in fronts:
+        for rows in dict.fromkeys(front.rows for front in fronts):
             # Known equations are not searched, so too few rows do no harm to them.
-            if not set(front.rows.equations) <= set(task.terms):
-                found += few_rows(front.rows)
-            found += ambiguities(front.rows)
+            if not set(rows.equations) <= set(task.terms):
+                found += few_rows(rows)
+            found += ambiguities(rows)
         return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(task.runs))
 
     def _identify_under(

@@ -7,14 +7,13 @@ terms, then targets, each contiguous in memory.
 
 import numpy as np
 
-from ep2sindy.regression.gram_kernels import independent_terms, solve_masks
+from ep2sindy.regression.gram_kernels import solve_masks
+from ep2sindy.regression.row_kernels import dot, spread
 from ep2sindy.regression.search_kernels import best_subsets
-from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
-
-FAST = {"fastmath": {"reassoc", "contract"}, "error_model": "numpy", **SEPARATE_ARRAYS}
+from ep2sindy.runtime.compilation import REORDERED, compiled
 
 
-@compiled(**FAST)
+@compiled(**REORDERED)
 def smooth(values, first, middle, last, out):
     """Write weighted sums over the window about each sample; at the ends, over the last full one.
 
@@ -36,7 +35,7 @@ def smooth(values, first, middle, last, out):
                 within[i] += middle[k] * moved[i]
 
 
-@compiled(**FAST)
+@compiled(**REORDERED)
 def differentiate(values, weights, out):
     """Write second-order differences. weights: (3, samples), of three neighbours of each sample."""
     last = values.shape[1] - 1
@@ -53,7 +52,7 @@ def differentiate(values, weights, out):
             out[v, last] += weights[k, last] * values[v, last - 2 + k]
 
 
-@compiled(**FAST)
+@compiled(**REORDERED)
 def fill_rows(known, table, rates, train, test, train_rows, test_rows, scale):
     """Write the scaled columns of terms and targets at the training and the held-out samples.
 
@@ -86,18 +85,7 @@ def fill_rows(known, table, rates, train, test, train_rows, test_rows, scale):
             test_rows[j, i] = column[test[i]] * share
 
 
-@compiled(**FAST)
-def fill_products(rows, products):
-    """Write the product of every pair of columns: (pairs, rows)."""
-    pair = 0
-    for a in range(len(rows)):
-        for b in range(a, len(rows)):
-            for i in range(rows.shape[1]):
-                products[pair, i] = rows[a, i] * rows[b, i]
-            pair += 1
-
-
-@compiled(**FAST)
+@compiled(**REORDERED)
 def fill_running_sums(rows, means, sums):
     """Write the sums over the rows before of the products of all pairs, less their means.
 
@@ -117,7 +105,7 @@ def fill_running_sums(rows, means, sums):
                 pair += 1
 
 
-@compiled(**FAST)
+@compiled(**REORDERED)
 def add_steps(starts, places, steps, running, means, n_drawn, sums):
     """Write the sums of products of every draw, from the places where its weights change.
 
@@ -133,54 +121,23 @@ def add_steps(starts, places, steps, running, means, n_drawn, sums):
                 sums[d, pair] += steps[k] * running[places[k], pair]
 
 
-@compiled(**FAST)
-def _product(left, right):
-    """Scalar product."""
-    total = 0.0
-    for i in range(len(left)):
-        total += left[i] * right[i]
-    return total
-
-
-@compiled(**FAST)
+@compiled(**REORDERED)
 def gram(rows, out):
     """Write the products of all columns: (columns, columns)."""
     for a in range(len(rows)):
         for b in range(a, len(rows)):
-            out[a, b] = out[b, a] = _product(rows[a], rows[b])
+            out[a, b] = out[b, a] = dot(rows[a], rows[b])
 
 
-@compiled
-def all_usable(gram, order, same):
-    """True if all is finite, and no term is zero, repeats another, or combines others.
-
-    order: terms, the simplest first. same: 1 - |cosine| below which two terms are the same.
-    """
-    n_terms = len(order)
-    for a in range(len(gram)):
-        for b in range(len(gram)):
-            if not np.isfinite(gram[a, b]):
-                return False
-    xx = np.empty((n_terms, n_terms))
-    for a in range(n_terms):
-        for b in range(n_terms):
-            xx[a, b] = gram[order[a], order[b]]
-            if a != b and abs(xx[a, b]) > 1.0 - same:
-                return False
-        if xx[a, a] <= 0.0:
-            return False
-    return independent_terms(xx).all()
-
-
-@compiled(**FAST)
+@compiled(**REORDERED)
 def alike(states, limit):
     """True if two states are correlated by more than `limit`."""
     unit = np.empty(states.shape)
     for s in range(len(states)):
         unit[s] = states[s] - states[s].mean()
-        unit[s] /= np.sqrt(_product(unit[s], unit[s]))
+        unit[s] /= np.sqrt(dot(unit[s], unit[s]))
         for r in range(s):
-            if abs(_product(unit[r], unit[s])) >= limit:
+            if abs(dot(unit[r], unit[s])) >= limit:
                 return True
     return False
 
@@ -203,33 +160,6 @@ def _write_mask(code, mask):
         mask[j] = (code >> j) & 1 == 1
         size += mask[j]
     return size
-
-
-@compiled
-def scale_draws(sums, kept, xx, xy, yy, scale):
-    """Write the Gram matrices of every draw, its kept terms scaled to unit norm.
-
-    sums: (draws, pairs). kept: (draws, terms). xx, xy, yy, scale: as in `Resamples`.
-    """
-    n_terms = kept.shape[1]
-    n_columns = n_terms + xy.shape[1]
-    for d in range(len(sums)):
-        pair = 0
-        for a in range(n_columns):
-            if a < n_terms:
-                is_there = kept[d, a] and sums[d, pair] > 0.0
-                scale[d, a] = 1.0 / np.sqrt(sums[d, pair]) if is_there else 0.0
-            for b in range(a, n_columns):
-                if b < n_terms:
-                    xx[d, a, b] = xx[d, b, a] = sums[d, pair]
-                elif a < n_terms:
-                    xy[d, b - n_terms, a] = sums[d, pair] * scale[d, a]
-                elif a == b:
-                    yy[d, a - n_terms] = sums[d, pair]
-                pair += 1
-        for a in range(n_terms):
-            for b in range(n_terms):
-                xx[d, a, b] *= scale[d, a] * scale[d, b]
 
 
 @compiled
@@ -299,7 +229,7 @@ def best_of_sizes(codes, train, judge, best):
                     most, best[e, size] = explained, code
 
 
-@compiled(**FAST)
+@compiled(**REORDERED)
 def _residual(rows, target, coef, out):
     """Write target - sum of coef times column; returns its sum of squares."""
     out[:] = rows[target]
@@ -308,22 +238,10 @@ def _residual(rows, target, coef, out):
             row = rows[a]
             for i in range(len(out)):
                 out[i] -= coef[a] * row[i]
-    return _product(out, out)
+    return dot(out, out)
 
 
-@compiled(**FAST)
-def _spread(row):
-    """Sum of squares about the mean."""
-    mean, squares = 0.0, 0.0
-    for i in range(len(row)):
-        mean += row[i]
-    mean /= len(row)
-    for i in range(len(row)):
-        squares += (row[i] - mean) ** 2
-    return squares
-
-
-@compiled(**FAST)
+@compiled(**REORDERED)
 def fit_best(best, gram, train_rows, test_rows, refined, coef, squares, r2_train, r2_test):
     """Fit the best support of every size to the training rows, and score it on both.
 
@@ -338,8 +256,8 @@ def fit_best(best, gram, train_rows, test_rows, refined, coef, squares, r2_train
     left, left_test = np.empty(train_rows.shape[1]), np.empty(test_rows.shape[1])
     for e in range(n_equations):
         y = n_terms + e
-        total = _spread(train_rows[y])
-        total_test = _spread(test_rows[y])
+        total = spread(train_rows[y])
+        total_test = spread(test_rows[y])
         for size in range(n_sizes):
             coef[e, size] = 0.0
             if best[e, size] < 0:
@@ -351,7 +269,7 @@ def fit_best(best, gram, train_rows, test_rows, refined, coef, squares, r2_train
             for _ in range(2):
                 _residual(train_rows, y, coef[e, size], left)
                 for a in range(n_terms):
-                    rhs[0, a] = _product(left, train_rows[a]) if mask[0, a] else 0.0
+                    rhs[0, a] = dot(left, train_rows[a]) if mask[0, a] else 0.0
                 step = solve_masks(xx, rhs, mask)[0]
                 coef[e, size] += step
                 if np.abs(step).max() <= refined * np.abs(coef[e, size]).max():

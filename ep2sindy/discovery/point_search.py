@@ -22,17 +22,14 @@ from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.point_kernels import (
     add_steps,
     alike,
-    all_usable,
     best_of_sizes,
     count_terms,
     differentiate,
-    fill_products,
     fill_rows,
     fill_running_sums,
     fit_best,
     fit_draws,
     gram,
-    scale_draws,
     smooth,
     supports_of_draws,
 )
@@ -40,6 +37,8 @@ from ep2sindy.library.library import Library
 from ep2sindy.regression.ambiguity import SAME, row_limit, simplest_first
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.front import REFINED, front_order
+from ep2sindy.regression.gram_kernels import all_usable
+from ep2sindy.regression.row_kernels import fill_products, scale_draws
 from ep2sindy.regression.searches import MOST_WORK, BestSubset
 from ep2sindy.runtime.values import check_kind, check_list
 from ep2sindy.selection.criteria import EBIC, AICc, Fits, Knee
@@ -219,7 +218,7 @@ class CompiledPoints:
             add_steps(*places, running, means, self.draws.n_drawn, sums)
         else:
             products = np.empty((n_pairs, n_rows))
-            fill_products(rows.train, products)
+            fill_products(rows.train, 0, n_rows, products)
             sums = np.ascontiguousarray((products @ self.draws.weights).T)
         n_equations = n_columns - n_terms
         found = DrawnGrams(

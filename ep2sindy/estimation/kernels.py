@@ -15,9 +15,7 @@ take seconds more to compile.
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import LOOPS, compiled
-
-INLINED = {**LOOPS, "forceinline": True}  # a call would cost as much as the few numbers of a row
+from ep2sindy.runtime.compilation import INNER, LOOPS, compiled
 
 VECTOR = 4  # numbers; rows are padded to whole ones
 PIECE = 2**15  # numbers that wait for their product of matrices, few enough to stay in the cache
@@ -71,19 +69,19 @@ def _sensitivities(
                 slopes[k, i, c] = total[i, c]
 
 
-@compiled(**INLINED)
+@compiled(**INNER)
 def _add(row, factor, total):
     for c in range(len(row)):
         total[c] += factor * row[c]
 
 
-@compiled(**INLINED)
+@compiled(**INNER)
 def _copy(row, out):
     for c in range(len(out)):
         out[c] = row[c]
 
 
-@compiled(**INLINED)
+@compiled(**INNER)
 def _observe(i, residual, variance, state, cov, row, gain):
     """Update all rows with one sample of state i; returns the innovation's variance and its weight.
 
@@ -101,7 +99,7 @@ def _observe(i, residual, variance, state, cov, row, gain):
     return spread, weight
 
 
-@compiled(**INLINED)
+@compiled(**INNER)
 def _step(flow, miss, process, state, cov, ahead, row):
     """Write to `ahead` the rows of all states, propagated over one step."""
     d = len(flow)

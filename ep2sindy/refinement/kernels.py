@@ -9,10 +9,9 @@ the right-hand side.
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import LOOPS, compiled
+from ep2sindy.runtime.compilation import INNER, REORDERED, compiled
 
-SUMS = {**LOOPS, "fastmath": {"reassoc", "contract"}}
-INLINED = {**SUMS, "forceinline": True}  # a call would cost as much as the few numbers of a row
+INLINED = {**INNER, **REORDERED}  # a call would cost as much as the few numbers of a row
 
 
 @compiled(**INLINED)
@@ -93,7 +92,7 @@ def condense(
     return out
 
 
-@compiled(**SUMS)
+@compiled(**REORDERED)
 def _condense(maps, nodes, data, weights, block, n_start, out, columns, x, new):
     n_samples, (n, n_columns) = nodes.shape[2], x.shape
     for p in range(len(maps)):
@@ -129,7 +128,7 @@ def triangles(rows: np.ndarray) -> np.ndarray:
     return out
 
 
-@compiled(**SUMS)
+@compiled(**REORDERED)
 def _triangles(rows, columns, out):
     for p in range(len(rows)):
         for r in range(rows.shape[1]):

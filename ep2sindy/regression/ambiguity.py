@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.library import Library
-from ep2sindy.regression.gram_kernels import independent_terms
+from ep2sindy.regression.gram_kernels import all_usable, independent_terms
 from ep2sindy.regression.rows import RegressionRows
 
 # Bounds on one minus the cosine between two columns: at 1e-10 they differ by 1e-5 of their size.
@@ -49,6 +49,8 @@ def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
     A term is simpler if its degree is lower, or if it is earlier in the library.
     """
     xx = problem.train_gram.xx[0]
+    if all_usable(xx, simplest_first(problem.library), SAME):
+        return np.ones(len(xx), dtype=np.bool_)
     usable = _distinct(problem.library, xx)
     for j, parts in _combinations(problem.library, lambda: problem.train_theta, xx):
         usable[j] = len(parts) > MAX_PARTS
@@ -103,6 +105,8 @@ def find_ambiguities(
     theta: returns the columns of the library's terms, of unit norm or zero; it is called only where
     the Gram matrix xx does not tell.
     """
+    if all_usable(xx, simplest_first(library), ALIKE):
+        return ()
     return (*_zero(library, xx), *_alike(library, xx), *_dependent(library, theta, xx))
 
 

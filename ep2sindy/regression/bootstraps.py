@@ -7,16 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.regression.ambiguity import row_limit, usable_terms
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
-from ep2sindy.regression.rows import Grams, RegressionRows
-from ep2sindy.regression.searches import Search
+from ep2sindy.regression.row_kernels import count_drawn, scale_draws
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.search_kernels import key_words, pool_masks
+from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, Search
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.runtime.values import set_counts
+
+WORK_AT_ONCE = 1_000_000  # cubes of terms, over the draws whose searches are one call
 
 
 @dataclass(frozen=True)
@@ -48,25 +53,26 @@ class Bootstraps:
 
     def draw(
         self, problem: RegressionRows, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
-    ) -> tuple[Grams, Bool[np.ndarray, "draws terms"]]:
-        """Gram matrices and kept terms of every bootstrap, chosen among the usable `terms`."""
+    ) -> tuple[Float[np.ndarray, "draws pairs"], Bool[np.ndarray, "draws terms"]]:
+        """Sums of products (`resampled_sums`) and kept terms of every bootstrap.
+
+        The terms are chosen among the usable `terms`.
+        """
         if self.n == 0:
-            return problem.train_gram, terms[None]
+            triangle = [row[k:] for k, row in enumerate(problem.train_products)]
+            return np.concatenate(triangle)[None], terms[None]
         if self.block > 1 and len(problem.trajectories) > 1:
             raise ValueError(
                 f"blocks of {self.block} would cross from one trajectory to the next: "
                 f"{len(problem.trajectories)} trajectories came; use block=1"
             )
         group = problem.groups[~problem.test]
-        if (np.diff(group) > 0).all():  # each row alone, which is told at a tenth of the cost
-            group = np.arange(len(group))
-        else:
-            _, group = np.unique(group, return_inverse=True)
-        n_groups = int(group.max()) + 1
-        counts, kept = self.draw_groups(n_groups, terms, rng)
-        if n_groups < len(group):
-            counts = counts[:, group]
-        return problem.resampled_grams(counts), kept
+        if (group[1:] > group[:-1]).all():  # each row alone, which is told at a tenth of the cost
+            counts, kept = self.draw_groups(len(group), terms, rng)
+            return problem.resampled_sums(counts), kept
+        _, group = np.unique(group, return_inverse=True)
+        counts, kept = self.draw_groups(int(group.max()) + 1, terms, rng)
+        return problem.resampled_sums(counts.take(group, axis=1)), kept
 
     def draw_groups(
         self, n_groups: int, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
@@ -78,13 +84,15 @@ class Bootstraps:
                 f"n_culled must leave a term: {self.n_culled} of {len(usable)} would go; lower it "
                 "or use a larger library"
             )
-        counts = np.empty((self.n, n_groups))
-        kept = np.repeat(terms[None], self.n, axis=0)
+        sizes, first, culled = [], [], np.empty((self.n, self.n_culled), dtype=np.int64)
         for k in range(self.n):
-            size = max(1, round(rng.uniform(self.smallest, self.largest) * n_groups))
-            counts[k] = moving_block_counts(n_groups, n_drawn=size, block=self.block, rng=rng)
-            kept[k, rng.permutation(usable)[: self.n_culled]] = False
-        return counts, kept
+            share = self.smallest + (self.largest - self.smallest) * rng.random()
+            sizes.append(max(1, round(share * n_groups)))
+            first.append(draw_blocks(n_groups, n_drawn=sizes[-1], block=self.block, rng=rng))
+            culled[k] = rng.permutation(usable)[: self.n_culled]
+        kept = np.repeat(terms[None], self.n, axis=0)
+        kept[np.arange(self.n)[:, None], culled] = False
+        return _counts(first, sizes, n_rows=n_groups, block=self.block), kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,21 +116,25 @@ class Resamples:
     """Bootstraps of one problem, with columns scaled to unit norm in every draw.
 
     xx: (draws, terms, terms), xy: (draws, equations, terms), yy: (draws, equations); a term that
-    is missing from a draw is a column of zeros. at_hand: (draws, terms), true for terms in the
-    draw that are not zero on its rows. scale: factors from the problem's scaled columns to these.
-    kept: (draws, terms), true for terms that were not culled. counted: False for one search on
-    all rows. largest: largest number of terms that the number of rows allows in a support.
+    is missing from a draw is a column of zeros. scale: factors from the problem's scaled columns to
+    these, zero for terms that are culled or zero on the draw's rows. kept: (draws, terms), true for
+    terms that were not culled. counted: False for one search on all rows. largest: largest number
+    of terms that the number of rows allows in a support.
     """
 
     equations: Sequence[str]
     xx: Float[np.ndarray, "draws terms terms"]
     xy: Float[np.ndarray, "draws equations terms"]
     yy: Float[np.ndarray, "draws equations"]
-    at_hand: Bool[np.ndarray, "draws terms"]
     scale: Float[np.ndarray, "draws terms"]
     kept: Bool[np.ndarray, "draws terms"]
     counted: bool
     largest: int
+
+    @cached_property
+    def n_kept(self) -> Int[np.ndarray, " terms"]:
+        """Number of draws that kept each term; one instead of zero, to divide by."""
+        return np.maximum(self.kept.sum(axis=0), 1)
 
     def search(
         self,
@@ -137,14 +149,23 @@ class Resamples:
         allowed: terms that the equation may have; None for all. The others are searched as culled
         ones are, as columns of zeros.
         """
-        draws = zip(self.xx, self.xy[:, equation], self.yy[:, equation].tolist(), strict=True)
-        found = []
-        for xx, xy, yy in draws:
-            if allowed is not None and not allowed.all():
-                xx, xy = xx * (allowed[:, None] & allowed), xy * allowed
-            found.append(search.supports(xx, xy, yy))
-            advance(1)
-        if self.largest >= self.kept.shape[1]:
+        xx, xy = self.xx, np.ascontiguousarray(self.xy[:, equation])
+        yy = self.yy[:, equation]
+        if allowed is not None and not allowed.all():
+            xx, xy = xx * (allowed[:, None] & allowed), xy * allowed
+        n_draws, n_terms = xy.shape
+        in_one_call = search if isinstance(search, AdaptiveLasso | STLSQ) else None
+        # Between two reports of progress lies a fraction of a second.
+        step = max(1, WORK_AT_ONCE // n_terms**3) if in_one_call else 1
+        found: list[Bool[np.ndarray, "_ terms"]] = []
+        for start in range(0, n_draws, step):
+            some = slice(start, start + step)
+            if in_one_call:
+                found += in_one_call.supports_of_draws(xx[some], xy[some], yy[some])
+            else:
+                found.append(search.supports(xx[start], xy[start], float(yy[start])))
+            advance(min(step, n_draws - start))
+        if self.largest >= n_terms:
             return found
         return [masks[masks.sum(axis=1) <= self.largest] for masks in found]
 
@@ -159,11 +180,11 @@ class Resamples:
         found: the result of `search`. A draw without a support of that size fits the given one,
         restricted to the terms in the draw. Coefficients are those of the problem's scaled columns.
         """
-        coef = np.empty(self.at_hand.shape)
+        coef = np.empty(self.scale.shape)
         for k, masks in enumerate(found):
             same_size = masks[masks.sum(axis=1) == support.sum()]
             if not len(same_size):
-                same_size = (support & self.at_hand[k])[None]
+                same_size = (support & (self.scale[k] > 0.0))[None]
             xx, xy = self.xx[k], self.xy[k, equation]
             fits = fit_masks(xx, xy, same_size)
             coef[k] = fits[int(np.argmax(explained_squares(fits, xx, xy)))] * self.scale[k]
@@ -180,23 +201,22 @@ def draw_resamples(
     if bootstraps.n:
         problem.check_grams(bootstraps.n)  # before the work on terms, which may take minutes
     usable = usable_terms(problem)
-    grams, kept = bootstraps.draw(problem, usable, rng)
-    # Resampling changes the norms, so columns are scaled to unit norm again; then the search does
-    # not depend on units or draws. A culled term becomes a column of zeros.
-    diagonal = np.diagonal(grams.xx, axis1=1, axis2=2)
-    at_hand = kept & (diagonal > 0.0)
-    scale = at_hand / np.sqrt(np.where(at_hand, diagonal, 1.0))
-    return Resamples(
+    sums, kept = bootstraps.draw(problem, usable, rng)
+    n_draws, n_terms, n_equations = *kept.shape, len(problem.equations)
+    draws = Resamples(
         equations=problem.equations,
-        xx=grams.xx * scale[:, :, None] * scale[:, None, :],
-        xy=grams.xy * scale[:, None, :],
-        yy=grams.yy,
-        at_hand=at_hand,
-        scale=scale,
+        xx=np.empty((n_draws, n_terms, n_terms)),
+        xy=np.empty((n_draws, n_equations, n_terms)),
+        yy=np.empty((n_draws, n_equations)),
+        scale=np.empty((n_draws, n_terms)),
         kept=kept,
         counted=bootstraps.n > 0,
         largest=row_limit(int(usable.sum()), problem.n_train),
     )
+    # Resampling changes the norms, so columns are scaled to unit norm again; then the search does
+    # not depend on units or draws. A culled term becomes a column of zeros.
+    scale_draws(sums, kept, draws.xx, draws.xy, draws.yy, draws.scale)
+    return draws
 
 
 def pooled_supports(
@@ -213,25 +233,18 @@ def pooled_supports(
 
 def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ terms"]]) -> Supports:
     """Count the supports and terms that `search` found over the draws of one equation."""
-    n_terms = draws.kept.shape[1]
-    source = np.repeat(np.arange(len(found)), [len(masks) for masks in found])
-    masks = np.concatenate(found)
-    sizes = masks.sum(axis=1)
-    included = np.zeros((len(found), n_terms + 1, n_terms), dtype=np.bool_)
-    rows, columns = np.nonzero(masks)
-    included[source[rows], sizes[rows], columns] = True
-    # One byte string per mask: sorting those is much faster than sorting rows.
-    packed = np.packbits(masks, axis=1)
-    keys = packed.view(f"S{packed.shape[1]}")[:, 0]
-    _, first, which = np.unique(keys, return_index=True, return_inverse=True)
-    found_in = np.zeros((len(first), len(found)), dtype=np.bool_)
-    found_in[which, source] = True
-    order = np.argsort(sizes[first], kind="stable")
+    masks, n_terms = np.concatenate(found), draws.kept.shape[1]
+    ends = np.cumsum([len(each) for each in found])
+    keys = np.empty((len(masks), key_words(n_terms)), dtype=np.int64)
+    places = np.empty((3, len(masks)), dtype=np.int64)
+    held, last = np.empty((2, n_terms + 1, n_terms), dtype=np.int64)
+    n_distinct = pool_masks(masks, ends, keys, places, held, last)
+    order, n_draws = places[0, :n_distinct], places[1]
     supports = Supports(
         equation=draws.equations[equation],
-        masks=masks[first[order]],
-        share=found_in.mean(axis=1)[order],
-        inclusion=included.sum(axis=0) / np.maximum(draws.kept.sum(axis=0), 1),
+        masks=masks[order],
+        share=n_draws[order] / len(found),
+        inclusion=held / draws.n_kept,
     )
     if draws.counted:
         return supports
@@ -245,7 +258,7 @@ def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ te
 
 def moving_block_counts(
     n_rows: int, *, n_drawn: int, block: int, rng: np.random.Generator
-) -> Int[np.ndarray, " rows"]:
+) -> Float[np.ndarray, " rows"]:
     """Number of times each row occurs in a draw of `n_drawn` rows, made of runs of `block` rows.
 
     A row may stand for a group of rows that are drawn together.
@@ -254,13 +267,26 @@ def moving_block_counts(
     Raises ValueError for a block that is not between one row and all of them.
     Source: Kuensch 1989, doi:10.1214/aos/1176347265.
     """
+    first = draw_blocks(n_rows, n_drawn=n_drawn, block=block, rng=rng)
+    return _counts([first], [n_drawn], n_rows=n_rows, block=block)[0]
+
+
+def draw_blocks(
+    n_rows: int, *, n_drawn: int, block: int, rng: np.random.Generator
+) -> Int[np.ndarray, " runs"]:
+    """First row of each run of `moving_block_counts`."""
     if not 1 <= block <= n_rows:
         raise ValueError(
             f"a block must hold between one and all {n_rows} groups of training rows: {block} "
             "came; shorten it, or use more data"
         )
-    first = rng.integers(n_rows - block + 1, size=-(-n_drawn // block))
-    if block == 1:
-        return np.bincount(first, minlength=n_rows)
-    drawn = (first[:, None] + np.arange(block)).ravel()[:n_drawn]
-    return np.bincount(drawn, minlength=n_rows)
+    return rng.integers(n_rows - block + 1, size=-(-n_drawn // block))
+
+
+def _counts(
+    first: Sequence[Int[np.ndarray, " _"]], sizes: Sequence[int], *, n_rows: int, block: int
+) -> Float[np.ndarray, "draws rows"]:
+    """How often each row occurs in every draw, from its runs and its number of rows."""
+    counts, ends = np.empty((len(first), n_rows)), np.cumsum([len(runs) for runs in first])
+    count_drawn(np.concatenate(first), ends, np.array(sizes), block, counts)
+    return counts

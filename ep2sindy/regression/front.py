@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
-from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, solve_masks
+from ep2sindy.regression.gram_kernels import fit_masks, rank_masks, solve_masks
+from ep2sindy.regression.row_kernels import TILE, add_residuals, spread
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
@@ -132,7 +133,9 @@ class ParetoFront:
     def with_scores(self, scores: Float[np.ndarray, " candidates"]) -> ParetoFront:
         """Copy of the front whose candidates have these scores."""
         pairs = zip(self.candidates, scores.tolist(), strict=True)
-        return replace(self, candidates=[replace(each, score=score) for each, score in pairs])
+        # `replace` would look at each of hundreds of fields one by one.
+        scored = [Candidate(**(vars(each) | {"score": score})) for each, score in pairs]
+        return replace(self, candidates=scored)
 
     @property
     def errors(self) -> Float[np.ndarray, " candidates"]:
@@ -201,9 +204,12 @@ def fit_supports(
     problem: RegressionRows, equation: str, masks: Bool[np.ndarray, "supports terms"]
 ) -> list[Candidate]:
     """Fit given supports as in `fit_support`; coefficients of dependent terms are NaN."""
+    number = problem.equations.index(equation)
     unknown = np.full(len(masks), np.nan)
     nothing = np.full((len(problem.library) + 1, len(problem.library)), np.nan)
-    return _candidates(problem, Supports(equation, masks, unknown, nothing))
+    supports = Supports(equation, masks, unknown, nothing)
+    fits = _fit(problem, number, masks, _spread(problem, number))
+    return _candidates(problem, supports, fits, range(len(masks)))
 
 
 def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1) -> ParetoFront:
@@ -214,26 +220,22 @@ def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1)
     with linearly dependent terms. With noise in the library a wrong support can score slightly
     better than the true one of the same size; a depth of 3 keeps both for a later selection.
     """
-    n_terms = len(problem.library)
-    equation = problem.equations.index(supports.equation)
+    depth, equation = check_count("depth", depth), problem.equations.index(supports.equation)
     sizes = supports.masks.sum(axis=1)
-    explained = _explain(problem, equation, supports.masks)
-    best = _best_of_each_size(sizes, explained, depth)
-    empty = np.zeros((1, n_terms), dtype=np.bool_)
+    explained, best = _rank(problem, equation, supports.masks, depth)
+    empty = np.zeros((1, len(problem.library)), dtype=np.bool_)
     chosen = Supports(
         equation=supports.equation,
         masks=np.concatenate([empty, supports.masks[best]]),
-        share=np.append(supports.share[~supports.masks.any(axis=1)].sum(), supports.share[best]),
+        share=np.append(supports.share[sizes == 0].sum(), supports.share[best]),
         inclusion=supports.inclusion,
     )
-    candidates = _candidates(problem, chosen)
-    order = front_order(
-        np.array([c.n_terms for c in candidates]),
-        np.array([-c.r2 for c in candidates]),
-        depth=depth,
-    )
-    cloud = _cloud(problem, equation, sizes, explained)
-    return ParetoFront(supports.equation, [candidates[k] for k in order], problem, cloud)
+    about_mean = _spread(problem, equation)
+    fits = _fit(problem, equation, chosen.masks, about_mean)
+    order = front_order(np.append(0, sizes[best]), -fits.r2, depth=depth)
+    candidates = _candidates(problem, chosen, fits, order)
+    cloud = _cloud(problem, equation, about_mean, sizes, explained)
+    return ParetoFront(supports.equation, candidates, problem, cloud)
 
 
 def front_order(
@@ -243,7 +245,8 @@ def front_order(
     depth = check_count("depth", depth)
     front: list[int] = []
     lowest = np.inf
-    for _, same_size in groupby(np.lexsort((errors, sizes)).tolist(), key=lambda k: sizes[k]):
+    of, ranks = sizes.tolist(), np.lexsort((errors, sizes)).tolist()
+    for _, same_size in groupby(ranks, key=of.__getitem__):
         ranked = list(same_size)[:depth]
         if errors[ranked[0]] < lowest:
             lowest = errors[ranked[0]]
@@ -251,71 +254,110 @@ def front_order(
     return front
 
 
-def _candidates(problem: RegressionRows, supports: Supports) -> list[Candidate]:
-    """Candidates fitted to the training rows, and scored on both training and held-out rows."""
+class Spread(NamedTuple):
+    """Sums of squares of a scaled target about its mean; that of held-out rows is NaN for none."""
+
+    train: float
+    test: float
+
+
+class RowFits(NamedTuple):
+    """Least-squares fits of supports to the training rows, in scaled columns, and their scores."""
+
+    coef: Float[np.ndarray, "supports terms"]
+    r2_train: Float[np.ndarray, " supports"]
+    r2_test: Float[np.ndarray, " supports"]
+
+    @property
+    def r2(self) -> Float[np.ndarray, " supports"]:
+        """R2 on held-out rows, or on the training rows if none are held out."""
+        return np.where(np.isnan(self.r2_test), self.r2_train, self.r2_test)
+
+
+def _spread(problem: RegressionRows, equation: int) -> Spread:
+    held_out = problem.test_target(equation)
+    return Spread(
+        train=spread(problem.train_target(equation)),
+        test=spread(held_out) if len(held_out) else float("nan"),
+    )
+
+
+def _candidates(
+    problem: RegressionRows, supports: Supports, fits: RowFits, chosen: Iterable[int]
+) -> list[Candidate]:
+    """Candidates of the chosen supports."""
     equation = problem.equations.index(supports.equation)
-    coef = _fit(problem, equation, supports.masks)
-    coef_SI = problem.coef_SI(coef, equation)
-    r2_train, r2_test = (_r2(problem, equation, coef, test=test) for test in (False, True))
-    return [
-        Candidate(
-            equation=supports.equation,
-            terms=tuple(problem.term_names[j] for j in columns),
-            coef=coef_SI[k, columns],
-            r2_train=float(r2_train[k]),
-            r2_test=float(r2_test[k]),
-            share=float(supports.share[k]),
-            inclusion=supports.inclusion[len(columns), columns],
+    coef_SI = problem.coef_SI(fits.coef, equation)
+    sizes = supports.masks.sum(axis=1)
+    of, columns = np.nonzero(supports.masks)
+    coef, inclusion = coef_SI[of, columns], supports.inclusion[sizes[of], columns]
+    names, ends = [problem.term_names[j] for j in columns.tolist()], np.cumsum(sizes).tolist()
+    r2_train, r2_test, share = (
+        fits.r2_train.tolist(),
+        fits.r2_test.tolist(),
+        supports.share.tolist(),
+    )
+    found = []
+    for k in chosen:
+        own = slice(ends[k - 1] if k else 0, ends[k])
+        found.append(
+            Candidate(
+                equation=supports.equation,
+                terms=tuple(names[own]),
+                coef=coef[own],
+                r2_train=r2_train[k],
+                r2_test=r2_test[k],
+                share=share[k],
+                inclusion=inclusion[own],
+            )
         )
-        for k, columns in enumerate(map(np.flatnonzero, supports.masks))
-    ]
+    return found
 
 
-def _explain(
-    problem: RegressionRows, equation: int, masks: Bool[np.ndarray, "supports terms"]
-) -> Float[np.ndarray, " supports"]:
+def _rank(
+    problem: RegressionRows, equation: int, masks: Bool[np.ndarray, "supports terms"], depth: int
+) -> tuple[Float[np.ndarray, " supports"], Int[np.ndarray, " best"]]:
     """Reduction of the target's sum of squares by each support, on the rows used for scoring.
 
-    Computed from Gram matrices only; NaN for linearly dependent terms.
+    Computed from Gram matrices only; NaN for linearly dependent terms. And the indices of the
+    `depth` supports that reduce it most of each size, ordered by size.
     """
-    train = problem.train_gram
+    train, n_terms = problem.train_gram, len(problem.library)
     judge = problem.test_gram if problem.test.any() else train
-    coef = fit_masks(train.xx[0], train.xy[0, equation], masks)
-    return explained_squares(coef, judge.xx[0], judge.xy[0, equation])
-
-
-def _best_of_each_size(
-    sizes: Int[np.ndarray, " supports"], explained: Float[np.ndarray, " supports"], depth: int
-) -> Int[np.ndarray, " best"]:
-    """Indices of the `depth` supports of least error of each size, ordered by size."""
-    order = np.lexsort((-explained, sizes))
-    order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
-    _, first, count = np.unique(sizes[order], return_index=True, return_counts=True)
-    rank = np.arange(len(order)) - np.repeat(first, count)
-    return order[rank < depth]
+    explained, best = np.empty(len(masks)), np.empty((n_terms + 1, depth), dtype=np.int64)
+    scratch = np.empty((n_terms, n_terms)), np.empty(n_terms), np.empty(n_terms, dtype=np.int64)
+    grams = train.xx[0], train.xy[0, equation], judge.xx[0], judge.xy[0, equation]
+    rank_masks(*grams, masks, *scratch, explained, best)
+    return explained, best[best >= 0]
 
 
 def _cloud(
     problem: RegressionRows,
     equation: int,
+    about_mean: Spread,
     sizes: Int[np.ndarray, " supports"],
     explained: Float[np.ndarray, " supports"],
 ) -> Cloud:
     """Sizes and errors of all supports.
 
-    The sum of squares about the mean is not zero here: `r2` would have raised before.
+    The sum of squares about the mean is not zero here: `r2_of` would have raised before.
     """
     held_out = problem.test.any()
-    y = problem.test_target(equation) if held_out else problem.train_target(equation)
-    errors = (y @ y - explained) / np.square(y - y.mean()).sum()
+    gram = problem.test_gram if held_out else problem.train_gram
+    errors = (gram.yy[0, equation] - explained) / (
+        about_mean.test if held_out else about_mean.train
+    )
     fitted = np.isfinite(errors)
     return Cloud(sizes[fitted], errors[fitted])
 
 
 def _fit(
-    problem: RegressionRows, equation: int, masks: Bool[np.ndarray, "supports terms"]
-) -> Float[np.ndarray, "supports terms"]:
-    """Least-squares coefficients of every support on the training rows, in scaled columns.
+    problem: RegressionRows,
+    equation: int,
+    masks: Bool[np.ndarray, "supports terms"],
+    about_mean: Spread,
+) -> RowFits:
+    """Fit every support to the training rows, and score it on both training and held-out rows.
 
     The Gram matrix squares the condition number of the rows, so its solution is refined with the
     residuals of the rows themselves (Bjorck 1996, Numerical Methods for Least Squares, 2.9.3).
@@ -325,41 +367,33 @@ def _fit(
     coef = fit_masks(xx, gram.xy[0, equation], masks)
     for _ in range(2):
         left = np.zeros_like(coef)
-        for theta, residual in _residuals(problem, equation, coef, test=False):
-            left += residual @ theta
+        squares = _residual_squares(problem, equation, coef, test=False, products=left)
         step = solve_masks(xx, left, masks)
-        coef = coef + step
+        coef += step
+        squares -= (step * (2.0 * left - step @ xx)).sum(axis=1)  # what the step explains
         if not (np.abs(step) > REFINED * np.abs(coef).max(axis=1, keepdims=True)).any():
             break  # the next step would be as much smaller again
-    return coef
+    r2_train = r2_of(squares, spread=about_mean.train)
+    if np.isnan(about_mean.test):
+        return RowFits(coef, r2_train, np.full(len(coef), np.nan))
+    squares = _residual_squares(problem, equation, coef, test=True)
+    return RowFits(coef, r2_train, r2_of(squares, spread=about_mean.test))
 
 
-def _r2(
+def _residual_squares(
     problem: RegressionRows,
     equation: int,
     coef: Float[np.ndarray, "supports terms"],
     *,
     test: bool,
+    products: Float[np.ndarray, "_ terms"] | None = None,
 ) -> Float[np.ndarray, " supports"]:
-    """R2 of every support on training or held-out rows; NaN if there are none."""
-    target = problem.test_target(equation) if test else problem.train_target(equation)
-    if not len(target):
-        return np.full(len(coef), np.nan)
-    squares = np.zeros(len(coef))
-    for _, residual in _residuals(problem, equation, coef, test=test):
-        squares += np.square(residual).sum(axis=1)
-    return r2_of(squares, truth=target)
+    """Squares of every support's residual, on training or held-out rows.
 
-
-def _residuals(
-    problem: RegressionRows,
-    equation: int,
-    coef: Float[np.ndarray, "supports terms"],
-    *,
-    test: bool,
-) -> Iterator[tuple[Float[np.ndarray, "_ terms"], Float[np.ndarray, "supports _"]]]:
-    """Scaled terms, and the residuals of every support, on one block of rows after another."""
-    n_terms = len(problem.library)
-    for rows in problem.blocks(test=test):
-        theta, target = rows[:, :n_terms], rows[:, n_terms + equation]
-        yield theta, target - coef @ theta.T
+    products: if given, the products of the residuals and the terms are added.
+    """
+    squares, left = np.zeros(len(coef)), np.empty(TILE)
+    out = np.empty((0, coef.shape[1])) if products is None else products
+    for columns in problem.blocks(test=test):
+        add_residuals(columns, len(problem.library) + equation, coef, left, out, squares)
+    return squares

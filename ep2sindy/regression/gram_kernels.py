@@ -15,82 +15,121 @@ DEPENDENT = 1e-11
 ROUNDING = 1e-15
 
 
-@compiled
-def solve(xx, rhs, active, n_active, out):
-    """Solve xx[active][:, active] out = rhs[active] by Cholesky; False if columns depend."""
-    lower = np.empty((n_active, n_active))
+@compiled(fastmath={"contract"}, error_model="numpy")
+def append_term(xx, active, n_active, term, lower):
+    """Write the row by which a term extends the Cholesky factor of the active ones.
+
+    Returns false if the term depends on them. The diagonal of a factor holds reciprocals, since a
+    division takes longer than the rest of an inner loop.
+    """
+    rest = xx[term, term]
     for i in range(n_active):
-        for j in range(i + 1):
-            total = xx[active[i], active[j]]
-            for k in range(j):
-                total -= lower[i, k] * lower[j, k]
-            if i > j:
-                lower[i, j] = total / lower[j, j]
-            elif total <= DEPENDENT * xx[active[i], active[i]]:
-                return False
-            else:
-                lower[i, i] = np.sqrt(total)
+        total = xx[term, active[i]]
+        for k in range(i):
+            total -= lower[n_active, k] * lower[i, k]
+        lower[n_active, i] = total * lower[i, i]
+        rest -= lower[n_active, i] ** 2
+    if not rest > DEPENDENT * xx[term, term]:
+        return False
+    lower[n_active, n_active] = 1.0 / np.sqrt(rest)
+    return True
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
+def substitute(lower, rhs, active, n_active, out):
+    """Solve xx[active][:, active] out = rhs[active] by the Cholesky factor of the active terms."""
     for i in range(n_active):
         total = rhs[active[i]]
         for k in range(i):
             total -= lower[i, k] * out[k]
-        out[i] = total / lower[i, i]
+        out[i] = total * lower[i, i]
     for i in range(n_active - 1, -1, -1):
-        total = out[i]
-        for k in range(i + 1, n_active):
-            total -= lower[k, i] * out[k]
-        out[i] = total / lower[i, i]
-    return True
+        out[i] *= lower[i, i]
+        for k in range(i):
+            out[k] -= lower[i, k] * out[i]
 
 
-@compiled
-def independent_terms(xx):
-    """Mask of a maximal independent set of terms; earlier terms take precedence."""
-    n_terms = len(xx)
-    mask = np.zeros(n_terms, dtype=np.bool_)
-    lower = np.zeros((n_terms, n_terms))
-    rows = np.empty(n_terms, dtype=np.int64)
-    n_kept = 0
-    for j in range(n_terms):
-        rest = xx[j, j]
-        for i in range(n_kept):
-            total = xx[j, rows[i]]
-            for k in range(i):
-                total -= lower[n_kept, k] * lower[i, k]
-            lower[n_kept, i] = total / lower[i, i]
-            rest -= lower[n_kept, i] ** 2
-        if rest > DEPENDENT * xx[j, j]:
-            lower[n_kept, n_kept] = np.sqrt(rest)
-            rows[n_kept] = j
-            n_kept += 1
-            mask[j] = True
-    return mask
-
-
-@compiled
-def _fill_active(masks, m, active):
-    """Write the indices of the terms of one mask into `active`; returns their number."""
+@compiled(fastmath={"contract"}, error_model="numpy")
+def factorise(xx, active, lower):
+    """Write the first independent terms, earlier ones first, and their factor; returns how many."""
     n_active = 0
-    for j in range(masks.shape[1]):
-        if masks[m, j]:
+    for j in range(len(xx)):
+        if append_term(xx, active, n_active, j, lower):
             active[n_active] = j
             n_active += 1
     return n_active
 
 
-@compiled
+@compiled(fastmath={"contract"}, error_model="numpy")
+def independent_terms(xx):
+    """Mask of a maximal independent set of terms; earlier terms take precedence."""
+    n_terms = len(xx)
+    mask, lower = np.zeros(n_terms, dtype=np.bool_), np.empty((n_terms, n_terms))
+    active = np.empty(n_terms, dtype=np.int64)
+    for i in range(factorise(xx, active, lower)):
+        mask[active[i]] = True
+    return mask
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
+def all_usable(gram, order, same):
+    """True if all is finite, and no term is zero, repeats another, or combines others.
+
+    gram: of terms, and of targets behind them. order: terms, the simplest first. same: 1 - |cosine|
+    below which two terms are the same.
+    """
+    n_terms = len(order)
+    for a in range(len(gram)):
+        for b in range(len(gram)):
+            if not np.isfinite(gram[a, b]):
+                return False
+    xx = np.empty((n_terms, n_terms))
+    for a in range(n_terms):
+        for b in range(n_terms):
+            xx[a, b] = gram[order[a], order[b]]
+            if a != b and abs(xx[a, b]) > 1.0 - same:
+                return False
+        if xx[a, a] <= 0.0:
+            return False
+    return independent_terms(xx).all()
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
+def _extend(xx, mask, active, n_active, lower):
+    """Write the terms of a mask and their factor; returns how many, and whether they are so.
+
+    active: n_active terms that have a row of the factor already. Masks in the order of
+    `pool_masks` often begin with the terms of the one before, whose rows are kept.
+    """
+    n_same = 0
+    for j in range(len(mask)):
+        if not mask[j]:
+            continue
+        if n_same == n_active or active[n_same] != j:
+            n_active = n_same  # the rows behind belong to other terms
+            if not append_term(xx, active, n_active, j, lower):
+                return n_active, False
+            active[n_active] = j
+            n_active += 1
+        n_same += 1
+    return n_same, True
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
 def solve_masks(xx, rhs, masks):
     """Solve xx coef = rhs on each support; NaN if its columns are linearly dependent.
 
-    rhs, masks and the returned coef: (masks, terms); coef is zero outside the support.
+    rhs: (masks, terms), or (1, terms) for all. masks and the returned coef: (masks, terms); coef is
+    zero outside the support.
     """
     n_masks, n_terms = masks.shape
     coef = np.zeros((n_masks, n_terms))
-    solution = np.empty(n_terms)
-    active = np.empty(n_terms, dtype=np.int64)
+    solution, lower = np.empty(n_terms), np.empty((n_terms, n_terms))
+    active, n_active = np.empty(n_terms, dtype=np.int64), 0
     for m in range(n_masks):  # loops, since fancy indices would take seconds longer to compile
-        n_active = _fill_active(masks, m, active)
-        if solve(xx, rhs[m], active, n_active, solution):
+        n_active, solved = _extend(xx, masks[m], active, n_active, lower)
+        if solved:
+            substitute(lower, rhs[min(m, len(rhs) - 1)], active, n_active, solution)
             for i in range(n_active):
                 coef[m, active[i]] = solution[i]
         else:
@@ -99,12 +138,48 @@ def solve_masks(xx, rhs, masks):
     return coef
 
 
+@compiled(fastmath={"contract"}, error_model="numpy")
+def rank_masks(xx, xy, judge_xx, judge_xy, masks, lower, solution, active, explained, best):
+    """Fit every support, write what it explains on the rows that judge, and rank those of a size.
+
+    As `explained_squares` of `fit_masks`, but coefficients are used as soon as they are there, and
+    only those of the support.
+    best: (sizes, depth), gets the numbers of the best supports of each size but zero, -1 for none.
+    explained: (masks,), NaN for dependent terms. lower: (terms, terms), solution: (terms,) and
+    active: (terms,) of int are scratch.
+    """
+    best[:] = -1
+    n_active = 0
+    for m in range(len(masks)):
+        n_active, solved = _extend(xx, masks[m], active, n_active, lower)
+        explained[m] = np.nan
+        if not solved:
+            continue
+        substitute(lower, xy, active, n_active, solution)
+        total = 0.0
+        for i in range(n_active):
+            change = 2.0 * judge_xy[active[i]]
+            for k in range(n_active):
+                change -= solution[k] * judge_xx[active[i], active[k]]
+            total += solution[i] * change
+        explained[m] = total
+        if n_active == 0 or not np.isfinite(total):
+            continue
+        place, ranked = best.shape[1], best[n_active]
+        while place > 0 and (ranked[place - 1] < 0 or total > explained[ranked[place - 1]]):
+            place -= 1
+        for k in range(best.shape[1] - 1, place, -1):
+            ranked[k] = ranked[k - 1]
+        if place < best.shape[1]:
+            ranked[place] = m
+
+
 def fit_masks(xx, xy, masks):
     """Least-squares coefficients of each support; NaN if its columns are linearly dependent.
 
     xy: (terms,), of the columns and one target.
     """
-    return solve_masks(xx, np.where(masks, xy, 0.0), masks)
+    return solve_masks(xx, xy[None], masks)
 
 
 def explained_squares(coef, xx, xy):

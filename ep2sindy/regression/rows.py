@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
-from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.regression.row_kernels import fill_norms, fill_products, gather_columns
 from ep2sindy.regression.window_kernels import band_width
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.smoothers import Smoother
@@ -151,31 +151,43 @@ class RegressionRows:
     @cached_property
     def theta_scale(self) -> Float[np.ndarray, " terms"]:
         """L2 norm of each column over the training rows; 1 for a column of zeros."""
-        return column_norms(self.theta[~self.test])
+        return _norms(self.theta, self._train_places)
 
     @cached_property
     def target_scale(self) -> Float[np.ndarray, " equations"]:
-        return column_norms(self.target[~self.test])
+        return _norms(self.target, self._train_places)
 
     @cached_property
-    def train_rows(self) -> Float[np.ndarray, "train columns"]:
-        """Scaled terms, then scaled targets, of the training rows."""
-        return self._scaled(np.flatnonzero(~self.test))
+    def train_columns(self) -> Float[np.ndarray, "columns train"]:
+        """Scaled terms, then scaled targets, of the training rows, each contiguous in memory."""
+        return self._scaled(self._train_places)
 
     @cached_property
-    def test_rows(self) -> Float[np.ndarray, "test columns"]:
+    def test_columns(self) -> Float[np.ndarray, "columns test"]:
         return self._scaled(np.flatnonzero(self.test))
 
     @property
-    def n_train(self) -> int:
-        return int((~self.test).sum())
+    def train_rows(self) -> Float[np.ndarray, "train columns"]:
+        return self.train_columns.T
 
-    def blocks(self, *, test: bool) -> Iterator[Float[np.ndarray, "_ columns"]]:
-        """Scaled rows, training or held out, in order: all at once, or those of a long record in
-        blocks, of which none is kept.
+    @property
+    def test_rows(self) -> Float[np.ndarray, "test columns"]:
+        return self.test_columns.T
+
+    @cached_property
+    def _train_places(self) -> Int[np.ndarray, " train"]:
+        return np.flatnonzero(~self.test)
+
+    @property
+    def n_train(self) -> int:
+        return len(self._train_places)
+
+    def blocks(self, *, test: bool) -> Iterator[Float[np.ndarray, "columns _"]]:
+        """Scaled columns, of training or held-out rows in order: of all at once, or of a long
+        record in blocks, of which none is kept.
         """
         if len(self.test) <= MOST_ROWS:
-            yield self.test_rows if test else self.train_rows
+            yield self.test_columns if test else self.train_columns
             return
         for start in range(0, len(self.test), MOST_ROWS):
             here = self.test[start : start + MOST_ROWS] == test
@@ -206,12 +218,17 @@ class RegressionRows:
         return coef * self.target_scale[equation] / self.theta_scale
 
     @cached_property
+    def train_products(self) -> Float[np.ndarray, "columns columns"]:
+        """Products of all scaled columns, summed over the training rows."""
+        return self._products(test=False)
+
+    @cached_property
     def train_gram(self) -> Grams:
-        return self._gram(test=False)
+        return self._grams(self.train_products)
 
     @cached_property
     def test_gram(self) -> Grams:
-        return self._gram(test=True)
+        return self._grams(self._products(test=True))
 
     def check_grams(self, n_draws: int) -> None:
         """Raise ValueError if the Gram matrices of `n_draws` draws exceed the memory."""
@@ -225,52 +242,63 @@ class RegressionRows:
             each=each,
         )
 
-    def resampled_grams(self, weights: Float[np.ndarray, "draws train"]) -> Grams:
-        """Gram matrices of the training rows for each draw, each row counted `weights` times.
+    def resampled_sums(
+        self, weights: Float[np.ndarray, "draws train"]
+    ) -> Float[np.ndarray, "draws pairs"]:
+        """Products of all pairs of scaled columns, summed over the training rows for each draw.
 
-        All draws share the products of pairs of columns, so each draw is one row of a matrix
-        product. Rows are processed in blocks to keep these products small.
+        Each row is counted `weights` times. The pairs are those of an upper triangle, row by row.
+        All draws share the products, so each draw is one row of a matrix product. Rows are
+        processed in blocks to keep these products small.
         """
         self.check_grams(len(weights))
         n_columns, begin = len(self.library) + len(self.equations), 0
-        first, second = np.triu_indices(n_columns)
-        sums = np.zeros((len(weights), len(first)))
-        for rows in self.blocks(test=False):
-            for start in range(0, len(rows), ROW_BLOCK):
-                columns = np.ascontiguousarray(rows[start : start + ROW_BLOCK].T)
-                products = columns[first] * columns[second]
-                here = slice(begin + start, begin + start + columns.shape[1])
-                sums += weights[:, here] @ products.T
-            begin += len(rows)
-        whole = np.empty((len(weights), n_columns, n_columns))
-        whole[:, first, second] = sums
-        whole[:, second, first] = sums
-        return self._grams(whole)
+        sums = np.zeros((n_columns * (n_columns + 1) // 2, len(weights)))
+        products = np.empty((len(sums), min(ROW_BLOCK, self.n_train)))
+        for columns in self.blocks(test=False):
+            for start in range(0, columns.shape[1], ROW_BLOCK):
+                n_rows = min(ROW_BLOCK, columns.shape[1] - start)
+                fill_products(columns, start, n_rows, products)
+                here = slice(begin + start, begin + start + n_rows)
+                sums += products[:, :n_rows] @ weights[:, here].T
+            begin += columns.shape[1]
+        return np.ascontiguousarray(sums.T)
 
-    def _gram(self, *, test: bool) -> Grams:
-        parts = [rows.T @ rows for rows in self.blocks(test=test)]
-        return self._grams(sum(parts[1:], parts[0])[None])
+    def _products(self, *, test: bool) -> Float[np.ndarray, "columns columns"]:
+        parts = [columns @ columns.T for columns in self.blocks(test=test)]
+        return sum(parts[1:], parts[0])
 
-    def _scaled_target(self, equation: int, *, test: bool) -> Float[np.ndarray, " _"]:
-        if len(self.test) <= MOST_ROWS:  # the scaled rows are at hand
-            return (self.test_rows if test else self.train_rows)[:, len(self.library) + equation]
-        return self.target[self.test == test, equation] / self.target_scale[equation]
-
-    def _scaled(self, index: Int[np.ndarray, " _"]) -> Float[np.ndarray, "_ columns"]:
-        n = len(self.library)
-        # Filled in place: concatenating narrow arrays side by side takes ten times as long.
-        scaled = np.empty((len(index), n + len(self.equations)))
-        scaled[:, :n], scaled[:, n:] = self.theta[index], self.target[index]
-        scaled /= np.concatenate([self.theta_scale, self.target_scale])
-        return scaled
-
-    def _grams(self, products: np.ndarray) -> Grams:
+    def _grams(self, products: Float[np.ndarray, "columns columns"]) -> Grams:
         n = len(self.library)
         return Grams(
-            xx=np.ascontiguousarray(products[:, :n, :n]),  # views would be compiled for anew
-            xy=np.ascontiguousarray(products[:, n:, :n]),
-            yy=products.diagonal(axis1=1, axis2=2)[:, n:],
+            xx=products[None, :n, :n].copy(),  # views would be compiled for anew
+            xy=products[None, n:, :n].copy(),
+            yy=products.diagonal()[None, n:],
         )
+
+    def _scaled_target(self, equation: int, *, test: bool) -> Float[np.ndarray, " _"]:
+        if len(self.test) <= MOST_ROWS:  # the scaled columns are at hand
+            columns = self.test_columns if test else self.train_columns
+            return columns[len(self.library) + equation]
+        return self.target[self.test == test, equation] / self.target_scale[equation]
+
+    def _scaled(self, places: Int[np.ndarray, " _"]) -> Float[np.ndarray, "columns _"]:
+        n = len(self.library)
+        scaled = np.empty((n + len(self.equations), len(places)))
+        gather_columns(self.theta, places, self.theta_scale, 0, scaled)
+        gather_columns(self.target, places, self.target_scale, n, scaled)
+        return scaled
+
+
+def _norms(
+    values: Float[np.ndarray, "rows columns"], places: Int[np.ndarray, " _"]
+) -> Float[np.ndarray, " columns"]:
+    """L2 norms of the columns over some rows, as `column_norms`."""
+    columns = np.empty((values.shape[1], len(places)))
+    norms = np.ones(len(columns))
+    gather_columns(values, places, norms, 0, columns)
+    fill_norms(columns, norms)
+    return norms
 
 
 @runtime_checkable

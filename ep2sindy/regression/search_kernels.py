@@ -9,13 +9,18 @@ import numpy as np
 from ep2sindy.regression.gram_kernels import (
     DEPENDENT,
     ROUNDING,
-    independent_terms,
-    solve,
+    append_term,
+    factorise,
+    substitute,
 )
 from ep2sindy.runtime.compilation import compiled
 
+BITS = 62  # terms in one number of a key
 
-@compiled
+PATH_PER_TERM = 8  # supports on a lasso path, per term, at which it ends; they may come and go
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
 def _next_event(coef, slope, correlation, drift, level, active, n_active, closed):
     """Next knot of the lasso path below the penalty `level`: step, term, and whether it joins."""
     step, term, joins = level, -1, False
@@ -26,68 +31,82 @@ def _next_event(coef, slope, correlation, drift, level, active, n_active, closed
     for j in range(len(coef)):
         if closed[j]:
             continue
-        for sign in (1.0, -1.0):
-            closing = 1.0 - sign * drift[j]
-            if closing > 1e-12:
-                distance = max((level - sign * correlation[j]) / closing, 0.0)
-                if distance < step:
-                    step, term, joins = distance, j, True
+        # The correlation meets plus the level, or minus the level.
+        if 1.0 - drift[j] > 1e-12:
+            distance = max((level - correlation[j]) / (1.0 - drift[j]), 0.0)
+            if distance < step:
+                step, term, joins = distance, j, True
+        if 1.0 + drift[j] > 1e-12:
+            distance = max((level + correlation[j]) / (1.0 + drift[j]), 0.0)
+            if distance < step:
+                step, term, joins = distance, j, True
     return step, term, joins
 
 
-@compiled
-def lasso_supports(xx, xy, max_terms):
-    """All supports on the exact lasso path, from the empty one to `max_terms` or all terms.
+@compiled(fastmath={"contract"}, error_model="numpy")
+def lasso_path(xx, xy, max_terms, lower, vectors, places, masks, n_masks):
+    """Write all supports on the exact lasso path, from the empty one to `max_terms` or all terms.
 
     Homotopy in the penalty, in which terms join and leave (Osborne, Presnell & Turlach 2000,
-    doi:10.1093/imanum/20.3.389; Efron et al. 2004, doi:10.1214/009053604000000067).
+    doi:10.1093/imanum/20.3.389; Efron et al. 2004, doi:10.1214/009053604000000067). The Cholesky
+    factor of the active terms grows by a row where one joins, and is made anew from the place where
+    one leaves.
+    masks: (room, terms), written from n_masks on; returns how many are written then. lower: (terms,
+    terms), vectors: (5 or more, terms) and places: (2, terms) of int are scratch.
     """
     n_terms = len(xy)
-    masks = np.zeros((8 * n_terms + 8, n_terms), dtype=np.bool_)
-    coef, correlation, drift = np.zeros(n_terms), np.zeros(n_terms), np.zeros(n_terms)
-    slope, signs = np.zeros(n_terms), np.zeros(n_terms)
-    active = np.zeros(n_terms, dtype=np.int64)
-    closed = np.zeros(n_terms, dtype=np.bool_)  # terms that cannot join: active, or barred
+    coef, correlation, drift = vectors[0], vectors[1], vectors[2]
+    slope, signs, active = vectors[3], vectors[4], places[0]
+    closed = places[1]  # terms that cannot join, for they are active, or barred
     n_active = np.int64(0)  # as a bare 0 it would have callees compiled twice
-    n_masks, left, level = 1, -1, 0.0
+    end, left, level = n_masks + PATH_PER_TERM * (n_terms + 1), -1, 0.0
     for j in range(n_terms):
-        correlation[j] = xy[j]
+        coef[j], correlation[j], closed[j] = 0.0, xy[j], 0
         level = max(level, abs(xy[j]))
     floor = 1e-13 * level
-    while level > floor and n_masks < len(masks):
+    n_masks = _write_support(active, n_active, masks, n_masks)
+    while level > floor and n_masks < end:
         _fill_drift(xx, slope, active, n_active, drift)
         if left >= 0:
-            closed[left] = True  # it would rejoin at this same knot
+            closed[left] = 1  # it would rejoin at this same knot
         step, term, joins = _next_event(
             coef, slope, correlation, drift, level, active, n_active, closed
         )
         if left >= 0:
-            closed[left], left = False, -1
+            closed[left], left = 0, -1
         _move(step, coef, slope, active, n_active, correlation, drift, signs)
         level -= step
         if term < 0:
             break
         if joins:
+            closed[term] = 1
+            if not append_term(xx, active, n_active, term, lower):
+                # It depends on the active terms; the path continues without it.
+                substitute(lower, signs, active, n_active, slope)
+                continue
             active[n_active] = term
             n_active += 1
         else:
-            n_active = _leave(active, n_active, term)
-            coef[term], left = 0.0, term
-        closed[term] = joins
-        if not solve(xx, signs, active, n_active, slope):
-            closed[term] = True  # it depends on the active terms; the path continues without it
-            n_active = _leave(active, n_active, term)
-            solve(xx, signs, active, n_active, slope)
-            continue
+            n_active = _leave(xx, active, n_active, term, lower)
+            coef[term], closed[term], left = 0.0, 0, term
+        substitute(lower, signs, active, n_active, slope)
         if n_active > max_terms:
             break
-        for i in range(n_active):
-            masks[n_masks, active[i]] = True
-        n_masks += 1
-    return masks[:n_masks]
+        n_masks = _write_support(active, n_active, masks, n_masks)
+    return n_masks
 
 
-@compiled
+@compiled(fastmath={"contract"}, error_model="numpy")
+def _write_support(active, n_active, masks, m):
+    """Write the mask of the active terms in row m; returns the next row."""
+    for j in range(masks.shape[1]):
+        masks[m, j] = False
+    for i in range(n_active):
+        masks[m, active[i]] = True
+    return m + 1
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
 def _move(step, coef, slope, active, n_active, correlation, drift, signs):
     """Move coefficients and correlations along the path, and write the signs of the latter."""
     for i in range(n_active):
@@ -97,77 +116,189 @@ def _move(step, coef, slope, active, n_active, correlation, drift, signs):
         signs[j] = np.sign(correlation[j])
 
 
-@compiled
+@compiled(fastmath={"contract"}, error_model="numpy")
 def _fill_drift(xx, slope, active, n_active, drift):
     """Write the rate at which each term's correlation decreases along the path."""
     for j in range(len(drift)):
         drift[j] = 0.0
-        for i in range(n_active):
-            drift[j] += xx[j, active[i]] * slope[i]
-
-
-@compiled
-def adaptive_lasso_supports(xx, xy, gamma, max_terms):
-    """Supports on the path of the lasso with penalties |b_ols|^-gamma (Zou 2006).
-
-    Scaling each column by |b_ols|^gamma makes this a plain lasso. A term that depends on earlier
-    ones has no least-squares coefficient of its own and never joins.
-    """
-    n_terms = len(xy)
-    kept, n_kept = _places(independent_terms(xx))
-    fitted, scale, scaled_xy = np.zeros(n_terms), np.zeros(n_terms), np.zeros(n_terms)
-    solve(xx, xy, kept, n_kept, fitted)
-    for i in range(n_kept):
-        scale[kept[i]] = abs(fitted[i]) ** gamma
-    scaled_xx = np.zeros((n_terms, n_terms))
-    for i in range(n_terms):
-        scaled_xy[i] = xy[i] * scale[i]
-        for j in range(n_terms):
-            scaled_xx[i, j] = xx[i, j] * scale[i] * scale[j]
-    return lasso_supports(scaled_xx, scaled_xy, max_terms)
-
-
-@compiled
-def _places(mask):
-    """Indices of the true entries of a mask, and their number."""
-    places, n_places = np.zeros(len(mask), dtype=np.int64), 0
-    for j in range(len(mask)):
-        if mask[j]:
-            places[n_places] = j
-            n_places += 1
-    return places, n_places
-
-
-@compiled
-def _leave(active, n_active, term):
-    kept = 0
     for i in range(n_active):
-        if active[i] != term:
-            active[kept] = active[i]
-            kept += 1
+        for j in range(len(drift)):
+            drift[j] += xx[active[i], j] * slope[i]
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
+def _leave(xx, active, n_active, term, lower):
+    """Take a term out of the active ones and their factor; returns how many are left."""
+    kept = 0
+    while active[kept] != term:
+        kept += 1
+    for i in range(kept + 1, n_active):  # independent of each other before, so they still are
+        append_term(xx, active, kept, active[i], lower)
+        active[kept] = active[i]
+        kept += 1
     return kept
 
 
-@compiled
-def thresholded_supports(xx, xy, thresholds):
-    """Supports by sequentially thresholded least squares, iterated to convergence per threshold."""
-    n_terms = len(xy)
-    masks = np.zeros((len(thresholds), n_terms), dtype=np.bool_)
-    start, solution = independent_terms(xx), np.zeros(n_terms)
-    for m in range(len(thresholds)):
+@compiled(fastmath={"contract"}, error_model="numpy")
+def adaptive_lasso_supports(xx, xy, gamma, max_terms, matrices, vectors, places, masks, ends):
+    """Write the supports on the path of the lasso with penalties |b_ols|^-gamma, for every draw.
+
+    Scaling each column by |b_ols|^gamma makes this a plain lasso (Zou 2006). A term that depends on
+    earlier ones has no least-squares coefficient of its own and never joins. All draws are one
+    call, since a path takes no longer than a call of NumPy.
+    xx: (draws, terms, terms). xy: (draws, terms). masks: as in `lasso_path`. ends: (draws,), number
+    of masks up to each draw. matrices: (2, terms, terms), vectors: (7, terms) and places are
+    scratch.
+    """
+    scaled_xx, lower, scale, scaled_xy = matrices[0], matrices[1], vectors[5], vectors[6]
+    active, fitted, n_terms, n_masks = places[0], vectors[0], xy.shape[1], np.int64(0)
+    for d in range(len(xx)):
+        n_kept = factorise(xx[d], active, lower)
+        substitute(lower, xy[d], active, n_kept, fitted)
         for j in range(n_terms):
-            masks[m, j] = start[j]
-        while True:
-            active, n_active = _places(masks[m])
-            solve(xx, xy, active, n_active, solution)
-            n_dropped = 0
-            for i in range(n_active):
-                if abs(solution[i]) <= thresholds[m]:
-                    masks[m, active[i]] = False
-                    n_dropped += 1
-            if n_dropped == 0:
-                break
-    return masks
+            scale[j] = 0.0
+        for i in range(n_kept):
+            size = abs(fitted[i])
+            scale[active[i]] = size if gamma == 1.0 else size**gamma
+        for i in range(n_terms):
+            scaled_xy[i] = xy[d, i] * scale[i]
+            for j in range(n_terms):
+                scaled_xx[i, j] = xx[d, i, j] * (scale[i] * scale[j])
+        n_masks = lasso_path(
+            scaled_xx, scaled_xy, max_terms, lower, vectors, places, masks, n_masks
+        )
+        ends[d] = n_masks
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
+def thresholded_supports(xx, xy, thresholds, max_terms, lower, places, chain, fits, masks, ends):
+    """Write the supports by sequentially thresholded least squares, for every draw and threshold.
+
+    Each threshold is iterated to convergence; a support of more than max_terms is left out.
+    Neighbouring thresholds mostly drop the same terms in the same steps, so a fit is made only
+    where the last threshold had another support at that step.
+    thresholds: (draws, thresholds). masks: (draws * thresholds, terms). ends: (draws,), number of
+    masks up to each draw. lower: (terms, terms), places: (1, terms) of int, chain: (terms + 1,
+    terms) of bool and fits: (terms + 1, terms) are scratch: supports at the steps, and their
+    coefficients.
+    """
+    n_terms, n_masks, active = xy.shape[1], np.int64(0), places[0]
+    for d in range(len(xx)):
+        n_known, n_kept = 0, factorise(xx[d], active, lower)
+        _write_support(active, n_kept, chain, 0)
+        for m in range(thresholds.shape[1]):
+            step, dropped, n_left = 0, True, n_kept
+            for j in range(n_terms):
+                masks[n_masks, j] = chain[0, j]
+            while dropped:
+                if step >= n_known or not _same(masks, n_masks, chain, step):
+                    _fit_support(xx[d], xy[d], masks[n_masks], active, lower, fits[step])
+                    for j in range(n_terms):
+                        chain[step, j] = masks[n_masks, j]
+                    n_known = step + 1
+                dropped = False
+                for j in range(n_terms):
+                    if masks[n_masks, j] and abs(fits[step, j]) <= thresholds[d, m]:
+                        masks[n_masks, j], dropped, n_left = False, True, n_left - 1
+                step += 1
+            if n_left <= max_terms:
+                n_masks += 1
+        ends[d] = n_masks
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
+def _same(masks, m, others, k):
+    """True if row m of masks is row k of the others."""
+    n_different = 0
+    for j in range(masks.shape[1]):
+        n_different += masks[m, j] != others[k, j]
+    return n_different == 0
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
+def _fit_support(xx, xy, mask, active, lower, coef):
+    """Write the least-squares coefficients of a support of independent terms at its terms."""
+    n_active = 0
+    for j in range(len(mask)):
+        if mask[j]:
+            append_term(xx, active, n_active, j, lower)
+            active[n_active] = j
+            n_active += 1
+    substitute(lower, xy, active, n_active, coef)
+    for i in range(n_active - 1, -1, -1):  # each place is read before it is written
+        coef[active[i]] = coef[i]
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
+def pool_masks(masks, ends, keys, places, held, last):
+    """Order the distinct masks of all draws by size, then by terms, and count the draws of each.
+
+    Counted are also the draws in which a support of each size held each term: held: (terms + 1,
+    terms). Each mask is sought among those known, which are kept in order.
+    ends: (draws,), number of masks up to each draw. places: (3, masks) of int: the first row gets
+    the number of a mask in order, each once; the second, by the number of the mask, its draws; one
+    is scratch, and so are keys: (masks, `key_words`) of int and last: (terms + 1, terms) of int.
+    Returns the number of distinct masks.
+    """
+    order, n_draws, latest = places[0], places[1], places[2]
+    held[:] = 0
+    last[:] = -1
+    n_known, start = 0, 0
+    for d in range(len(ends)):
+        for m in range(start, ends[d]):
+            _write_key(masks, m, keys)
+            if m > start and _compare(keys, m, m - 1) == 0:
+                continue
+            size = keys[m, 0]
+            for j in range(masks.shape[1]):
+                if masks[m, j] and last[size, j] != d:
+                    last[size, j] = d
+                    held[size, j] += 1
+            rank, end = 0, n_known
+            while rank < end:
+                middle = (rank + end) // 2
+                if _compare(keys, order[middle], m) < 0:
+                    rank = middle + 1
+                else:
+                    end = middle
+            if rank == n_known or _compare(keys, order[rank], m) != 0:
+                for k in range(n_known, rank, -1):
+                    order[k] = order[k - 1]
+                order[rank], n_draws[m], latest[m] = m, 0, -1
+                n_known += 1
+            known = order[rank]
+            if latest[known] != d:
+                latest[known] = d
+                n_draws[known] += 1
+        start = ends[d]
+    return n_known
+
+
+def key_words(n_terms):
+    """Number of whole numbers in the key of a mask: its size, and its terms as bits."""
+    return 1 + -(-n_terms // BITS)
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
+def _write_key(masks, m, keys):
+    """Write the size of a mask and its terms, BITS in a number, the first the most significant."""
+    n_terms = masks.shape[1]
+    keys[m, 0] = 0
+    for word in range(1, keys.shape[1]):
+        code = 0
+        for j in range((word - 1) * BITS, min(word * BITS, n_terms)):
+            code = 2 * code + masks[m, j]
+            keys[m, 0] += masks[m, j]
+        keys[m, word] = code
+
+
+@compiled(fastmath={"contract"}, error_model="numpy")
+def _compare(keys, k, m):
+    """Negative if key k comes before key m, zero if they are the same."""
+    for word in range(keys.shape[1]):
+        if keys[k, word] != keys[m, word]:
+            return -1 if keys[k, word] < keys[m, word] else 1
+    return 0
 
 
 @compiled

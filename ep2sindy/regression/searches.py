@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ep2sindy.regression.exchanges import exchanged_supports
 from ep2sindy.regression.search_kernels import (
+    PATH_PER_TERM,
     adaptive_lasso_supports,
     best_subsets,
     thresholded_supports,
@@ -55,7 +58,23 @@ class AdaptiveLasso:
         set_counts(self, _where_set(self.max_terms))
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
-        return adaptive_lasso_supports(xx, xy, self.gamma, self.max_terms or len(xy))
+        (masks,) = self.supports_of_draws(xx[None], xy[None], np.array([yy]))
+        return masks
+
+    def supports_of_draws(
+        self,
+        xx: Float[np.ndarray, "draws terms terms"],
+        xy: Float[np.ndarray, "draws terms"],
+        yy: Float[np.ndarray, " draws"],
+    ) -> list[Masks]:
+        """Supports of every draw, as `supports` of one."""
+        n_draws, n = xy.shape
+        masks = np.empty((n_draws * PATH_PER_TERM * (n + 1), n), dtype=np.bool_)
+        ends, places = np.empty(n_draws, dtype=np.int64), np.empty((2, n), dtype=np.int64)
+        scratch = np.empty((2, n, n)), np.empty((7, n)), places
+        max_terms = self.max_terms or n
+        adaptive_lasso_supports(xx, xy, self.gamma, max_terms, *scratch, masks, ends)
+        return _by_draw(masks, ends)
 
 
 @dataclass(frozen=True)
@@ -81,9 +100,28 @@ class STLSQ:
         set_counts(self, {"n_thresholds": 2} | _where_set(self.max_terms))
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
-        thresholds = np.sqrt(yy) * np.geomspace(self.lowest, self.highest, self.n_thresholds)
-        masks = thresholded_supports(xx, xy, thresholds)
-        return masks[masks.sum(axis=1) <= (self.max_terms or len(xy))]
+        (masks,) = self.supports_of_draws(xx[None], xy[None], np.array([yy]))
+        return masks
+
+    def supports_of_draws(
+        self,
+        xx: Float[np.ndarray, "draws terms terms"],
+        xy: Float[np.ndarray, "draws terms"],
+        yy: Float[np.ndarray, " draws"],
+    ) -> list[Masks]:
+        """Supports of every draw, as `supports` of one."""
+        n_draws, n = xy.shape
+        thresholds = np.sqrt(yy)[:, None] * self._shares
+        masks, ends = np.empty((thresholds.size, n), dtype=np.bool_), np.empty(n_draws, np.int64)
+        chain, fits = np.empty((n + 1, n), dtype=np.bool_), np.empty((n + 1, n))
+        scratch = np.empty((n, n)), np.empty((1, n), dtype=np.int64), chain, fits
+        max_terms = self.max_terms or n
+        thresholded_supports(xx, xy, thresholds, max_terms, *scratch, masks, ends)
+        return _by_draw(masks, ends)
+
+    @cached_property
+    def _shares(self) -> Float[np.ndarray, " thresholds"]:
+        return np.geomspace(self.lowest, self.highest, self.n_thresholds)
 
 
 class Unproven(UserWarning):
@@ -165,6 +203,12 @@ def subsets_within(
     masks = np.zeros_like(found)
     masks[:, order] = found
     return masks, proven
+
+
+def _by_draw(masks: Masks, ends: Int[np.ndarray, " draws"]) -> list[Masks]:
+    """The masks of every draw, from those of all and their number up to each."""
+    bounds = [0, *ends.tolist()]
+    return [masks[start:end] for start, end in pairwise(bounds)]
 
 
 def _where_set(max_terms: int | None) -> dict[str, int]:

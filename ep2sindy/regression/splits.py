@@ -28,8 +28,9 @@ class RandomSplit:
         _check_fraction(self.test_fraction)
 
     def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
-        chosen = rng.permutation(n_groups)[: round(self.test_fraction * n_groups)]
-        return np.isin(np.arange(n_groups), chosen)
+        held_out = np.zeros(n_groups, dtype=np.bool_)
+        held_out[rng.permutation(n_groups)[: round(self.test_fraction * n_groups)]] = True
+        return held_out
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,9 @@ LOOPS: dict[str, Any] = {
 # inlined. Where there is one place, `inline="always"` is faster to compile.
 INNER = {**LOOPS, "no_cpython_wrapper": True, "forceinline": True}
 
+# As LOOPS, for sums that may be taken in any order, which lets them fill the vector units.
+REORDERED = {**LOOPS, "fastmath": {"reassoc", "contract"}}
+
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
     """Compile by `numba.njit` with a cache on disk: `@compiled` or `@compiled(inline="always")`.

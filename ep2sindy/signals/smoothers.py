@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -90,15 +91,19 @@ class SavitzkyGolay:
 
     def _smooth_equal(self, values: np.ndarray) -> np.ndarray:
         """Weighted sums over windows: each sample takes its own, those at the ends the nearest."""
-        half = self.window // 2
-        powers = np.linspace(-1.0, 1.0, self.window)[:, None] ** np.arange(self.order + 1)
-        weights = powers @ np.linalg.pinv(powers)  # row k gives the polynomial at sample k
+        half, weights = self.window // 2, self._weights
         smoothed = np.empty(values.shape)
         for column, target in zip(values.T, smoothed.T, strict=True):
             target[half : len(values) - half] = np.correlate(column, weights[half])
         smoothed[:half] = weights[:half] @ values[: self.window]
         smoothed[len(values) - half :] = weights[half + 1 :] @ values[len(values) - self.window :]
         return smoothed
+
+    @cached_property
+    def _weights(self) -> Float[np.ndarray, "window window"]:
+        """Weights of a window's samples; row k gives the polynomial at sample k."""
+        powers = np.linspace(-1.0, 1.0, self.window)[:, None] ** np.arange(self.order + 1)
+        return powers @ np.linalg.pinv(powers)
 
     def _smooth_unequal(self, t: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Fit the window around each sample in scaled time; the nearest full one at the ends."""
