@@ -220,9 +220,11 @@ def _likelihoods(
     """Add up the likelihoods, all ratios side by side, given the start of every filter.
 
     The gain of the signal is the new d0; gain1 and gain2 are those of slope and bend. variance: of
-    the innovation; weight: its inverse.
+    the innovation; weight: its inverse. At even steps the last ratio of those whose gains change is
+    let go once it has settled, so ratios in ascending order take the least time.
     """
     (n_samples, n_columns), n_ratios = values.shape, len(ratios)
+    changing = n_ratios
     h1, h2 = steps[0], steps[1]
     _fill_parabola(h1, h2, parabola)
     for r in range(n_ratios):
@@ -234,13 +236,21 @@ def _likelihoods(
                 bend[j, r] += parabola[2, i] * values[i, j]
     for k in range(3, n_samples):
         h = steps[k - 1]
-        for r in range(n_ratios):
+        even = abs(h - steps[k - 2]) <= EVEN
+        if not even:
+            changing = n_ratios
+        last = max(changing - 1, 0)
+        old0, old1, old2 = d0[last], d1[last], d2[last]
+        for r in range(changing):
             l10[r], l20[r], l21[r], new0, new1, new2 = _predict(
                 h, ratios[r], l10[r], l20[r], l21[r], d0[r], d1[r], d2[r]
             )
             variance[r], weight[r] = new0 + 1.0, 1.0 / (new0 + 1.0)
             d0[r], d1[r], d2[r] = new0 / variance[r], new1, new2
             gain1[r], gain2[r] = l10[r] * d0[r], l20[r] * d0[r]
+        if even and _hardly_changed(d0[last], d1[last], d2[last], old0, old1, old2):
+            changing = last
+        for r in range(n_ratios):
             product[r] *= variance[r]
         for j in range(n_columns):
             for r in range(n_ratios):
