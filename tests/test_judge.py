@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import diags_array
 
 import ep2sindy as ep
 from ep2sindy.discovery import choice
@@ -19,11 +19,11 @@ from ep2sindy.signals.kernels import likelihood, smooth
 
 def plain_covariance(rows: NoisyRows, sensitivity: np.ndarray, target_scale: float) -> np.ndarray:
     """The sum over variables of M M', where M is the rows' change per unit noise of a variable."""
-    total = np.zeros((rows.mean.shape[0],) * 2)
+    total, (mean, slope) = np.zeros((len(rows.windows),) * 2), rows.windows.matrices()
     for v, std in enumerate(rows.noise_std.T):
-        change = rows.mean @ diags_array(sensitivity[v])
+        change = mean @ diags_array(sensitivity[v])
         if v == rows.state:
-            change = change - rows.slope @ diags_array(std) / target_scale
+            change = change - slope @ diags_array(std) / target_scale
         total += (change @ change.T).toarray()
     return total
 
@@ -44,8 +44,7 @@ def test_the_banded_covariance_is_that_of_sparse_products(steps: str, order: str
     rng, rows = np.random.default_rng(0), rows_of_lorenz(steps).noisy
     assert rows is not None
     if order == "shuffled":
-        mixed = rng.permutation(rows.mean.shape[0])
-        rows = replace(rows, mean=csr_array(rows.mean[mixed]), slope=csr_array(rows.slope[mixed]))
+        rows = replace(rows, windows=rows.windows.taken(rng.permutation(len(rows.windows))))
     sensitivity = rng.normal(size=rows.noise_std.T.shape)
     band, plain = _covariance(rows, sensitivity, 3.0), plain_covariance(rows, sensitivity, 3.0)
     n = len(plain)
@@ -58,9 +57,9 @@ def test_the_banded_covariance_is_that_of_sparse_products(steps: str, order: str
 def test_sums_over_windows_are_sparse_products() -> None:
     rows, rng = rows_of_lorenz("uneven").noisy, np.random.default_rng(0)
     assert rows is not None
-    windows, (n_rows, n_samples) = rows.stretches, rows.mean.shape
+    windows, n_rows, n_samples = rows.windows, len(rows.windows), rows.windows.n_samples
     columns, weights = rng.normal(size=(4, n_samples)), rng.normal(size=n_rows)
-    for stretch, matrix in ((windows.mean, rows.mean), (windows.slope, rows.slope)):
+    for stretch, matrix in zip((windows.mean, windows.slope), windows.matrices(), strict=True):
         sums, spread = np.empty((4, n_rows)), np.empty(n_samples)
         sum_windows(windows.starts, windows.first, stretch, columns, sums)
         spread_windows(windows.starts, windows.first, stretch, weights, spread)

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.regression.row_kernels import fill_norms, fill_products, gather_columns
-from ep2sindy.regression.window_kernels import band_width
+from ep2sindy.regression.windows import Windows
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.trust.memory import check_memory
@@ -42,15 +41,14 @@ class Grams:
 class NoisyRows:
     """Dependence of the training rows of one equation on the noisy samples x.
 
-    Targets are slope @ x[state], terms are mean @ library(x); both matrices are sparse, (rows,
-    samples), with sorted columns. target: of the samples as they are. values: (samples, variables),
-    the library's variables, then states that it lacks.
+    Targets are windows.slopes(x[state]), terms are windows.means(library(x)). target: of the
+    samples as they are. values: (samples, variables), the library's variables, then states that it
+    lacks.
     smoothed: an estimate of their true values. noise_std: standard deviation of their independent
     noise.
     """
 
-    mean: csr_array
-    slope: csr_array
+    windows: Windows
     target: Float[np.ndarray, " rows"]
     state: int
     values: Float[np.ndarray, "samples variables"]
@@ -61,45 +59,6 @@ class NoisyRows:
     def columns(self) -> tuple[Float[np.ndarray, "variables samples"], ...]:
         """Values, smoothed values and noise, each variable contiguous in memory."""
         return tuple(map(np.ascontiguousarray, (self.values.T, self.smoothed.T, self.noise_std.T)))
-
-    @cached_property
-    def stretches(self) -> Stretches:
-        """The windows of all rows as stretches of neighbouring samples."""
-        first = np.minimum(*(_ends(matrix)[0] for matrix in (self.mean, self.slope)))
-        last = np.maximum(*(_ends(matrix)[1] for matrix in (self.mean, self.slope)))
-        first, last = first.astype(np.int64), last.astype(np.int64)
-        starts = np.append(0, np.cumsum(last + 1 - first))
-        mean, slope = (_filled(matrix, starts, first) for matrix in (self.mean, self.slope))
-        return Stretches(starts, first, mean, slope, band_width(first, last))
-
-
-class Stretches(NamedTuple):
-    """Windows of rows: that of row i is mean[starts[i]:starts[i + 1]] from sample first[i] on.
-
-    slope: in the same places. width: largest distance between rows that overlap, plus one.
-    """
-
-    starts: Int[np.ndarray, " bounds"]
-    first: Int[np.ndarray, " rows"]
-    mean: Float[np.ndarray, " weights"]
-    slope: Float[np.ndarray, " weights"]
-    width: int
-
-
-def _ends(matrix: csr_array) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " rows"]]:
-    """First and last sample of every row of a sparse matrix with sorted columns."""
-    return matrix.indices[matrix.indptr[:-1]], matrix.indices[matrix.indptr[1:] - 1]
-
-
-def _filled(
-    matrix: csr_array, starts: Int[np.ndarray, " bounds"], first: Int[np.ndarray, " rows"]
-) -> Float[np.ndarray, " weights"]:
-    """Entries of a sparse matrix as stretches, with zeros for entries that it lacks."""
-    if matrix.nnz == starts[-1]:  # it lacks none
-        return matrix.data
-    weights, row = np.zeros(starts[-1]), np.repeat(np.arange(len(first)), np.diff(matrix.indptr))
-    weights[starts[row] + matrix.indices - first[row]] = matrix.data
-    return weights
 
 
 @dataclass(frozen=True, eq=False)

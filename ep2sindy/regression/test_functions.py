@@ -7,35 +7,14 @@ from functools import lru_cache
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.sparse import csr_array
+from jaxtyping import Float
 
 from ep2sindy.regression.sampling import even_grid, is_even, one_about_each
+from ep2sindy.regression.windows import Windows
 from ep2sindy.runtime.values import set_counts
 
 # Value of a bump, relative to its centre, at the first sample inside its edge.
 EDGE = 1e-10
-
-
-@dataclass(frozen=True, eq=False)
-class WindowRows:
-    """Test functions phi on stretches of one trajectory, ordered by their first sample.
-
-    mean: (windows, samples), sparse; mean @ values is the integral of phi * values divided by
-    that of phi. slope: the same for a derivative; slope @ x is the integral of phi * x' divided
-    by that of phi, computed by parts without differencing x.
-    """
-
-    mean: csr_array
-    slope: csr_array
-
-    @property
-    def first(self) -> Int[np.ndarray, " windows"]:
-        return self.mean.indices[self.mean.indptr[:-1]]
-
-    @property
-    def last(self) -> Int[np.ndarray, " windows"]:
-        return self.mean.indices[self.mean.indptr[1:] - 1]
 
 
 @runtime_checkable
@@ -48,7 +27,7 @@ class WindowFunctions(Protocol):
         x: Float[np.ndarray, " samples"],
         *,
         rng: np.random.Generator,
-    ) -> WindowRows: ...
+    ) -> Windows: ...
 
 
 @dataclass(frozen=True)
@@ -73,7 +52,7 @@ class Boxes:
         x: Float[np.ndarray, " samples"],
         *,
         rng: np.random.Generator,
-    ) -> WindowRows:
+    ) -> Windows:
         """Raises ValueError for windows longer than the trajectory."""
         _check_width(self.n_points, len(t), "n_points")
         first = np.sort(rng.integers(len(t) - self.n_points + 1, size=self.n_windows))
@@ -85,9 +64,9 @@ class Boxes:
         mean[:, 0] = half_steps[first]
         mean[:, -1] = half_steps[last - 1]
         length_s = (t[last] - t[first])[:, None]
-        ends = np.stack([first, last], axis=1)
-        difference = np.tile([-1.0, 1.0], (self.n_windows, 1)) / length_s
-        return WindowRows(_rows(inside, mean / length_s, len(t)), _rows(ends, difference, len(t)))
+        slope = np.zeros(mean.shape)
+        slope[:, 0], slope[:, -1] = -1.0, 1.0
+        return Windows.even(first, mean / length_s, slope / length_s, len(t))
 
 
 @dataclass(frozen=True)
@@ -126,7 +105,7 @@ class Bumps:
         x: Float[np.ndarray, " samples"],
         *,
         rng: np.random.Generator,
-    ) -> WindowRows:
+    ) -> Windows:
         """Weights of all windows over one signal.
 
         Samples at unequal steps are interpolated onto an even grid; the interpolation weights
@@ -139,13 +118,13 @@ class Bumps:
         grid, lines = even_grid(t)
         windows = self._even_windows(lines @ x, grid[1] - grid[0])
         middle = grid[(windows.first + windows.last) // 2]
-        kept = one_about_each(t, middle)
-        mean, slope = windows.mean[kept] @ lines, windows.slope[kept] @ lines
+        kept = windows.taken(one_about_each(t, middle))
+        mean, slope = (weights @ lines for weights in kept.matrices())
         mean.sort_indices()
         slope.sort_indices()
-        return WindowRows(mean, slope)
+        return Windows.of_matrices(mean, slope)
 
-    def _even_windows(self, x: np.ndarray, dt_s: float) -> WindowRows:
+    def _even_windows(self, x: np.ndarray, dt_s: float) -> Windows:
         half_width = self._half_width(x, dt_s)
         _check_width(2 * half_width + 1, len(x), "half_width_s")
         power = bump_power(half_width)
@@ -154,13 +133,8 @@ class Bumps:
         fall = s * (1.0 - s**2) ** (power - 1.0)
         # Scaled so that the slope of a straight line is exact however few samples a bump spans.
         fall /= fall @ s * half_width * dt_s
-        stride = max(1, half_width // self.overlap)
-        first = np.arange(0, len(x) - 2 * half_width, stride, dtype=np.int32)
-        inside = first[:, None] + np.arange(2 * half_width + 1, dtype=np.int32)
-        return WindowRows(
-            mean=_rows(inside, np.broadcast_to(phi / phi.sum(), inside.shape), len(x)),
-            slope=_rows(inside, np.broadcast_to(fall, inside.shape), len(x)),
-        )
+        first = np.arange(0, len(x) - 2 * half_width, max(1, half_width // self.overlap))
+        return Windows.even(first, phi / phi.sum(), fall, len(x))
 
     def _half_width(self, x: np.ndarray, dt_s: float) -> int:
         if self.half_width_s is None:
@@ -240,10 +214,3 @@ def _check_width(n_points: int, n_samples: int, name: str) -> None:
             f"a window must fit the trajectory: {n_points} samples were asked of {n_samples}; "
             f"lower {name} or use more data"
         )
-
-
-def _rows(columns: np.ndarray, weights: np.ndarray, n_samples: int) -> csr_array:
-    """Sparse matrix with one row per window: `weights` (windows, width) at samples `columns`."""
-    n_windows, width = columns.shape
-    starts = np.arange(0, n_windows * width + 1, width)
-    return csr_array((weights.ravel(), columns.ravel(), starts), shape=(n_windows, n_samples))

@@ -6,12 +6,11 @@ they were set and not measured, are treated as free of noise.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import block_diag, csr_array
 
 from ep2sindy.data.coerce import check_domain, keep_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
@@ -20,8 +19,9 @@ from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.sampling import stretches
 from ep2sindy.regression.splits import RandomSplit, Split
-from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions, WindowRows
+from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.regression.windows import Windows
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 from ep2sindy.signals.smoothers import Smoother
@@ -135,11 +135,11 @@ class Weak:
         name = runs[0].run.state_names[state]
         parts = [run.rows(state) for run in runs]
         test = np.concatenate([part.test for part in parts])
-        mean, slope = _stack(p.mean for p in parts), _stack(p.slope for p in parts)
+        windows = Windows.joined([part.windows for part in parts])
         n_segments = np.cumsum([0, *(run.segment[-1] + 1 for run in runs)])
-        target = slope @ np.concatenate([run.run.states[:, state] for run in runs])
+        target = windows.slopes(np.concatenate([run.run.states[:, state] for run in runs]))
         return RegressionRows(
-            theta=mean @ np.concatenate([run.terms for run in runs]),
+            theta=windows.means(np.concatenate([run.terms for run in runs])),
             target=target[:, None],
             library=library,
             equations=(name,),
@@ -148,7 +148,7 @@ class Weak:
             ),
             test=test,
             trajectories=tuple(trajectories),
-            noisy=_noisy_rows(name, runs, _taken(mean, ~test), _taken(slope, ~test), target[~test])
+            noisy=_noisy_rows(name, runs, windows.taken(~test), target[~test])
             if self.errors_in_variables
             else None,
         )
@@ -167,7 +167,7 @@ class _Sampled:
     names: tuple[str, ...]
     terms: Float[np.ndarray, "samples terms"]
     estimate: KalmanEstimate | None
-    windows: Sequence[WindowRows]
+    windows: Sequence[Windows]
     segment: Int[np.ndarray, " samples"]
     held_out: Bool[np.ndarray, " samples"]
 
@@ -179,8 +179,7 @@ class _Sampled:
         share = (n_held_out[last + 1] - n_held_out[first]) / (last + 1 - first)
         pure = (share == 0.0) | (share == 1.0)
         return _Rows(
-            mean=_taken(windows.mean, pure),
-            slope=_taken(windows.slope, pure),
+            windows=windows.taken(pure),
             segment=self.segment[(first + last) // 2][pure],
             test=share[pure] == 1.0,
         )
@@ -190,8 +189,7 @@ class _Sampled:
 class _Rows:
     """Rows of one state on one trajectory; segment: (rows,), that of the middle of the window."""
 
-    mean: csr_array
-    slope: csr_array
+    windows: Windows
     segment: Int[np.ndarray, " rows"]
     test: Bool[np.ndarray, " rows"]
 
@@ -202,25 +200,13 @@ def _pieces(run: Trajectory) -> list[Trajectory]:
     return [run] if parts == [(0, run.n_samples)] else [run.window(*part) for part in parts]
 
 
-def _taken(matrix: csr_array, rows: Bool[np.ndarray, " rows"]) -> csr_array:
-    """Some rows of a sparse matrix; the matrix itself if that is all, which saves the copy."""
-    return matrix if rows.all() else matrix[rows]
-
-
-def _stack(blocks: Iterable[csr_array]) -> csr_array:
-    """Block-diagonal matrix of the windows of all trajectories over all their samples."""
-    first, *others = blocks
-    return block_diag([first, *others], format="csr") if others else first
-
-
 def _noisy_rows(
-    name: str, runs: Sequence[_Sampled], mean: csr_array, slope: csr_array, target: np.ndarray
+    name: str, runs: Sequence[_Sampled], windows: Windows, target: Float[np.ndarray, " rows"]
 ) -> NoisyRows:
     names = runs[0].names
     estimates = [run.estimate for run in runs if run.estimate is not None]
     return NoisyRows(
-        mean=mean,
-        slope=slope,
+        windows=windows,
         target=target,
         state=names.index(name),
         values=np.concatenate([run.run.columns(names) for run in runs]),

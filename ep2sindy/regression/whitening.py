@@ -210,7 +210,7 @@ class _Linearised:
         sensitivity *= noise_std
         target_scale = float(problem.target_scale[0])
         factor = _banded_cholesky(_covariance(rows, sensitivity, target_scale))
-        windows = rows.stretches
+        windows = rows.windows
         white = np.empty((2 * len(coef) + 1, len(windows.first)))
         flat = terms.reshape(2 * len(coef), n_samples)
         sum_windows(windows.starts, windows.first, windows.mean, flat, white[:-1])
@@ -244,7 +244,7 @@ class _Linearised:
     def correct(self, coef: Float[np.ndarray, " terms"]) -> Float[np.ndarray, "variables samples"]:
         """Samples minus their most likely noise."""
         weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
-        rows, windows = self.source, self.source.stretches
+        rows, windows = self.source, self.source.windows
         values, _, noise_std = rows.columns
         by_mean, by_slope = np.empty((2, values.shape[1]))
         for weights, sums in ((windows.mean, by_mean), (windows.slope, by_slope)):
@@ -269,7 +269,7 @@ def _lift(
     n = len(library.variables)
     curved = np.flatnonzero(library.exponents[:, n:].any(axis=1))
     some, lift = library.take(curved), np.zeros((len(x), len(library)))
-    left = max(1.0 - rows.mean.shape[0] / rows.values.size, 0.0)
+    left = max(1.0 - len(rows.windows) / rows.values.size, 0.0)
     here = some.evaluate(x)
     for v in range(n):
         step = np.zeros_like(x)
@@ -285,7 +285,7 @@ def _covariance(
     rows: NoisyRows, sensitivity: Float[np.ndarray, "variables samples"], target_scale: float
 ) -> Float[np.ndarray, "band rows"]:
     """Covariance of the rows by the samples' noise, from its diagonal downwards."""
-    windows = rows.stretches
+    windows = rows.windows
     own, std = sensitivity[rows.state], rows.columns[2][rows.state] / target_scale
     band = np.zeros((len(windows.first), windows.width))
     banded_covariance(

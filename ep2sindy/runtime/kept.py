@@ -22,7 +22,6 @@ from typing import Any, Protocol, runtime_checkable
 from zipfile import BadZipFile
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from ep2sindy._stubs import PACKAGE
 from ep2sindy.runtime.files import WriteError, replacing, sweep
@@ -244,9 +243,6 @@ class _Packer:
             return {kind.__name__: [self.node(each) for each in value]}
         if kind is range:
             return {"range": [value.start, value.stop, value.step]}
-        if kind is csr_array:
-            parts = [value.data, value.indices, value.indptr, tuple(value.shape)]
-            return {"csr": [self.node(part) for part in parts]}
         if kind in (dict, MappingProxyType):
             pairs = [[self.node(key), self.node(each)] for key, each in value.items()]
             return {"dict" if kind is dict else "mapping": pairs}
@@ -297,9 +293,6 @@ class _Unpacker:
             return _class(content[0], object).by_name(str(content[1]))
         if kind == "named":
             return _class(content[0], tuple)._make(map(self.value, content[1]))
-        if kind == "csr":
-            *parts, shape = map(self.value, content)
-            return csr_array(tuple(parts), shape=shape)
         if kind == "range":
             return range(*content)
         if kind in ("dict", "mapping"):
