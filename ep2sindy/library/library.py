@@ -232,18 +232,20 @@ class Library:
     ) -> tuple[Library, Float[np.ndarray, "terms columns products"]]:
         """Terms and their derivatives by the first n variables, as sums of distinct products.
 
-        Returns a library of these products, sorted by exponents, and weights of shape
+        Returns a library of these products, sorted by ascending exponents, and weights of shape
         (terms, 1 + n, products), which combine the products to each term and its n derivatives.
         """
         slopes = [[{term: 1.0}, *map(term.derivative, self.variables[:n])] for term in self.terms]
-        distinct = dict.fromkeys(t for sums in slopes for parts in sums for t in parts)
-        products = by_exponents(library_of(self.variables, distinct))
-        shares = np.zeros((len(self), 1 + n, len(products)))
+        distinct = list(dict.fromkeys(t for sums in slopes for parts in sums for t in parts))
+        unsorted = library_of(self.variables, distinct)
+        order = np.lexsort(unsorted.exponents.T[::-1])
+        places = {distinct[k]: place for place, k in enumerate(order.tolist())}
+        shares = np.zeros((len(self), 1 + n, len(distinct)))
         for row, sums in zip(shares, slopes, strict=True):
             for column, parts in zip(row, sums, strict=True):
                 for term, weight in parts.items():
-                    column[products._places[term]] = weight
-        return products, shares
+                    column[places[term]] = weight
+        return unsorted.take(order), shares
 
     @cached_property
     def _named(self) -> dict[str, int]:
@@ -290,11 +292,6 @@ def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:
             row[places[factor]] = power
     functions = [factor for factor in factors if isinstance(factor, Function)]
     return Library(variables, exponents, functions)
-
-
-def by_exponents(library: Library) -> Library:
-    """Sort the terms by ascending exponents, comparing those of the first variable first."""
-    return library.take(np.lexsort(library.exponents.T[::-1]))
 
 
 def named_terms(variables: Sequence[str], names: Sequence[str]) -> Library:

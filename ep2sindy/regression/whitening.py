@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg.lapack import dpbtrf, dtbtrs
 
 from ep2sindy.data.coerce import keep_inside
-from ep2sindy.data.numbers import column_norms
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.window_kernels import (
@@ -109,7 +109,8 @@ def _near(
     before: Float[np.ndarray, " terms"], after: Float[np.ndarray, " terms"], share: float
 ) -> bool:
     """Whether coefficients differ by less than a share of the latter; never for a share of 0."""
-    return bool(np.linalg.norm(after - before) < share * np.linalg.norm(after))
+    change = after - before
+    return bool(change @ change < share**2 * (after @ after))
 
 
 def _following(
@@ -233,7 +234,7 @@ class _Linearised:
         """Coefficients of the chosen terms; the terms at x are instruments for the noisy terms."""
         coef = np.zeros(len(terms))
         theta, drifted = self.theta[:, terms], self.drifted[:, terms]
-        scale = column_norms(theta)
+        scale = zero_to_one(np.sqrt(np.einsum("rc,rc->c", theta, theta)))
         instruments = theta / scale
         coef[terms] = (
             np.linalg.lstsq(instruments.T @ (drifted / scale), instruments.T @ self.target)[0]
