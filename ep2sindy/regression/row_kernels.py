@@ -92,11 +92,11 @@ def count_drawn(first, ends, n_drawn, block, counts):
         row, left = counts[d], n_drawn[d]
         for i in range(len(row)):
             row[i] = 0.0
-        for run in range(start, ends[d]):
+        for place in first[start : ends[d]]:
             if block == 1:
-                row[first[run]] += 1.0
+                row[place] += 1.0
                 continue
-            for i in range(first[run], first[run] + min(block, left)):
+            for i in range(place, place + min(block, left)):
                 row[i] += 1.0
             left -= block
         start = ends[d]
