@@ -28,7 +28,8 @@ def smooth(values, first, middle, last, out):
                 end += last[i, k] * values[v, n_samples - len(middle) + k]
             out[v, i], out[v, n_samples - half + i] = begin, end
         within = out[v, half : n_samples - half]
-        within[:] = 0.0
+        for i in range(len(within)):
+            within[i] = 0.0
         for k in range(len(middle)):  # outermost, so that the samples fill the vector units
             moved = values[v, k : k + len(within)]
             for i in range(len(within)):
@@ -62,14 +63,18 @@ def fill_rows(known, table, rates, train, test, train_rows, test_rows, scale):
     n_terms, column = len(table), np.empty(known.shape[1])
     for j in range(len(scale)):
         if j < n_terms:
-            column[:] = known[table[j, 0]]
+            first = known[table[j, 0]]
+            for i in range(len(column)):
+                column[i] = first[i]
             for k in range(1, table.shape[1]):
                 if table[j, k] < len(known) - 1:
                     factor = known[table[j, k]]
                     for i in range(len(column)):
                         column[i] *= factor[i]
         else:
-            column[:] = rates[j - n_terms]
+            rate = rates[j - n_terms]
+            for i in range(len(column)):
+                column[i] = rate[i]
         largest, squares = 0.0, 0.0
         for i in range(len(train)):
             train_rows[j, i] = column[train[i]]
@@ -93,7 +98,8 @@ def fill_running_sums(rows, means, sums):
     pairs).
     """
     n_columns = len(rows)
-    sums[0] = 0.0
+    for pair in range(sums.shape[1]):
+        sums[0, pair] = 0.0
     row = np.empty(n_columns)
     for i in range(rows.shape[1]):
         for a in range(n_columns):
@@ -115,7 +121,8 @@ def add_steps(starts, places, steps, running, means, n_drawn, sums):
     n_drawn: (draws,) sum of weights.
     """
     for d in range(len(sums)):
-        sums[d] = n_drawn[d] * means
+        for pair in range(sums.shape[1]):
+            sums[d, pair] = n_drawn[d] * means[pair]
         for k in range(starts[d], starts[d + 1]):
             for pair in range(sums.shape[1]):
                 sums[d, pair] += steps[k] * running[places[k], pair]
@@ -134,8 +141,16 @@ def alike(states, limit):
     """True if two states are correlated by more than `limit`."""
     unit = np.empty(states.shape)
     for s in range(len(states)):
-        unit[s] = states[s] - states[s].mean()
-        unit[s] /= np.sqrt(dot(unit[s], unit[s]))
+        row, own = states[s], unit[s]
+        mean = 0.0
+        for i in range(len(row)):
+            mean += row[i]
+        mean /= len(row)
+        for i in range(len(row)):
+            own[i] = row[i] - mean
+        share = 1.0 / np.sqrt(dot(own, own))
+        for i in range(len(row)):
+            own[i] *= share
         for r in range(s):
             if abs(dot(unit[r], unit[s])) >= limit:
                 return True
@@ -163,6 +178,17 @@ def _write_mask(code, mask):
 
 
 @compiled
+def _order_by_size(values, order):
+    """Write the places of the values, the largest in size first, equal ones in order."""
+    for a in range(len(values)):  # insertion; numba's sort takes a second to compile
+        place = a
+        while place > 0 and abs(values[order[place - 1]]) < abs(values[a]):
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = a
+
+
+@compiled
 def supports_of_draws(xx, xy, yy, largest, max_terms, most_work, codes):
     """Write the best support of every size in every draw, for each equation.
 
@@ -172,10 +198,12 @@ def supports_of_draws(xx, xy, yy, largest, max_terms, most_work, codes):
     n_draws, n_equations, n_terms = xy.shape
     ordered_xx, ordered_xy = np.empty((1, n_terms, n_terms)), np.empty((1, n_terms))
     ordered_yy, mask = np.empty(1), np.empty(n_terms, dtype=np.bool_)
-    codes[:] = -1
+    order = np.empty(n_terms, dtype=np.int64)
     for e in range(n_equations):
         for d in range(n_draws):
-            order = np.argsort(-(xy[d, e] ** 2), kind="mergesort")
+            _order_by_size(xy[d, e], order)
+            for size in range(codes.shape[2]):
+                codes[e, d, size] = -1
             for a in range(n_terms):
                 ordered_xy[0, a] = xy[d, e, order[a]]
                 for b in range(n_terms):
@@ -189,7 +217,9 @@ def supports_of_draws(xx, xy, yy, largest, max_terms, most_work, codes):
             for k in range(len(found)):
                 for a in range(n_terms):
                     mask[order[a]] = found[k, a]
-                size = mask.sum()
+                size = 0
+                for a in range(n_terms):
+                    size += mask[a]
                 if size <= largest:
                     codes[e, d, size] = _code(mask)
     return True
@@ -203,22 +233,22 @@ def best_of_sizes(codes, train, judge, best):
     """
     n_equations, n_draws, n_sizes = codes.shape
     n_terms = len(train) - n_equations
-    xx = np.ascontiguousarray(train[:n_terms, :n_terms])
     mask, rhs = np.empty((1, n_terms), dtype=np.bool_), np.empty((1, n_terms))
-    best[:] = -1
-    best[:, 0] = 0
     for e in range(n_equations):
         y = n_terms + e
+        best[e, 0] = 0
         for size in range(1, n_sizes):
-            most = -np.inf
+            most, best[e, size] = -np.inf, -1
             for d in range(n_draws):
-                code = codes[e, d, size]
-                if code < 0 or code in codes[e, :d, size]:
+                code, earlier = codes[e, d, size], 0
+                while codes[e, earlier, size] != code:
+                    earlier += 1
+                if code < 0 or earlier < d:
                     continue
                 _write_mask(code, mask[0])
                 for a in range(n_terms):
                     rhs[0, a] = train[y, a] if mask[0, a] else 0.0
-                coef = solve_masks(xx, rhs, mask)[0]
+                coef = solve_masks(train, rhs, mask)[0]
                 explained = 0.0
                 for a in range(n_terms):
                     change = 2.0 * judge[y, a]
@@ -232,7 +262,9 @@ def best_of_sizes(codes, train, judge, best):
 @compiled(**REORDERED)
 def _residual(rows, target, coef, out):
     """Write target - sum of coef times column; returns its sum of squares."""
-    out[:] = rows[target]
+    aim = rows[target]
+    for i in range(len(out)):
+        out[i] = aim[i]
     for a in range(len(coef)):
         if coef[a] != 0.0:
             row = rows[a]
@@ -251,7 +283,6 @@ def fit_best(best, gram, train_rows, test_rows, refined, coef, squares, r2_train
     of the training residuals. r2_test: NaN if no rows are held out.
     """
     n_equations, n_sizes, n_terms = coef.shape
-    xx = np.ascontiguousarray(gram[:n_terms, :n_terms])
     mask, rhs = np.empty((1, n_terms), dtype=np.bool_), np.empty((1, n_terms))
     left, left_test = np.empty(train_rows.shape[1]), np.empty(test_rows.shape[1])
     for e in range(n_equations):
@@ -259,20 +290,27 @@ def fit_best(best, gram, train_rows, test_rows, refined, coef, squares, r2_train
         total = spread(train_rows[y])
         total_test = spread(test_rows[y])
         for size in range(n_sizes):
-            coef[e, size] = 0.0
+            for a in range(n_terms):
+                coef[e, size, a] = 0.0
             if best[e, size] < 0:
                 continue
             _write_mask(best[e, size], mask[0])
             for a in range(n_terms):
                 rhs[0, a] = gram[y, a] if mask[0, a] else 0.0
-            coef[e, size] = solve_masks(xx, rhs, mask)[0]
+            fit = solve_masks(gram, rhs, mask)
+            for a in range(n_terms):
+                coef[e, size, a] = fit[0, a]
             for _ in range(2):
                 _residual(train_rows, y, coef[e, size], left)
                 for a in range(n_terms):
                     rhs[0, a] = dot(left, train_rows[a]) if mask[0, a] else 0.0
-                step = solve_masks(xx, rhs, mask)[0]
-                coef[e, size] += step
-                if np.abs(step).max() <= refined * np.abs(coef[e, size]).max():
+                step = solve_masks(gram, rhs, mask)
+                largest, longest = 0.0, 0.0
+                for a in range(n_terms):
+                    coef[e, size, a] += step[0, a]
+                    longest = max(longest, abs(step[0, a]))
+                    largest = max(largest, abs(coef[e, size, a]))
+                if longest <= refined * largest:
                     break  # the next step would be as much smaller again
             squares[e, size] = _residual(train_rows, y, coef[e, size], left)
             r2_train[e, size] = 1.0 - squares[e, size] / total
@@ -317,4 +355,6 @@ def fit_draws(codes, chosen, xx, xy, scale, coef):
             for a in range(n_terms):
                 mask[0, a] &= scale[d, a] > 0.0
                 rhs[0, a] = xy[d, e, a] if mask[0, a] else 0.0
-            coef[d, e] = solve_masks(xx[d], rhs, mask)[0] * scale[d]
+            fit = solve_masks(xx[d], rhs, mask)
+            for a in range(n_terms):
+                coef[d, e, a] = fit[0, a] * scale[d, a]

@@ -291,7 +291,8 @@ def _candidates(
     sizes = supports.masks.sum(axis=1)
     of, columns = np.nonzero(supports.masks)
     coef, inclusion = coef_SI[of, columns], supports.inclusion[sizes[of], columns]
-    names, ends = [problem.term_names[j] for j in columns.tolist()], np.cumsum(sizes).tolist()
+    of_terms = problem.term_names
+    names, ends = [of_terms[j] for j in columns.tolist()], np.cumsum(sizes).tolist()
     r2_train, r2_test, share = (
         fits.r2_train.tolist(),
         fits.r2_test.tolist(),

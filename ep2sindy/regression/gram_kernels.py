@@ -52,7 +52,7 @@ def substitute(lower, rhs, active, n_active, out):
 @compiled(fastmath={"contract"}, error_model="numpy")
 def factorise(xx, active, lower):
     """Write the first independent terms, earlier ones first, and their factor; returns how many."""
-    n_active = 0
+    n_active = np.int64(0)  # as a bare 0 it would have callees compiled twice
     for j in range(len(xx)):
         if append_term(xx, active, n_active, j, lower):
             active[n_active] = j
@@ -91,7 +91,8 @@ def all_usable(gram, order, same):
                 return False
         if xx[a, a] <= 0.0:
             return False
-    return independent_terms(xx).all()
+    lower, active = np.empty((n_terms, n_terms)), np.empty(n_terms, dtype=np.int64)
+    return factorise(xx, active, lower) == n_terms
 
 
 @compiled(fastmath={"contract"}, error_model="numpy")
@@ -101,7 +102,7 @@ def _extend(xx, mask, active, n_active, lower):
     active: n_active terms that have a row of the factor already. Masks in the order of
     `pool_masks` often begin with the terms of the one before, whose rows are kept.
     """
-    n_same = 0
+    n_same = np.int64(0)  # as a bare 0 it would have callees compiled twice
     for j in range(len(mask)):
         if not mask[j]:
             continue
@@ -125,7 +126,7 @@ def solve_masks(xx, rhs, masks):
     n_masks, n_terms = masks.shape
     coef = np.zeros((n_masks, n_terms))
     solution, lower = np.empty(n_terms), np.empty((n_terms, n_terms))
-    active, n_active = np.empty(n_terms, dtype=np.int64), 0
+    active, n_active = np.empty(n_terms, dtype=np.int64), np.int64(0)
     for m in range(n_masks):  # loops, since fancy indices would take seconds longer to compile
         n_active, solved = _extend(xx, masks[m], active, n_active, lower)
         if solved:
@@ -148,8 +149,10 @@ def rank_masks(xx, xy, judge_xx, judge_xy, masks, lower, solution, active, expla
     explained: (masks,), NaN for dependent terms. lower: (terms, terms), solution: (terms,) and
     active: (terms,) of int are scratch.
     """
-    best[:] = -1
-    n_active = 0
+    n_active = np.int64(0)
+    for size in range(len(best)):
+        for k in range(best.shape[1]):
+            best[size, k] = -1
     for m in range(len(masks)):
         n_active, solved = _extend(xx, masks[m], active, n_active, lower)
         explained[m] = np.nan

@@ -7,8 +7,6 @@ import numpy as np
 
 from ep2sindy.runtime.compilation import REORDERED, compiled
 
-SMALL = 1e-200  # a sum of squares from it to its inverse has lost nothing to the number format
-
 TILE = 1024  # rows whose residual stays in the fastest cache
 
 
@@ -40,27 +38,6 @@ def gather_columns(values, places, norms, first, columns):
         column, share = columns[first + j], 1.0 / norms[j]
         for i in range(len(places)):
             column[i] = values[places[i], j] * share
-
-
-@compiled(**REORDERED)
-def fill_norms(columns, norms):
-    """Write the norms of the columns; 1 for a column of zeros.
-
-    Squares of densities may overflow, and then the column is first divided by its largest value.
-    """
-    for j in range(len(columns)):
-        column = columns[j]
-        squares = dot(column, column)
-        if SMALL < squares < 1.0 / SMALL:
-            norms[j] = np.sqrt(squares)
-            continue
-        largest, squares = 0.0, 0.0
-        for i in range(len(column)):
-            largest = max(largest, abs(column[i]))
-        over = 1.0 / largest if largest > 0.0 else 1.0
-        for i in range(len(column)):
-            squares += (column[i] * over) ** 2
-        norms[j] = largest * np.sqrt(squares) if largest > 0.0 else 1.0
 
 
 @compiled(**REORDERED)
@@ -113,13 +90,15 @@ def count_drawn(first, ends, n_drawn, block, counts):
     start = 0
     for d in range(len(ends)):
         row, left = counts[d], n_drawn[d]
-        row[:] = 0.0
+        for i in range(len(row)):
+            row[i] = 0.0
         for place in first[start : ends[d]]:
             if block == 1:
                 row[place] += 1.0
-            else:
-                row[place : place + min(block, left)] += 1.0
-                left -= block
+                continue
+            for i in range(place, place + min(block, left)):
+                row[i] += 1.0
+            left -= block
         start = ends[d]
 
 

