@@ -6,7 +6,9 @@ support.
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import compiled
+from ep2sindy.runtime.compilation import LOOPS, compiled
+
+WITHIN = {**LOOPS, "no_cpython_wrapper": True}  # for kernels that only kernels call
 
 # A column counts as dependent on others if their residual of its square falls below this share.
 DEPENDENT = 1e-11
@@ -15,7 +17,7 @@ DEPENDENT = 1e-11
 ROUNDING = 1e-15
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def append_term(xx, active, n_active, term, lower):
     """Write the row by which a term extends the Cholesky factor of the active ones.
 
@@ -35,7 +37,7 @@ def append_term(xx, active, n_active, term, lower):
     return True
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def substitute(lower, rhs, active, n_active, out):
     """Solve xx[active][:, active] out = rhs[active] by the Cholesky factor of the active terms."""
     for i in range(n_active):
@@ -49,7 +51,7 @@ def substitute(lower, rhs, active, n_active, out):
             out[k] -= lower[i, k] * out[i]
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def factorise(xx, active, lower):
     """Write the first independent terms, earlier ones first, and their factor; returns how many."""
     n_active = np.int64(0)  # as a bare 0 it would have callees compiled twice
@@ -95,7 +97,7 @@ def all_usable(gram, order, same):
     return factorise(xx, active, lower) == n_terms
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _extend(xx, mask, active, n_active, lower):
     """Write the terms of a mask and their factor; returns how many, and whether they are so.
 
