@@ -8,6 +8,7 @@ assembled rows and end with the best candidate of every size on the held-out row
 
 Then the calls that a user makes: `ep.discover` by the thesis's recipe, by one threshold sweep, and
 by default, each with its test whether the model leaves more than noise; and of 100,000 samples.
+PySINDy's fit beside it is given one threshold, and tests nothing.
 
     python -m benchmarks.search
     python -m benchmarks.search long   # one regression on 10,000,000 samples: time and memory
@@ -20,6 +21,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import pysindy
 import sklearn
 from sklearn.linear_model import lasso_path
 from threadpoolctl import threadpool_limits
@@ -132,8 +134,16 @@ def calls() -> None:
         for name, method in METHODS.items():
             call = partial(ep.discover, run, method=method, seed=0)
             print(f"discover, {name:<34}{1e3 * cpu_s(call, n_runs=9):8.1f} ms")
+        theirs_s = cpu_s(partial(pysindy_fit, run), n_runs=9)
+        print(f"PySINDy, STLSQ at one threshold             {1e3 * theirs_s:8.1f} ms")
         call = partial(ep.discover, long, method=METHODS["thesis"], seed=0)
         print(f"discover, {f'thesis, {long.n_samples} samples':<34}{cpu_s(call, n_runs=3):8.2f} s")
+
+
+def pysindy_fit(run: ep.Trajectory) -> None:
+    library = pysindy.PolynomialLibrary(degree=2)
+    model = pysindy.SINDy(optimizer=pysindy.STLSQ(threshold=0.1), feature_library=library)
+    model.fit(run.states, t=run.dt_s)
 
 
 def long_record(n_samples: int = 10_000_000) -> None:
