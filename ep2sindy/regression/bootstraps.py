@@ -258,7 +258,7 @@ def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ te
 
 def moving_block_counts(
     n_rows: int, *, n_drawn: int, block: int, rng: np.random.Generator
-) -> Float[np.ndarray, " rows"]:
+) -> Int[np.ndarray, " rows"]:
     """Number of times each row occurs in a draw of `n_drawn` rows, made of runs of `block` rows.
 
     A row may stand for a group of rows that are drawn together.
@@ -268,7 +268,7 @@ def moving_block_counts(
     Source: Kuensch 1989, doi:10.1214/aos/1176347265.
     """
     first = draw_blocks(n_rows, n_drawn=n_drawn, block=block, rng=rng)
-    return _counts([first], [n_drawn], n_rows=n_rows, block=block)[0]
+    return _counts([first], [n_drawn], n_rows=n_rows, block=block)[0].astype(np.int64)
 
 
 def draw_blocks(

@@ -26,6 +26,7 @@ MOST_WORK = 2e9  # multiplications of one search for a proof, a few seconds
 Gram = Float[np.ndarray, "terms terms"]
 Products = Float[np.ndarray, " terms"]
 Masks = Bool[np.ndarray, "supports terms"]
+MasksByDraw = list[Bool[np.ndarray, "_ terms"]]
 
 
 @runtime_checkable
@@ -66,7 +67,7 @@ class AdaptiveLasso:
         xx: Float[np.ndarray, "draws terms terms"],
         xy: Float[np.ndarray, "draws terms"],
         yy: Float[np.ndarray, " draws"],
-    ) -> list[Masks]:
+    ) -> MasksByDraw:
         """Supports of every draw, as `supports` of one."""
         n_draws, n = xy.shape
         masks = np.empty((n_draws * PATH_PER_TERM * (n + 1), n), dtype=np.bool_)
@@ -108,7 +109,7 @@ class STLSQ:
         xx: Float[np.ndarray, "draws terms terms"],
         xy: Float[np.ndarray, "draws terms"],
         yy: Float[np.ndarray, " draws"],
-    ) -> list[Masks]:
+    ) -> MasksByDraw:
         """Supports of every draw, as `supports` of one."""
         n_draws, n = xy.shape
         thresholds = np.sqrt(yy)[:, None] * self._shares
@@ -205,7 +206,7 @@ def subsets_within(
     return masks, proven
 
 
-def _by_draw(masks: Masks, ends: Int[np.ndarray, " draws"]) -> list[Masks]:
+def _by_draw(masks: Masks, ends: Int[np.ndarray, " draws"]) -> MasksByDraw:
     """The masks of every draw, from those of all and their number up to each."""
     bounds = [0, *ends.tolist()]
     return [masks[start:end] for start, end in pairwise(bounds)]
