@@ -6,13 +6,14 @@ from first[i] on. Loops run over slices: with sums of indices in them they would
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
+from ep2sindy.runtime.compilation import INNER, LOOPS, compiled
 
-FAST = {"fastmath": {"reassoc", "contract"}, "error_model": "numpy", **SEPARATE_ARRAYS}
+REORDERED = {"fastmath": {"reassoc", "contract"}}  # sums in any order go through vector units
+FAST, FAST_INNER = {**LOOPS, **REORDERED}, {**INNER, **REORDERED}
 PIECE = 512  # samples
 
 
-@compiled
+@compiled(**LOOPS)
 def band_width(first, last):
     """Largest distance between two rows whose windows overlap, plus one."""
     width, ordered = 1, True
@@ -27,7 +28,6 @@ def band_width(first, last):
     return width
 
 
-@compiled(**FAST)
 def linearise(columns, table, term, variable, product, weight, departure, coef, terms, sensitivity):
     """Write terms, terms moved along their derivatives, and the slopes of their sum, by sample.
 
@@ -38,9 +38,17 @@ def linearise(columns, table, term, variable, product, weight, departure, coef, 
     coef times term. The loops of products and of sums are fused over pieces of samples: terms of
     all samples would not stay in the cache.
     """
+    terms[:], sensitivity[:] = 0.0, 0.0
     values = np.empty((len(table), PIECE))
-    _clear(terms.reshape(-1))
-    _clear(sensitivity.reshape(-1))
+    _linearise(
+        columns, table, term, variable, product, weight, departure, coef, values, terms, sensitivity
+    )
+
+
+@compiled(**FAST)
+def _linearise(
+    columns, table, term, variable, product, weight, departure, coef, values, terms, sensitivity
+):
     for begin in range(0, columns.shape[1], PIECE):
         here = slice(begin, min(begin + PIECE, columns.shape[1]))
         n = here.stop - begin
@@ -60,31 +68,25 @@ def linearise(columns, table, term, variable, product, weight, departure, coef, 
                 _multiply_add(value, weight[e], departure[v, here], terms[1, t, here])
 
 
-@compiled(**FAST)
+@compiled(**FAST_INNER)
 def _copy(values, out):
     for i in range(len(out)):
         out[i] = values[i]
 
 
-@compiled(**FAST)
-def _clear(out):
-    for i in range(len(out)):
-        out[i] = 0.0
-
-
-@compiled(**FAST)
+@compiled(**FAST_INNER)
 def _multiply(value, factor):
     for i in range(len(value)):
         value[i] *= factor[i]
 
 
-@compiled(**FAST)
+@compiled(**FAST_INNER)
 def _add(value, weight, total):
     for i in range(len(value)):
         total[i] += weight * value[i]
 
 
-@compiled(**FAST)
+@compiled(**FAST_INNER)
 def _multiply_add(value, weight, factor, total):
     for i in range(len(value)):
         total[i] += weight * value[i] * factor[i]
@@ -105,13 +107,14 @@ def sum_windows(starts, first, weights, columns, sums):
 @compiled(**FAST)
 def spread_windows(starts, first, weights, rows, samples):
     """Write the sums over rows of their windows times `rows` (rows,), a transposed product."""
-    _clear(samples)
+    for s in range(len(samples)):
+        samples[s] = 0.0
     for i in range(len(first)):
         window = weights[starts[i] : starts[i + 1]]
         _add(window, rows[i], samples[first[i] : first[i] + len(window)])
 
 
-@compiled(**FAST)
+@compiled(**FAST_INNER)
 def _both_products(a, b, c, d):
     """Sum of the scalar products of a with b and of c with d."""
     total = 0.0
@@ -120,7 +123,6 @@ def _both_products(a, b, c, d):
     return total
 
 
-@compiled(**FAST)
 def banded_covariance(starts, first, mean, slope, of_mean, of_both, of_slope, band):
     """Write the covariance of the rows to band[i, k], of row i + k with row i.
 
@@ -128,10 +130,17 @@ def banded_covariance(starts, first, mean, slope, of_mean, of_both, of_slope, ba
     times another, of the target; of_mean, of_both and of_slope (samples,) are the sums over all
     variables of the products of these factors.
     """
-    n_rows, longest = len(first), 0
-    for i in range(n_rows):
-        longest = max(longest, starts[i + 1] - starts[i])
-    by_mean, by_slope = np.empty(longest), np.empty(longest)
+    by_mean, by_slope = np.empty((2, np.diff(starts).max(initial=0)))
+    _banded_covariance(
+        starts, first, mean, slope, of_mean, of_both, of_slope, by_mean, by_slope, band
+    )
+
+
+@compiled(**FAST)
+def _banded_covariance(
+    starts, first, mean, slope, of_mean, of_both, of_slope, by_mean, by_slope, band
+):
+    n_rows = len(first)
     for i in range(n_rows):
         m, w = mean[starts[i] : starts[i + 1]], slope[starts[i] : starts[i + 1]]
         here = slice(first[i], first[i] + len(m))
