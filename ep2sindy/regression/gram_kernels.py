@@ -6,7 +6,9 @@ support.
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import compiled
+from ep2sindy.runtime.compilation import LOOPS, compiled
+
+WITHIN = {**LOOPS, "no_cpython_wrapper": True}  # for kernels that only kernels call
 
 # A column counts as dependent on others if their residual of its square falls below this share.
 DEPENDENT = 1e-11
@@ -15,7 +17,7 @@ DEPENDENT = 1e-11
 ROUNDING = 1e-15
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def append_term(xx, active, n_active, term, lower):
     """Write the row by which a term extends the Cholesky factor of the active ones.
 
@@ -35,7 +37,7 @@ def append_term(xx, active, n_active, term, lower):
     return True
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def substitute(lower, rhs, active, n_active, out):
     """Solve xx[active][:, active] out = rhs[active] by the Cholesky factor of the active terms."""
     for i in range(n_active):
@@ -49,10 +51,10 @@ def substitute(lower, rhs, active, n_active, out):
             out[k] -= lower[i, k] * out[i]
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def factorise(xx, active, lower):
     """Write the first independent terms, earlier ones first, and their factor; returns how many."""
-    n_active = 0
+    n_active = np.int64(0)  # for a plain 0, the functions called with it are compiled once more
     for j in range(len(xx)):
         if append_term(xx, active, n_active, j, lower):
             active[n_active] = j
@@ -94,7 +96,7 @@ def all_usable(gram, order, same):
     return independent_terms(xx).all()
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _extend(xx, mask, active, n_active, lower):
     """Write the terms of a mask and their factor; returns how many, and whether they are so.
 
@@ -125,7 +127,7 @@ def solve_masks(xx, rhs, masks):
     n_masks, n_terms = masks.shape
     coef = np.zeros((n_masks, n_terms))
     solution, lower = np.empty(n_terms), np.empty((n_terms, n_terms))
-    active, n_active = np.empty(n_terms, dtype=np.int64), 0
+    active, n_active = np.empty(n_terms, dtype=np.int64), np.int64(0)
     for m in range(n_masks):  # loops, since fancy indices would take seconds longer to compile
         n_active, solved = _extend(xx, masks[m], active, n_active, lower)
         if solved:
@@ -149,7 +151,7 @@ def rank_masks(xx, xy, judge_xx, judge_xy, masks, lower, solution, active, expla
     active: (terms,) of int are scratch.
     """
     best[:] = -1
-    n_active = 0
+    n_active = np.int64(0)
     for m in range(len(masks)):
         n_active, solved = _extend(xx, masks[m], active, n_active, lower)
         explained[m] = np.nan
