@@ -10,10 +10,13 @@ import numpy as np
 from ep2sindy.regression.gram_kernels import solve_masks
 from ep2sindy.regression.row_kernels import dot, spread
 from ep2sindy.regression.search_kernels import best_subsets
-from ep2sindy.runtime.compilation import REORDERED, compiled
+from ep2sindy.runtime.compilation import GIVEN_ARRAYS, REORDERED, compiled
+
+# REORDERED for kernels that make arrays, or assign whole ones.
+OWN_ARRAYS = {key: value for key, value in REORDERED.items() if key not in GIVEN_ARRAYS}
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def smooth(values, first, middle, last, out):
     """Write weighted sums over the window about each sample; at the ends, over the last full one.
 
@@ -35,7 +38,7 @@ def smooth(values, first, middle, last, out):
                 within[i] += middle[k] * moved[i]
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def differentiate(values, weights, out):
     """Write second-order differences. weights: (3, samples), of three neighbours of each sample."""
     last = values.shape[1] - 1
@@ -52,7 +55,7 @@ def differentiate(values, weights, out):
             out[v, last] += weights[k, last] * values[v, last - 2 + k]
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def fill_rows(known, table, rates, train, test, train_rows, test_rows, scale):
     """Write the scaled columns of terms and targets at the training and the held-out samples.
 
@@ -85,7 +88,7 @@ def fill_rows(known, table, rates, train, test, train_rows, test_rows, scale):
             test_rows[j, i] = column[test[i]] * share
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def fill_running_sums(rows, means, sums):
     """Write the sums over the rows before of the products of all pairs, less their means.
 
@@ -105,7 +108,7 @@ def fill_running_sums(rows, means, sums):
                 pair += 1
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def add_steps(starts, places, steps, running, means, n_drawn, sums):
     """Write the sums of products of every draw, from the places where its weights change.
 
@@ -121,7 +124,7 @@ def add_steps(starts, places, steps, running, means, n_drawn, sums):
                 sums[d, pair] += steps[k] * running[places[k], pair]
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def gram(rows, out):
     """Write the products of all columns: (columns, columns)."""
     for a in range(len(rows)):
@@ -129,7 +132,7 @@ def gram(rows, out):
             out[a, b] = out[b, a] = dot(rows[a], rows[b])
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def alike(states, limit):
     """True if two states are correlated by more than `limit`."""
     unit = np.empty(states.shape)
@@ -229,7 +232,7 @@ def best_of_sizes(codes, train, judge, best):
                     most, best[e, size] = explained, code
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def _residual(rows, target, coef, out):
     """Write target - sum of coef times column; returns its sum of squares."""
     out[:] = rows[target]
@@ -241,7 +244,7 @@ def _residual(rows, target, coef, out):
     return dot(out, out)
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def fit_best(best, gram, train_rows, test_rows, refined, coef, squares, r2_train, r2_test):
     """Fit the best support of every size to the training rows, and score it on both.
 
