@@ -9,7 +9,7 @@ import numpy as np
 
 from ep2sindy.regression.gram_kernels import solve_masks
 from ep2sindy.regression.row_kernels import dot, spread
-from ep2sindy.regression.search_kernels import best_subsets
+from ep2sindy.regression.search_kernels import search_subsets
 from ep2sindy.runtime.compilation import GIVEN_ARRAYS, REORDERED, compiled
 
 # REORDERED for kernels that make arrays, or assign whole ones.
@@ -175,6 +175,14 @@ def supports_of_draws(xx, xy, yy, largest, max_terms, most_work, codes):
     n_draws, n_equations, n_terms = xy.shape
     ordered_xx, ordered_xy = np.empty((1, n_terms, n_terms)), np.empty((1, n_terms))
     ordered_yy, mask = np.empty(1), np.empty(n_terms, dtype=np.bool_)
+    depth = min(max_terms, n_terms)
+    levels, smallest = (
+        np.empty((depth + 1, 1, n_terms + 1, n_terms + 1)),
+        np.empty((1, n_terms + 1)),
+    )
+    scratch, best = np.empty((n_terms + 1, n_terms + 1)), np.empty((depth + 1, 1))
+    chosen, following = np.empty(depth + 1, dtype=np.int64), np.empty(depth + 1, dtype=np.int64)
+    best_masks = np.empty((depth + 1, 1, n_terms), dtype=np.bool_)
     codes[:] = -1
     for e in range(n_equations):
         for d in range(n_draws):
@@ -184,16 +192,15 @@ def supports_of_draws(xx, xy, yy, largest, max_terms, most_work, codes):
                 for b in range(n_terms):
                     ordered_xx[0, a, b] = xx[d, order[a], order[b]]
             ordered_yy[0] = yy[d, e]
-            found, proven = best_subsets(
-                ordered_xx, ordered_xy, ordered_yy, max_terms, 1, most_work
-            )
-            if not proven:
+            if not search_subsets(
+                ordered_xx, ordered_xy, ordered_yy, most_work, levels, smallest, scratch, chosen,
+                following, best, best_masks,
+            ):  # fmt: skip
                 return False
-            for k in range(len(found)):
-                for a in range(n_terms):
-                    mask[order[a]] = found[k, a]
-                size = mask.sum()
-                if size <= largest:
+            for size in range(min(largest, depth) + 1):
+                if best[size, 0] < np.inf:
+                    for a in range(n_terms):
+                        mask[order[a]] = best_masks[size, 0, a]
                     codes[e, d, size] = _code(mask)
     return True
 
