@@ -9,11 +9,14 @@ import numpy as np
 
 from ep2sindy.regression.gram_kernels import solve_masks
 from ep2sindy.regression.row_kernels import dot, spread
-from ep2sindy.regression.search_kernels import best_subsets
-from ep2sindy.runtime.compilation import REORDERED, compiled
+from ep2sindy.regression.search_kernels import search_subsets
+from ep2sindy.runtime.compilation import GIVEN_ARRAYS, REORDERED, compiled
+
+# REORDERED for kernels that make arrays, or assign whole ones.
+OWN_ARRAYS = {key: value for key, value in REORDERED.items() if key not in GIVEN_ARRAYS}
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def smooth(values, first, middle, last, out):
     """Write weighted sums over the window about each sample; at the ends, over the last full one.
 
@@ -36,7 +39,7 @@ def smooth(values, first, middle, last, out):
                 within[i] += middle[k] * moved[i]
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def differentiate(values, weights, out):
     """Write second-order differences. weights: (3, samples), of three neighbours of each sample."""
     last = values.shape[1] - 1
@@ -53,7 +56,7 @@ def differentiate(values, weights, out):
             out[v, last] += weights[k, last] * values[v, last - 2 + k]
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def fill_rows(known, table, rates, train, test, train_rows, test_rows, scale):
     """Write the scaled columns of terms and targets at the training and the held-out samples.
 
@@ -90,7 +93,7 @@ def fill_rows(known, table, rates, train, test, train_rows, test_rows, scale):
             test_rows[j, i] = column[test[i]] * share
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def fill_running_sums(rows, means, sums):
     """Write the sums over the rows before of the products of all pairs, less their means.
 
@@ -111,7 +114,7 @@ def fill_running_sums(rows, means, sums):
                 pair += 1
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def add_steps(starts, places, steps, running, means, n_drawn, sums):
     """Write the sums of products of every draw, from the places where its weights change.
 
@@ -128,7 +131,7 @@ def add_steps(starts, places, steps, running, means, n_drawn, sums):
                 sums[d, pair] += steps[k] * running[places[k], pair]
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def gram(rows, out):
     """Write the products of all columns: (columns, columns)."""
     for a in range(len(rows)):
@@ -136,7 +139,7 @@ def gram(rows, out):
             out[a, b] = out[b, a] = dot(rows[a], rows[b])
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def alike(states, limit):
     """True if two states are correlated by more than `limit`."""
     unit = np.empty(states.shape)
@@ -199,6 +202,12 @@ def supports_of_draws(xx, xy, yy, largest, max_terms, most_work, codes):
     ordered_xx, ordered_xy = np.empty((1, n_terms, n_terms)), np.empty((1, n_terms))
     ordered_yy, mask = np.empty(1), np.empty(n_terms, dtype=np.bool_)
     order = np.empty(n_terms, dtype=np.int64)
+    depth = min(max_terms, n_terms)
+    levels = np.empty((depth + 1, 1, n_terms + 1, n_terms + 1))
+    smallest = np.empty((1, n_terms + 1))
+    scratch, best = np.empty((n_terms + 1, n_terms + 1)), np.empty((depth + 1, 1))
+    chosen, following = np.empty(depth + 1, dtype=np.int64), np.empty(depth + 1, dtype=np.int64)
+    best_masks = np.empty((depth + 1, 1, n_terms), dtype=np.bool_)
     for e in range(n_equations):
         for d in range(n_draws):
             _order_by_size(xy[d, e], order)
@@ -209,18 +218,15 @@ def supports_of_draws(xx, xy, yy, largest, max_terms, most_work, codes):
                 for b in range(n_terms):
                     ordered_xx[0, a, b] = xx[d, order[a], order[b]]
             ordered_yy[0] = yy[d, e]
-            found, proven = best_subsets(
-                ordered_xx, ordered_xy, ordered_yy, max_terms, 1, most_work
-            )
-            if not proven:
+            if not search_subsets(
+                ordered_xx, ordered_xy, ordered_yy, most_work, levels, smallest, scratch, chosen,
+                following, best, best_masks,
+            ):  # fmt: skip
                 return False
-            for k in range(len(found)):
-                for a in range(n_terms):
-                    mask[order[a]] = found[k, a]
-                size = 0
-                for a in range(n_terms):
-                    size += mask[a]
-                if size <= largest:
+            for size in range(min(largest, depth) + 1):
+                if best[size, 0] < np.inf:
+                    for a in range(n_terms):
+                        mask[order[a]] = best_masks[size, 0, a]
                     codes[e, d, size] = _code(mask)
     return True
 
@@ -259,7 +265,7 @@ def best_of_sizes(codes, train, judge, best):
                     most, best[e, size] = explained, code
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def _residual(rows, target, coef, out):
     """Write target - sum of coef times column; returns its sum of squares."""
     aim = rows[target]
@@ -273,7 +279,7 @@ def _residual(rows, target, coef, out):
     return dot(out, out)
 
 
-@compiled(**REORDERED)
+@compiled(**OWN_ARRAYS)
 def fit_best(best, gram, train_rows, test_rows, refined, coef, squares, r2_train, r2_test):
     """Fit the best support of every size to the training rows, and score it on both.
 

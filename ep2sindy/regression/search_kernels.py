@@ -4,6 +4,8 @@ In every kernel, xx: (terms, terms) is a Gram matrix of columns in comparable un
 xy: (terms,) holds their products with one target. A mask: (terms,) of bool is a support.
 """
 
+from typing import Any
+
 import numpy as np
 
 from ep2sindy.regression.gram_kernels import (
@@ -13,7 +15,7 @@ from ep2sindy.regression.gram_kernels import (
     factorise,
     substitute,
 )
-from ep2sindy.runtime.compilation import compiled
+from ep2sindy.runtime.compilation import GIVEN_ARRAYS, compiled
 
 BITS = 62  # terms in one number of a key
 
@@ -302,7 +304,12 @@ def _compare(keys, k, m):
     return 0
 
 
-@compiled
+# For kernels that are given their arrays; sweeps are made in place, so these are not separate ones.
+PLAIN: dict[str, Any] = {"error_model": "numpy", **GIVEN_ARRAYS}
+PLAIN_INNER = {**PLAIN, "no_cpython_wrapper": True}
+
+
+@compiled(**PLAIN_INNER)
 def _sweep(source, target, j, size):
     """Eliminate column j: remove its contribution from the rows and columns after j."""
     for a in range(j + 1, size):
@@ -312,13 +319,13 @@ def _sweep(source, target, j, size):
             target[b, a] = target[a, b]
 
 
-@compiled
+@compiled(**PLAIN_INNER)
 def _join(total, residual, rounding, n_problems):
     """Multiply the product of residuals by one more, in logarithms; plain if there is only one."""
     return residual if n_problems == 1 else total + np.log(max(residual, rounding))
 
 
-@compiled
+@compiled(**PLAIN_INNER)
 def _least_residual(matrices, first, size, smallest, scratch):
     """Product of residuals if all columns from `first` on are used: a bound for a subtree."""
     total = 0.0
@@ -333,7 +340,7 @@ def _least_residual(matrices, first, size, smallest, scratch):
     return total
 
 
-@compiled
+@compiled(**PLAIN_INNER)
 def _offer(residual, chosen, n_chosen, best, best_masks):
     """Insert a subset into the list of the best of its size, sorted by residual, if it is."""
     rank = best.shape[1]
@@ -353,12 +360,10 @@ def _offer(residual, chosen, n_chosen, best, best_masks):
         best_masks[n_chosen, rank, chosen[i]] = True
 
 
-@compiled
-def _root(xx, xy, yy, depth):
-    """Gram matrices of columns and target, room for `depth` levels, and the bounds for zero."""
+@compiled(inline="always")
+def _begin(xx, xy, yy, levels, smallest, best, best_masks):
+    """Write the first level, the bounds for zero, and the empty support as all that is known."""
     n_problems, n_terms = xy.shape
-    levels = np.zeros((depth + 1, n_problems, n_terms + 1, n_terms + 1))
-    smallest = np.empty((n_problems, n_terms + 1))
     for p in range(n_problems):
         for i in range(n_terms):
             for j in range(n_terms):
@@ -367,7 +372,26 @@ def _root(xx, xy, yy, depth):
             smallest[p, i] = DEPENDENT * xx[p, i, i]
         levels[0, p, n_terms, n_terms] = yy[p]
         smallest[p, n_terms] = ROUNDING * yy[p] if yy[p] > 0.0 else 1.0
-    return levels, smallest
+    for size in range(best.shape[0]):
+        for rank in range(best.shape[1]):
+            best[size, rank] = np.inf
+    best[0, 0] = 0.0
+    for j in range(n_terms):
+        best_masks[0, 0, j] = False
+
+
+@compiled(inline="always")
+def _with_column(levels, level, j, smallest):
+    """Product of residuals if column j is chosen as well, and whether it changes any."""
+    n_problems, n_terms = levels.shape[1], levels.shape[2] - 1
+    residual, adds = 0.0, False
+    for p in range(n_problems):  # indexed directly: views would cost more than the arithmetic
+        left, pivot = levels[level, p, n_terms, n_terms], levels[level, p, j, j]
+        if pivot > smallest[p, j]:
+            left -= levels[level, p, j, n_terms] ** 2 / pivot
+            adds = True
+        residual = _join(residual, left, smallest[p, n_terms], n_problems)
+    return residual, adds
 
 
 @compiled(inline="always")  # a call would cost the search 5 %
@@ -383,7 +407,6 @@ def _eliminate(levels, level, j, smallest):
                     below[a, b] = here[a, b]
 
 
-@compiled
 def best_subsets(xx, xy, yy, max_terms, n_best, most_work):
     """The `n_best` supports of least residual of every size up to max_terms, proven best or not.
 
@@ -400,50 +423,43 @@ def best_subsets(xx, xy, yy, max_terms, n_best, most_work):
     """
     n_terms = xy.shape[1]
     depth = min(max_terms, n_terms)
-    levels, smallest = _root(xx, xy, yy, depth)
-    best = np.empty((depth + 1, n_best))
-    for size in range(depth + 1):
-        for rank in range(n_best):
-            best[size, rank] = np.inf
-    best[0, 0] = 0.0
-    best_masks = np.zeros((depth + 1, n_best, n_terms), dtype=np.bool_)
-    proven = _search(levels, smallest, best, best_masks, most_work)
-    found = np.empty((best.size, n_terms), dtype=np.bool_)
-    n_found = 0
-    for size in range(depth + 1):
-        for rank in range(n_best):
-            if best[size, rank] < np.inf:
-                for j in range(n_terms):
-                    found[n_found, j] = best_masks[size, rank, j]
-                n_found += 1
-    return found[:n_found], proven
+    room = room_for_subsets(len(xy), n_terms, depth, n_best)
+    proven = search_subsets(xx, xy, yy, most_work, *room)
+    best, best_masks = room[-2:]
+    return best_masks[best < np.inf], proven
 
 
-@compiled
-def _search(levels, smallest, best, best_masks, most_work):
-    """Branch and bound of `best_subsets`, from the Gram matrices of the first level.
+def room_for_subsets(n_problems, n_terms, depth, n_best):
+    """Arrays of `search_subsets` for supports of up to `depth` terms, in its order."""
+    size = n_terms + 1
+    return (
+        np.empty((depth + 1, n_problems, size, size)), np.empty((n_problems, size)),
+        np.empty((size, size)), np.empty(depth + 1, dtype=np.int64),
+        np.empty(depth + 1, dtype=np.int64), np.empty((depth + 1, n_best)),
+        np.empty((depth + 1, n_best, n_terms), dtype=np.bool_),
+    )  # fmt: skip
 
-    Returns false if it ended for the work that it had done.
+
+@compiled(**PLAIN)
+def search_subsets(
+    xx, xy, yy, most_work, levels, smallest, scratch, chosen, following, best, best_masks
+):
+    """Branch and bound of `best_subsets`; returns false if it ended for the work that it had done.
+
+    Writes residuals to best (sizes, n_best), infinite where there is no support, and supports to
+    best_masks (sizes, n_best, terms). The others are scratch, see `room_for_subsets`.
     """
+    _begin(xx, xy, yy, levels, smallest, best, best_masks)
     n_problems, size = smallest.shape
     depth, n_best, n_terms = best.shape[0] - 1, best.shape[1], size - 1
-    scratch = np.empty((size, size))
-    chosen = np.zeros(depth + 1, dtype=np.int64)
-    following = np.zeros(depth + 1, dtype=np.int64)
-    level, work = 0, 0.0
+    following[0], level, work = 0, 0, 0.0
     while level >= 0:
         j = following[level]
         if j >= n_terms or level == depth:
             level -= 1
             continue
         following[level] = j + 1
-        residual, adds = 0.0, False
-        for p in range(n_problems):  # indexed directly: views would cost more than the arithmetic
-            left, pivot = levels[level, p, n_terms, n_terms], levels[level, p, j, j]
-            if pivot > smallest[p, j]:
-                left -= levels[level, p, j, n_terms] ** 2 / pivot
-                adds = True
-            residual = _join(residual, left, smallest[p, n_terms], n_problems)
+        residual, adds = _with_column(levels, level, j, smallest)
         if not adds:
             continue
         chosen[level] = j

@@ -212,6 +212,20 @@ def _likelihood(steps, values, ratio, parabola):
     return -0.5 * ((n_samples - 3) * np.log(noise) + logs), noise
 
 
+@compiled(inline="always")
+def _follow(h, k, values, gain0, gain1, gain2, weight, signal, slope, bend, total):
+    """Predict sample k under every ratio, add the weighted square of the error, and correct."""
+    for j in range(values.shape[1]):
+        for r in range(len(weight)):
+            turned = slope[j, r] + h * bend[j, r]
+            predicted = signal[j, r] + 0.5 * h * (slope[j, r] + turned)
+            missed = values[k, j] - predicted
+            total[j, r] += weight[r] * missed * missed
+            signal[j, r] = predicted + gain0[r] * missed
+            slope[j, r] = turned + gain1[r] * missed
+            bend[j, r] += gain2[r] * missed
+
+
 @compiled(**LOOPS)
 def _likelihoods(
     steps, values, ratios, parabola, l10, l20, l21, d0, d1, d2, signal, slope, bend,
@@ -252,15 +266,7 @@ def _likelihoods(
             changing = last
         for r in range(n_ratios):
             product[r] *= variance[r]
-        for j in range(n_columns):
-            for r in range(n_ratios):
-                turned = slope[j, r] + h * bend[j, r]
-                predicted = signal[j, r] + 0.5 * h * (slope[j, r] + turned)
-                missed = values[k, j] - predicted
-                total[j, r] += weight[r] * missed * missed
-                signal[j, r] = predicted + d0[r] * missed
-                slope[j, r] = turned + gain1[r] * missed
-                bend[j, r] += gain2[r] * missed
+        _follow(h, k, values, d0, gain1, gain2, weight, signal, slope, bend, total)
         if k % 8 == 0 or k == n_samples - 1:  # fewer logarithms; a product of eight is finite
             for r in range(n_ratios):
                 logs[r] += np.log(product[r])
