@@ -95,7 +95,16 @@ def _observe(i, residual, variance, state, cov, row, gain):
     for j in range(len(state)):
         gain[j] = weight * state[j, cov + i]
     for j in range(len(state)):
-        _add(row, -gain[j], state[j])
+        if j != i:
+            _add(row, -gain[j], state[j])
+    # What differences would lose where the state was far less certain than the sample.
+    left = weight * variance
+    own = state[i]
+    for c in range(len(own)):
+        own[c] = left * row[c]
+    own[0] += residual
+    for j in range(len(state)):
+        state[j, cov + i] = own[cov + j]
     return spread, weight
 
 
