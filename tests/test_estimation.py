@@ -14,8 +14,8 @@ import ep2sindy as ep
 from benchmarks.known_systems import noisy
 from ep2sindy._stubs import dotted_names
 from ep2sindy.discovery.recipe import method_of
-from ep2sindy.estimation import cost, explanation
-from ep2sindy.estimation.kernels import departures, eliminate
+from ep2sindy.estimation import cost, explanation, kernels
+from ep2sindy.estimation.kernels import departures, eliminate, filtered
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, fit_paths, gram, squares
 from ep2sindy.estimation.noise import _shown_by_samples, noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
@@ -86,10 +86,13 @@ def test_eliminated_states_leave_the_squares_of_the_dense_problem(rng: np.random
     assert least == pytest.approx(targets @ off @ targets)
 
 
+@pytest.mark.parametrize(("n", "size"), [(4, 1.0), (200, 1e-7)])
 def test_the_spread_of_innovations_is_the_determinant_of_the_samples(
-    rng: np.random.Generator,
+    rng: np.random.Generator, n: int, size: float
 ) -> None:
-    flow, misses, residuals, variance, process = linear_case(rng, n=4, p=0)
+    """Products of many small variances would leave the range of numbers."""
+    flow, misses, residuals, variance, process = linear_case(rng, n=n, p=0)
+    flow, variance, process = flow / 3.0, size * variance, size * process
     _, _, _, log_spread = eliminate(flow, misses, residuals, variance, process, 10.0)
     n, d = residuals.shape
     # Covariance of all states, from the first one's and the steps'.
@@ -104,6 +107,29 @@ def test_the_spread_of_innovations_is_the_determinant_of_the_samples(
     cov = to @ np.diag(own) @ to.T + np.diag(variance.reshape(-1))
     seen = np.isfinite(residuals).reshape(-1)
     assert log_spread == pytest.approx(np.linalg.slogdet(cov[np.ix_(seen, seen)])[1])
+
+
+def test_squares_add_up_over_pieces_of_a_record(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flow, *case = linear_case(rng, n=50)
+    whole = eliminate(flow / 3.0, *case, 10.0)
+    monkeypatch.setattr(kernels, "PIECE", 60)  # seven samples of two states and three coefficients
+    for found, expected in zip(eliminate(flow / 3.0, *case, 10.0), whole, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_the_last_state_of_the_filter_is_that_of_the_dense_problem(
+    rng: np.random.Generator,
+) -> None:
+    case = linear_case(rng, p=0)
+    rows, targets = dense_rows(*case, 10.0)
+    innovations, mean, cov = filtered(*case, 10.0)
+    d = len(mean)
+    np.testing.assert_allclose(mean, np.linalg.lstsq(rows, targets, rcond=None)[0][-d:], rtol=1e-9)
+    np.testing.assert_allclose(cov, np.linalg.inv(rows.T @ rows)[-d:, -d:], rtol=1e-9)
+    assert np.array_equal(np.isnan(innovations), np.isnan(case[2]))
+    assert np.nansum(innovations**2) == pytest.approx(eliminate(*case, 10.0)[2])
 
 
 def test_departures_are_those_of_the_dense_problem(rng: np.random.Generator) -> None:

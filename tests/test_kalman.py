@@ -161,6 +161,19 @@ def test_ratios_side_by_side_have_the_likelihoods_of_each_alone(t: np.ndarray) -
     assert found == pytest.approx(np.array(alone), rel=1e-12, abs=1e-10)
 
 
+@pytest.mark.parametrize("jumps", [[], [700, 701, 1500]])
+def test_settled_ratios_side_by_side_have_the_likelihoods_of_each_alone(jumps: list[int]) -> None:
+    """After an uneven step, all ratios are followed again."""
+    values, steps = np.random.default_rng(0).normal(size=(2000, 2)), np.ones(1999)
+    values, steps[jumps] = np.cumsum(values, axis=0) / 100.0, 1.5
+    ratios = 10.0 ** np.arange(-14.0, 5.0)
+    alone = [
+        [likelihood(steps, column, ratio)[0] for ratio in ratios]
+        for column in np.ascontiguousarray(values.T)
+    ]
+    np.testing.assert_allclose(likelihoods(steps, values, ratios), alone, rtol=1e-11)
+
+
 def test_the_ratio_found_is_the_most_likely() -> None:
     run = lorenz().trajectory(noise=0.05, rng=np.random.default_rng(2))
     steps, values = np.ones(499), run.states[:500, :1].copy()
