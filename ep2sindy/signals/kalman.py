@@ -80,12 +80,14 @@ class KalmanSmoother:
         Raises ValueError for fewer than five samples.
         """
         steps, step_s = _unit_steps(t, values)
-        spread = np.ptp(values, axis=0)
-        scaled = np.ascontiguousarray((values - values[0]) / zero_to_one(spread))
+        columns = np.ascontiguousarray(values.T)  # the kernels read one after the other
+        spread = columns.max(axis=1) - columns.min(axis=1)
+        columns = (columns - columns[:, :1]) / zero_to_one(spread)[:, None]
         signal, slope = np.empty((2, *values.shape))
-        noise_std, log10_ratio = np.empty(values.shape[1]), self._ratios(steps, scaled, step_s)
-        for j, ratio in enumerate((10.0**log10_ratio).tolist()):
-            column = np.ascontiguousarray(scaled[:, j])
+        noise_std, log10_ratio = np.empty(len(columns)), self._ratios(steps, columns.T, step_s)
+        for j, (column, ratio) in enumerate(
+            zip(columns, (10.0**log10_ratio).tolist(), strict=True)
+        ):
             signal[:, j : j + 1], slope[:, j : j + 1] = smooth(steps, column[:, None], ratio)
             noise_std[j] = np.sqrt(likelihood(steps, column, ratio)[1])
         return KalmanEstimate(
@@ -145,10 +147,10 @@ def most_likely_ratios(
     from scipy.optimize import minimize_scalar  # imported only when the ratio is estimated
 
     decades = np.append(np.arange(lowest, highest, 1.0), highest)
-    on_grid = -likelihoods(steps, values, 10.0**decades)
+    on_grid = -likelihoods(steps, np.ascontiguousarray(values), 10.0**decades)
     ratios = decades[on_grid.argmin(axis=1)]
-    for j, best in enumerate(on_grid.argmin(axis=1).tolist()):
-        column = np.ascontiguousarray(values[:, j])
+    columns = np.ascontiguousarray(values.T)
+    for j, (column, best) in enumerate(zip(columns, on_grid.argmin(axis=1).tolist(), strict=True)):
         found = minimize_scalar(
             partial(_misfit, steps, column),
             bounds=(decades[max(best - 1, 0)], decades[min(best + 1, len(decades) - 1)]),

@@ -176,7 +176,11 @@ def likelihood(steps, values, ratio):
 
 @compiled(**LOOPS)
 def _likelihood(steps, values, ratio, parabola):
-    """`_gains` and `_filter` in one loop that stores nothing, for a search tries many ratios."""
+    """`_gains` and `_filter` in one loop that stores nothing, for a search tries many ratios.
+
+    The state is that predicted for the next sample. Nothing but one product then waits for the
+    sample before; through prediction and correction in turn, twice as many operations would.
+    """
     n_samples = len(values)
     _fill_parabola(steps[0], steps[1], parabola)
     l10, l20, l21, d0, d1, d2 = _start(steps[0], steps[1], ratio, parabola)
@@ -185,6 +189,8 @@ def _likelihood(steps, values, ratio, parabola):
         signal += parabola[0, i] * values[i]
         slope += parabola[1, i] * values[i]
         bend += parabola[2, i] * values[i]
+    signal += steps[2] * (slope + 0.5 * steps[2] * bend)
+    slope += steps[2] * bend
     weight = gain1 = gain2 = log = squares = logs = 0.0
     settled = False
     for k in range(3, n_samples):
@@ -198,11 +204,11 @@ def _likelihood(steps, values, ratio, parabola):
             d0 /= variance  # the gain of the signal
             gain1, gain2 = l10 * d0, l20 * d0
             settled = even and _hardly_changed(d0, d1, d2, old0, old1, old2)
-        turned = slope + h * bend
-        predicted = signal + 0.5 * h * (slope + turned)
-        missed = values[k] - predicted
-        signal = predicted + d0 * missed
-        slope = turned + gain1 * missed
+        ahead = steps[k] if k < n_samples - 1 else 0.0
+        half = 0.5 * ahead * ahead
+        missed = values[k] - signal
+        signal = signal + ahead * slope + half * bend + (d0 + ahead * gain1 + half * gain2) * missed
+        slope = slope + ahead * bend + (gain1 + ahead * gain2) * missed
         bend += gain2 * missed
         squares += weight * missed**2
         logs += log
