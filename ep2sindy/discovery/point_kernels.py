@@ -7,7 +7,7 @@ terms, then targets, each contiguous in memory.
 
 import numpy as np
 
-from ep2sindy.regression.gram_kernels import solve_masks
+from ep2sindy.regression.gram_kernels import fill_solutions
 from ep2sindy.regression.row_kernels import dot, spread
 from ep2sindy.regression.search_kernels import search_subsets
 from ep2sindy.runtime.compilation import GIVEN_ARRAYS, REORDERED, compiled
@@ -239,7 +239,10 @@ def best_of_sizes(codes, train, judge, best):
     """
     n_equations, n_draws, n_sizes = codes.shape
     n_terms = len(train) - n_equations
-    mask, rhs = np.empty((1, n_terms), dtype=np.bool_), np.empty((1, n_terms))
+    mask = np.empty((1, n_terms), dtype=np.bool_)
+    rhs, fit = np.empty((1, n_terms)), np.empty((1, n_terms))
+    lower, solution = np.empty((n_terms, n_terms)), np.empty(n_terms)
+    active = np.empty(n_terms, dtype=np.int64)
     for e in range(n_equations):
         y = n_terms + e
         best[e, 0] = 0
@@ -254,7 +257,8 @@ def best_of_sizes(codes, train, judge, best):
                 _write_mask(code, mask[0])
                 for a in range(n_terms):
                     rhs[0, a] = train[y, a] if mask[0, a] else 0.0
-                coef = solve_masks(train, rhs, mask)[0]
+                fill_solutions(train, rhs, mask, fit, lower, solution, active)
+                coef = fit[0]
                 explained = 0.0
                 for a in range(n_terms):
                     change = 2.0 * judge[y, a]
@@ -289,7 +293,10 @@ def fit_best(best, gram, train_rows, test_rows, refined, coef, squares, r2_train
     of the training residuals. r2_test: NaN if no rows are held out.
     """
     n_equations, n_sizes, n_terms = coef.shape
-    mask, rhs = np.empty((1, n_terms), dtype=np.bool_), np.empty((1, n_terms))
+    mask = np.empty((1, n_terms), dtype=np.bool_)
+    rhs, fit = np.empty((1, n_terms)), np.empty((1, n_terms))
+    lower, solution = np.empty((n_terms, n_terms)), np.empty(n_terms)
+    active = np.empty(n_terms, dtype=np.int64)
     left, left_test = np.empty(train_rows.shape[1]), np.empty(test_rows.shape[1])
     for e in range(n_equations):
         y = n_terms + e
@@ -303,18 +310,18 @@ def fit_best(best, gram, train_rows, test_rows, refined, coef, squares, r2_train
             _write_mask(best[e, size], mask[0])
             for a in range(n_terms):
                 rhs[0, a] = gram[y, a] if mask[0, a] else 0.0
-            fit = solve_masks(gram, rhs, mask)
+            fill_solutions(gram, rhs, mask, fit, lower, solution, active)
             for a in range(n_terms):
                 coef[e, size, a] = fit[0, a]
             for _ in range(2):
                 _residual(train_rows, y, coef[e, size], left)
                 for a in range(n_terms):
                     rhs[0, a] = dot(left, train_rows[a]) if mask[0, a] else 0.0
-                step = solve_masks(gram, rhs, mask)
+                fill_solutions(gram, rhs, mask, fit, lower, solution, active)
                 largest, longest = 0.0, 0.0
                 for a in range(n_terms):
-                    coef[e, size, a] += step[0, a]
-                    longest = max(longest, abs(step[0, a]))
+                    coef[e, size, a] += fit[0, a]
+                    longest = max(longest, abs(fit[0, a]))
                     largest = max(largest, abs(coef[e, size, a]))
                 if longest <= refined * largest:
                     break  # the next step would be as much smaller again
@@ -352,7 +359,10 @@ def fit_draws(codes, chosen, xx, xy, scale, coef):
     chosen: (equations,) of codes. coef: (draws, equations, terms), of the problem's scaled columns.
     """
     n_draws, n_equations, n_terms = coef.shape
-    mask, rhs = np.empty((1, n_terms), dtype=np.bool_), np.empty((1, n_terms))
+    mask = np.empty((1, n_terms), dtype=np.bool_)
+    rhs, fit = np.empty((1, n_terms)), np.empty((1, n_terms))
+    lower, solution = np.empty((n_terms, n_terms)), np.empty(n_terms)
+    active = np.empty(n_terms, dtype=np.int64)
     for e in range(n_equations):
         size = _write_mask(chosen[e], mask[0])
         for d in range(n_draws):
@@ -361,6 +371,6 @@ def fit_draws(codes, chosen, xx, xy, scale, coef):
             for a in range(n_terms):
                 mask[0, a] &= scale[d, a] > 0.0
                 rhs[0, a] = xy[d, e, a] if mask[0, a] else 0.0
-            fit = solve_masks(xx[d], rhs, mask)
+            fill_solutions(xx[d], rhs, mask, fit, lower, solution, active)
             for a in range(n_terms):
                 coef[d, e, a] = fit[0, a] * scale[d, a]

@@ -62,30 +62,35 @@ def factorise(xx, active, lower):
     return n_active
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
 def independent_terms(xx):
     """Mask of a maximal independent set of terms; earlier terms take precedence."""
-    n_terms = len(xx)
-    mask, lower = np.zeros(n_terms, dtype=np.bool_), np.empty((n_terms, n_terms))
-    active = np.empty(n_terms, dtype=np.int64)
-    for i in range(factorise(xx, active, lower)):
-        mask[active[i]] = True
+    active, mask = np.empty(len(xx), dtype=np.int64), np.zeros(len(xx), dtype=np.bool_)
+    mask[active[: _factorise(xx, active, np.empty(xx.shape))]] = True
     return mask
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**LOOPS)
+def _factorise(xx, active, lower):
+    return factorise(xx, active, lower)
+
+
 def all_usable(gram, order, same):
     """True if all is finite, and no term is zero, repeats another, or combines others.
 
     gram: of terms, and of targets behind them. order: terms, the simplest first. same: 1 - |cosine|
     below which two terms are the same.
     """
+    shape = len(order), len(order)
+    return _all_usable(gram, order, same, np.empty(shape), np.empty(shape), np.empty_like(order))
+
+
+@compiled(**LOOPS)
+def _all_usable(gram, order, same, xx, lower, active):
     n_terms = len(order)
     for a in range(len(gram)):
         for b in range(len(gram)):
             if not np.isfinite(gram[a, b]):
                 return False
-    xx = np.empty((n_terms, n_terms))
     for a in range(n_terms):
         for b in range(n_terms):
             xx[a, b] = gram[order[a], order[b]]
@@ -93,7 +98,6 @@ def all_usable(gram, order, same):
                 return False
         if xx[a, a] <= 0.0:
             return False
-    lower, active = np.empty((n_terms, n_terms)), np.empty(n_terms, dtype=np.int64)
     return factorise(xx, active, lower) == n_terms
 
 
@@ -118,30 +122,36 @@ def _extend(xx, mask, active, n_active, lower):
     return n_same, True
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
 def solve_masks(xx, rhs, masks):
     """Solve xx coef = rhs on each support; NaN if its columns are linearly dependent.
 
     rhs: (masks, terms), or (1, terms) for all. masks and the returned coef: (masks, terms); coef is
     zero outside the support.
     """
-    n_masks, n_terms = masks.shape
-    coef = np.zeros((n_masks, n_terms))
-    solution, lower = np.empty(n_terms), np.empty((n_terms, n_terms))
-    active, n_active = np.empty(n_terms, dtype=np.int64), np.int64(0)
-    for m in range(n_masks):  # loops, since fancy indices would take seconds longer to compile
+    n_terms, coef = masks.shape[1], np.empty(masks.shape)
+    scratch = np.empty((n_terms, n_terms)), np.empty(n_terms), np.empty(n_terms, dtype=np.int64)
+    fill_solutions(xx, rhs, masks, coef, *scratch)
+    return coef
+
+
+@compiled(**LOOPS)
+def fill_solutions(xx, rhs, masks, coef, lower, solution, active):
+    """Write the solutions of `solve_masks` to coef (masks, terms).
+
+    lower: (terms, terms), solution: (terms,) and active: (terms,) of int are scratch.
+    """
+    n_active = np.int64(0)
+    for m in range(len(masks)):
         n_active, solved = _extend(xx, masks[m], active, n_active, lower)
+        for j in range(coef.shape[1]):
+            coef[m, j] = 0.0 if solved else np.nan
         if solved:
             substitute(lower, rhs[min(m, len(rhs) - 1)], active, n_active, solution)
             for i in range(n_active):
                 coef[m, active[i]] = solution[i]
-        else:
-            for j in range(n_terms):
-                coef[m, j] = np.nan
-    return coef
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**LOOPS)
 def rank_masks(xx, xy, judge_xx, judge_xy, masks, lower, solution, active, explained, best):
     """Fit every support, write what it explains on the rows that judge, and rank those of a size.
 
