@@ -149,25 +149,74 @@ def eliminate(flow, misses, residuals, variance, process, free_start):
     """
     n, d = residuals.shape
     state, cov = _at_start(d, flow.shape[2] - d, free_start)
-    told = np.empty((min(n, max(1, PIECE // (d * cov))), d, cov))
-    room = np.empty_like(state), np.empty(state.shape[1]), np.empty(d)
-    gram, log_spread = np.zeros((cov, cov)), 0.0
+    told, room = np.empty((min(n, max(1, PIECE // (d * cov))), d, cov)), _room_of(state)
+    gram, log_spread, case = np.zeros((cov, cov)), 0.0, (misses, residuals, variance, process)
     for first in range(0, n, len(told)):
-        log_spread += _tell(first, flow, misses, residuals, variance, process, state, *room, told)
+        log_spread += _filter(first, flow, *case, state, cov, *room, told, *_nothing(d))
         rows = told[: n - first].reshape(-1, cov)
         gram += rows.T @ rows
     return gram[1:, 1:], -gram[0, 1:], gram[0, 0], log_spread
 
 
-@compiled(**LOOPS)
-def _tell(first, flow, misses, residuals, variance, process, state, ahead, row, gain, told):
-    """Filter the samples from `first` on, as many as `told` (samples, d, 1 + p) has room for.
+def filtered(flow, misses, residuals, variance, process, free_start):
+    """Innovations (n, d), and mean (d,) and covariance (d, d) of the last departure from the path.
 
-    Writes to `told` minus the innovation and its derivatives by the coefficients, in its standard
-    deviation; zero where nothing was measured. Returns the sum of the logarithms of the variances.
+    An innovation is what a sample brings that the past did not tell, in its standard deviation; NaN
+    where nothing was measured. Arguments as for `departures`.
     """
-    cov, product, log_spread = told.shape[2], 1.0, 0.0
+    n, d = residuals.shape
+    state, cov = _at_start(d, 0, free_start)
+    told, case = np.empty((n, d, cov)), (misses, residuals, variance, process)
+    _filter(0, flow, *case, state, cov, *_room_of(state), told, *_nothing(d))
+    found = np.where(np.isfinite(residuals), -told[:, :, 0], np.nan)
+    return found, state[:, 0], state[:, cov : cov + d]
+
+
+def departures(flow, misses, residuals, variance, process, free_start):
+    """Departures (n, d) of all states from the path that minimise the squares.
+
+    Arguments as for `eliminate`, but only the first d columns of `flow` are used. The backward pass
+    is the adjoint of the filter, which inverts no matrix (Bierman 1973,
+    doi:10.1016/0005-1098(73)90089-3).
+    """
+    n, d = residuals.shape
+    state, cov = _at_start(d, 0, free_start)
+    told, roots, states = np.empty((n, d, cov + d)), np.empty((n, d)), np.empty((n, *state.shape))
+    case = misses, residuals, variance, process
+    _filter(0, flow, *case, state, cov, *_room_of(state), told, roots, states)
+    found = np.empty((n, d))
+    _look_back(flow, told, roots, states, cov, np.zeros((2, d)), found)
+    return found
+
+
+def _room_of(state):
+    """Scratch of `_filter`: the rows ahead, one row, and the gains."""
+    return np.empty_like(state), np.empty(state.shape[1]), np.empty(len(state))
+
+
+def _nothing(d):
+    """Arrays that keep no roots and states of `_filter`."""
+    return np.empty((0, d)), np.empty((0, d, 0))
+
+
+@compiled(**LOOPS)
+def _filter(
+    first, flow, misses, residuals, variance, process, state, cov, ahead, row, gain, told, roots,
+    states,
+):  # fmt: skip
+    """Filter the samples from `first` on, as many as `told` (samples, d, columns) has room for.
+
+    state: the rows before the first sample, then before the next one. Written to `told` are the
+    first columns of each observed row (see `_observe`), over the standard deviation of the
+    innovation; zero where nothing was measured. Kept, if they have room, are the inverses of these
+    deviations in `roots` (n, d), and in `states` (n, d, columns) the rows before each sample.
+    Returns the sum of the logarithms of the innovations' variances.
+    """
+    product, log_spread = 1.0, 0.0
     for k in range(first, min(first + len(told), len(residuals))):
+        if len(states):
+            for i in range(len(state)):
+                _copy(state[i], states[k, i])
         for i in range(len(state)):
             out, root = told[k - first, i], 0.0
             if np.isfinite(residuals[k, i]):
@@ -182,6 +231,8 @@ def _tell(first, flow, misses, residuals, variance, process, state, ahead, row, 
                     row[c] = 0.0
             for c in range(len(out)):
                 out[c] = root * row[c]
+            if len(roots):
+                roots[k, i] = root
         if k < len(flow):
             _step(flow[k], misses[k], process[k], state, cov, ahead, row)
             for i in range(len(state)):
@@ -189,59 +240,10 @@ def _tell(first, flow, misses, residuals, variance, process, state, ahead, row, 
     return log_spread + np.log(product)
 
 
-def filtered(flow, misses, residuals, variance, process, free_start):
-    """Innovations (n, d), and mean (d,) and covariance (d, d) of the last departure from the path.
-
-    An innovation is what a sample brings that the past did not tell, in its standard deviation; NaN
-    where nothing was measured. Arguments as for `departures`.
-    """
-    n, d = residuals.shape
-    state, cov = _at_start(d, 0, free_start)
-    told, room = np.empty((n, d, cov)), (np.empty_like(state), np.empty(state.shape[1]))
-    _tell(0, flow, misses, residuals, variance, process, state, *room, np.empty(d), told)
-    found = np.where(np.isfinite(residuals), -told[:, :, 0], np.nan)
-    return found, state[:, 0], state[:, cov : cov + d]
-
-
-def departures(flow, misses, residuals, variance, process, free_start):
-    """Departures (n, d) of all states from the path that minimise the squares.
-
-    Arguments as for `eliminate`, but only the first d columns of `flow` are used. The backward pass
-    is the adjoint of the filter, which inverts no matrix (Bierman 1973,
-    doi:10.1016/0005-1098(73)90089-3).
-    """
-    n, d = residuals.shape
-    state, cov = _at_start(d, 0, free_start)
-    states, gains, innovations = np.empty((n, *state.shape)), np.zeros((n, d, d)), np.zeros((n, d))
-    states[0] = state
-    _look_back(
-        flow, misses, residuals, variance, process, cov, states, state, np.empty(state.shape[1]),
-        gains, innovations, np.zeros((2, d)),
-    )  # fmt: skip
-    return innovations
-
-
 @compiled(**LOOPS)
-def _look_back(
-    flow, misses, residuals, variance, process, cov, states, state, row, gains, found, adjoints
-):
-    """Filter forwards, then go backwards; `found` (n, d) holds innovations, then departures.
-
-    states: (n, d, columns), the rows before each sample, of which the first are given.
-    """
-    n, d = residuals.shape
-    adjoint, carried = adjoints[0], adjoints[1]
-    for k in range(n):
-        for i in range(d):
-            _copy(states[k, i], state[i])
-        for i in range(d):
-            if np.isfinite(residuals[k, i]):
-                _, weight = _observe(
-                    i, residuals[k, i], variance[k, i], state, cov, row, gains[k, i]
-                )
-                found[k, i] = -weight * row[0]
-        if k < n - 1:
-            _step(flow[k], misses[k], process[k], state, cov, states[k + 1], row)
+def _look_back(flow, told, roots, states, cov, adjoints, found):
+    """Write the departures to `found` (n, d), from what the filter kept of every sample."""
+    (n, d), adjoint, carried = found.shape, adjoints[0], adjoints[1]
     for k in range(n - 1, -1, -1):
         for j in range(d):
             carried[j] = 0.0
@@ -251,11 +253,10 @@ def _look_back(
                     carried[j] += flow[k, i, j] * adjoint[i]
         _copy(carried, adjoint)
         for i in range(d - 1, -1, -1):
-            if np.isfinite(residuals[k, i]):
-                value = found[k, i]
-                for j in range(d):
-                    value += gains[k, i, j] * adjoint[j]
-                adjoint[i] -= value
+            value = -told[k, i, 0]
+            for j in range(d):
+                value += told[k, i, cov + j] * adjoint[j]
+            adjoint[i] -= roots[k, i] * value
         for i in range(d):
             value = states[k, i, 0]
             for j in range(d):
