@@ -41,11 +41,11 @@ class Windows:
         """Largest distance between two rows whose windows overlap, plus one."""
         return int(band_width(self.first, self.last))
 
-    def means(self, values: Float[np.ndarray, samples * k]) -> Float[np.ndarray, rows * k]:
+    def means(self, values: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "rows ..."]:
         """Means of sampled values over all windows."""
         return self._sums(self.mean, values)
 
-    def slopes(self, values: Float[np.ndarray, samples * k]) -> Float[np.ndarray, rows * k]:
+    def slopes(self, values: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "rows ..."]:
         """Mean derivatives of sampled values over all windows."""
         return self._sums(self.slope, values)
 
