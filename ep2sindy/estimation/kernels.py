@@ -18,7 +18,9 @@ import numpy as np
 from ep2sindy.runtime.compilation import INNER, LOOPS, compiled
 
 VECTOR = 4  # numbers; rows are padded to whole ones
-PIECE = 2**15  # numbers that wait for their product of matrices, few enough to stay in the cache
+# Rows that wait for their product of matrices hold as many numbers as stay in the cache, but are
+# enough that the product takes longer than its addition to the others.
+PIECE, FEWEST = 2**15, 64
 TINY, HUGE = 1e-100, 1e100  # bounds of a product of variances before its logarithm is taken
 
 
@@ -149,7 +151,8 @@ def eliminate(flow, misses, residuals, variance, process, free_start):
     """
     n, d = residuals.shape
     state, cov = _at_start(d, flow.shape[2] - d, free_start)
-    told, room = np.empty((min(n, max(1, PIECE // (d * cov))), d, cov)), _room_of(state)
+    n_rows = max(FEWEST, PIECE // cov)
+    told, room = np.empty((min(n, max(1, n_rows // d)), d, cov)), _room_of(state)
     gram, log_spread, case = np.zeros((cov, cov)), 0.0, (misses, residuals, variance, process)
     for first in range(0, n, len(told)):
         log_spread += _filter(first, flow, *case, state, cov, *room, told, *_nothing(d))
