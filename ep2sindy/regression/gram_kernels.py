@@ -51,7 +51,7 @@ def substitute(lower, rhs, active, n_active, out):
             out[k] -= lower[i, k] * out[i]
 
 
-@compiled(**WITHIN)
+@compiled(**LOOPS)
 def factorise(xx, active, lower):
     """Write the first independent terms, earlier ones first, and their factor; returns how many."""
     n_active = np.int64(0)  # as a bare 0 it would have callees compiled twice
@@ -65,13 +65,8 @@ def factorise(xx, active, lower):
 def independent_terms(xx):
     """Mask of a maximal independent set of terms; earlier terms take precedence."""
     active, mask = np.empty(len(xx), dtype=np.int64), np.zeros(len(xx), dtype=np.bool_)
-    mask[active[: _factorise(xx, active, np.empty(xx.shape))]] = True
+    mask[active[: factorise(xx, active, np.empty(xx.shape))]] = True
     return mask
-
-
-@compiled(**LOOPS)
-def _factorise(xx, active, lower):
-    return factorise(xx, active, lower)
 
 
 def all_usable(gram, order, same):
