@@ -9,12 +9,10 @@ the right-hand side.
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import INNER, REORDERED, compiled
-
-INLINED = {**INNER, **REORDERED}  # a call would cost as much as the few numbers of a row
+from ep2sindy.runtime.compilation import INNER_REORDERED, REORDERED, compiled
 
 
-@compiled(**INLINED)
+@compiled(**INNER_REORDERED)
 def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
     """Write R of a QR decomposition by Householder reflections.
 
@@ -44,13 +42,13 @@ def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
             out[i, j] = columns[j, i]
 
 
-@compiled(**INLINED)
+@compiled(**INNER_REORDERED)
 def _add(row: np.ndarray, factor: float, total: np.ndarray) -> None:
     for c in range(len(row)):
         total[c] += factor * row[c]
 
 
-@compiled(**INLINED)
+@compiled(**INNER_REORDERED)
 def _advance(by: np.ndarray, nodes: np.ndarray, x: np.ndarray, new: np.ndarray) -> None:
     """Propagate the columns of `x` (n, columns) over a step; the last column is the defect.
 

@@ -17,7 +17,7 @@ from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
 from ep2sindy.regression.row_kernels import count_drawn, scale_draws
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.search_kernels import key_words, pool_masks
-from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, Search
+from ep2sindy.regression.searches import Search, SearchOfDraws
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.runtime.values import set_counts
 
@@ -154,7 +154,7 @@ class Resamples:
         if allowed is not None and not allowed.all():
             xx, xy = xx * (allowed[:, None] & allowed), xy * allowed
         n_draws, n_terms = xy.shape
-        in_one_call = search if isinstance(search, AdaptiveLasso | STLSQ) else None
+        in_one_call = search if isinstance(search, SearchOfDraws) else None
         # Between two reports of progress lies a fraction of a second.
         step = max(1, WORK_AT_ONCE // n_terms**3) if in_one_call else 1
         found: list[Bool[np.ndarray, "_ terms"]] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -40,8 +41,25 @@ class Search(Protocol):
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks: ...
 
 
+class SearchOfDraws(ABC):
+    """A search that takes all draws of an equation in one call."""
+
+    @abstractmethod
+    def supports_of_draws(
+        self,
+        xx: Float[np.ndarray, "draws terms terms"],
+        xy: Float[np.ndarray, "draws terms"],
+        yy: Float[np.ndarray, " draws"],
+    ) -> MasksByDraw:
+        """Supports of every draw, as `supports` of one."""
+
+    def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
+        (masks,) = self.supports_of_draws(xx[None], xy[None], np.array([yy]))
+        return masks
+
+
 @dataclass(frozen=True)
-class AdaptiveLasso:
+class AdaptiveLasso(SearchOfDraws):
     """All supports on the exact path of the adaptive lasso.
 
     Each coefficient is penalised by |b_ols|^-gamma. The path is piecewise linear and needs only
@@ -58,17 +76,12 @@ class AdaptiveLasso:
             raise ValueError(f"gamma must be positive: {self.gamma} came")
         set_counts(self, _where_set(self.max_terms))
 
-    def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
-        (masks,) = self.supports_of_draws(xx[None], xy[None], np.array([yy]))
-        return masks
-
     def supports_of_draws(
         self,
         xx: Float[np.ndarray, "draws terms terms"],
         xy: Float[np.ndarray, "draws terms"],
         yy: Float[np.ndarray, " draws"],
     ) -> MasksByDraw:
-        """Supports of every draw, as `supports` of one."""
         n_draws, n = xy.shape
         masks = np.empty((n_draws * PATH_PER_TERM * (n + 1), n), dtype=np.bool_)
         ends, places = np.empty(n_draws, dtype=np.int64), np.empty((2, n), dtype=np.int64)
@@ -79,7 +92,7 @@ class AdaptiveLasso:
 
 
 @dataclass(frozen=True)
-class STLSQ:
+class STLSQ(SearchOfDraws):
     """Sequentially thresholded least squares, over a sweep of thresholds.
 
     Thresholds are fractions of the norm of the target, for columns of unit norm, spaced evenly in
@@ -100,17 +113,12 @@ class STLSQ:
             )
         set_counts(self, {"n_thresholds": 2} | _where_set(self.max_terms))
 
-    def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
-        (masks,) = self.supports_of_draws(xx[None], xy[None], np.array([yy]))
-        return masks
-
     def supports_of_draws(
         self,
         xx: Float[np.ndarray, "draws terms terms"],
         xy: Float[np.ndarray, "draws terms"],
         yy: Float[np.ndarray, " draws"],
     ) -> MasksByDraw:
-        """Supports of every draw, as `supports` of one."""
         n_draws, n = xy.shape
         thresholds = np.sqrt(yy)[:, None] * self._shares
         masks, ends = np.empty((thresholds.size, n), dtype=np.bool_), np.empty(n_draws, np.int64)

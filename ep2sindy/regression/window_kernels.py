@@ -6,10 +6,8 @@ from first[i] on. Loops run over slices: with sums of indices in them they would
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import INNER, LOOPS, compiled
+from ep2sindy.runtime.compilation import INNER_REORDERED, LOOPS, REORDERED, compiled
 
-REORDERED = {"fastmath": {"reassoc", "contract"}}  # sums in any order go through vector units
-FAST, FAST_INNER = {**LOOPS, **REORDERED}, {**INNER, **REORDERED}
 PIECE = 512  # samples
 
 
@@ -45,7 +43,7 @@ def linearise(columns, table, term, variable, product, weight, departure, coef, 
     )
 
 
-@compiled(**FAST)
+@compiled(**REORDERED)
 def _linearise(
     columns, table, term, variable, product, weight, departure, coef, values, terms, sensitivity
 ):
@@ -68,31 +66,31 @@ def _linearise(
                 _multiply_add(value, weight[e], departure[v, here], terms[1, t, here])
 
 
-@compiled(**FAST_INNER)
+@compiled(**INNER_REORDERED)
 def _copy(values, out):
     for i in range(len(out)):
         out[i] = values[i]
 
 
-@compiled(**FAST_INNER)
+@compiled(**INNER_REORDERED)
 def _multiply(value, factor):
     for i in range(len(value)):
         value[i] *= factor[i]
 
 
-@compiled(**FAST_INNER)
+@compiled(**INNER_REORDERED)
 def _add(value, weight, total):
     for i in range(len(value)):
         total[i] += weight * value[i]
 
 
-@compiled(**FAST_INNER)
+@compiled(**INNER_REORDERED)
 def _multiply_add(value, weight, factor, total):
     for i in range(len(value)):
         total[i] += weight * value[i] * factor[i]
 
 
-@compiled(**FAST)
+@compiled(**REORDERED)
 def sum_windows(starts, first, weights, columns, sums):
     """Write the weighted sums of columns (columns, samples) over all windows: (columns, rows)."""
     for i in range(len(first)):
@@ -104,7 +102,7 @@ def sum_windows(starts, first, weights, columns, sums):
             sums[c, i] = total
 
 
-@compiled(**FAST)
+@compiled(**REORDERED)
 def spread_windows(starts, first, weights, rows, samples):
     """Write the sums over rows of their windows times `rows` (rows,), a transposed product."""
     for s in range(len(samples)):
@@ -114,7 +112,7 @@ def spread_windows(starts, first, weights, rows, samples):
         _add(window, rows[i], samples[first[i] : first[i] + len(window)])
 
 
-@compiled(**FAST_INNER)
+@compiled(**INNER_REORDERED)
 def _both_products(a, b, c, d):
     """Sum of the scalar products of a with b and of c with d."""
     total = 0.0
@@ -136,7 +134,7 @@ def banded_covariance(starts, first, mean, slope, of_mean, of_both, of_slope, ba
     )
 
 
-@compiled(**FAST)
+@compiled(**REORDERED)
 def _banded_covariance(
     starts, first, mean, slope, of_mean, of_both, of_slope, by_mean, by_slope, band
 ):

@@ -57,6 +57,7 @@ INNER = {**LOOPS, "no_cpython_wrapper": True, "forceinline": True}
 
 # As LOOPS, for sums that may be taken in any order, which lets them fill the vector units.
 REORDERED = {**LOOPS, "fastmath": {"reassoc", "contract"}}
+INNER_REORDERED = {**INNER, **REORDERED}
 
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
