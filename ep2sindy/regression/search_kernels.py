@@ -11,18 +11,19 @@ import numpy as np
 from ep2sindy.regression.gram_kernels import (
     DEPENDENT,
     ROUNDING,
+    WITHIN,
     append_term,
     factorise,
     substitute,
 )
-from ep2sindy.runtime.compilation import GIVEN_ARRAYS, compiled
+from ep2sindy.runtime.compilation import GIVEN_ARRAYS, LOOPS, compiled
 
 BITS = 62  # terms in one number of a key
 
 PATH_PER_TERM = 8  # supports on a lasso path, per term, at which it ends; they may come and go
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _next_event(coef, slope, correlation, drift, level, active, n_active, closed):
     """Next knot of the lasso path below the penalty `level`: step, term, and whether it joins."""
     step, term, joins = level, -1, False
@@ -45,7 +46,7 @@ def _next_event(coef, slope, correlation, drift, level, active, n_active, closed
     return step, term, joins
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**LOOPS)
 def lasso_path(xx, xy, max_terms, lower, vectors, places, masks, n_masks):
     """Write all supports on the exact lasso path, from the empty one to `max_terms` or all terms.
 
@@ -98,7 +99,7 @@ def lasso_path(xx, xy, max_terms, lower, vectors, places, masks, n_masks):
     return n_masks
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _write_support(active, n_active, masks, m):
     """Write the mask of the active terms in row m; returns the next row."""
     for j in range(masks.shape[1]):
@@ -108,7 +109,7 @@ def _write_support(active, n_active, masks, m):
     return m + 1
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _move(step, coef, slope, active, n_active, correlation, drift, signs):
     """Move coefficients and correlations along the path, and write the signs of the latter."""
     for i in range(n_active):
@@ -118,7 +119,7 @@ def _move(step, coef, slope, active, n_active, correlation, drift, signs):
         signs[j] = np.sign(correlation[j])
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _fill_drift(xx, slope, active, n_active, drift):
     """Write the rate at which each term's correlation decreases along the path."""
     for j in range(len(drift)):
@@ -128,7 +129,7 @@ def _fill_drift(xx, slope, active, n_active, drift):
             drift[j] += xx[active[i], j] * slope[i]
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _leave(xx, active, n_active, term, lower):
     """Take a term out of the active ones and their factor; returns how many are left."""
     kept = 0
@@ -141,7 +142,7 @@ def _leave(xx, active, n_active, term, lower):
     return kept
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**LOOPS)
 def adaptive_lasso_supports(xx, xy, gamma, max_terms, matrices, vectors, places, masks, ends):
     """Write the supports on the path of the lasso with penalties |b_ols|^-gamma, for every draw.
 
@@ -172,7 +173,7 @@ def adaptive_lasso_supports(xx, xy, gamma, max_terms, matrices, vectors, places,
         ends[d] = n_masks
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**LOOPS)
 def thresholded_supports(xx, xy, thresholds, max_terms, lower, places, chain, fits, masks, ends):
     """Write the supports by sequentially thresholded least squares, for every draw and threshold.
 
@@ -208,7 +209,7 @@ def thresholded_supports(xx, xy, thresholds, max_terms, lower, places, chain, fi
         ends[d] = n_masks
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _same(masks, m, others, k):
     """True if row m of masks is row k of the others."""
     n_different = 0
@@ -217,7 +218,7 @@ def _same(masks, m, others, k):
     return n_different == 0
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _fit_support(xx, xy, mask, active, lower, coef):
     """Write the least-squares coefficients of a support of independent terms at its terms."""
     n_active = np.int64(0)
@@ -231,7 +232,7 @@ def _fit_support(xx, xy, mask, active, lower, coef):
         coef[active[i]] = coef[i]
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**LOOPS)
 def pool_masks(masks, ends, keys, places, held, last):
     """Order the distinct masks of all draws by size, then by terms, and count the draws of each.
 
@@ -282,7 +283,7 @@ def key_words(n_terms):
     return 1 + -(-n_terms // BITS)
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _write_key(masks, m, keys):
     """Write the size of a mask and its terms, BITS in a number, the first the most significant."""
     n_terms = masks.shape[1]
@@ -295,7 +296,7 @@ def _write_key(masks, m, keys):
         keys[m, word] = code
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(**WITHIN)
 def _compare(keys, k, m):
     """Negative if key k comes before key m, zero if they are the same."""
     for word in range(keys.shape[1]):
