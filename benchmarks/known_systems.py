@@ -17,7 +17,12 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.systems.draws import DRAWS, realization
 from ep2sindy.systems.systems import System
 
-KINDS = ("white", "lasting", "heavy", "proportional", "thinned300", "thinned100", "missing")
+# Gaps: percent of the record, and how many gaps they are divided into.
+GAPS = {f"gap{share}x{n}": (share, n) for share in (5, 10, 20, 30) for n in (1, 3)}
+KINDS = (
+    *("white", "lasting", "heavy", "proportional", "thinned300", "thinned100", "missing"),
+    *GAPS,
+)
 MEMORY, FREEDOM, MISSING = 0.7, 3.0, 0.3  # of AR(1), of Student's t, of samples
 
 
@@ -159,6 +164,11 @@ def _kept(kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
         return np.unique(np.round(np.linspace(0, n - 1, count)).astype(int))
     if kind == "missing":
         return np.flatnonzero(rng.random(n) > MISSING)
+    if kind in GAPS:
+        share, n_gaps = GAPS[kind]
+        length = round(share * n / (100 * n_gaps))
+        starts = (np.arange(1, n_gaps + 1) * n // (n_gaps + 1)) - length // 2
+        return np.setdiff1d(np.arange(n), starts[:, None] + np.arange(length))
     return np.arange(n)
 
 

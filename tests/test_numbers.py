@@ -9,7 +9,7 @@ import pytest
 
 from ep2sindy.data.coerce import trajectories_of
 from ep2sindy.data.numbers import check_magnitude, column_norms, real_numbers, rounding_s, seconds
-from ep2sindy.regression.sampling import is_even
+from ep2sindy.regression.test_functions import is_even
 from ep2sindy.signals.spectrum import is_uniform
 
 X = np.sin(np.arange(8.0))

@@ -385,7 +385,7 @@ def test_the_old_name_of_the_seed_warns() -> None:
 def test_bad_input_is_refused() -> None:
     rng = np.random.default_rng(0)
     data, model = clean(PREY), PREY.model
-    with pytest.raises(ValueError, match="1001 samples were asked of trajectories of at most 1000"):
+    with pytest.raises(ValueError, match="1001 samples were asked of at most 1000"):
         refine(model, [data], window=1001, seed=rng)
     with pytest.raises(ValueError, match="at least one term"):
         refine(off(model, 0.0), [data], seed=rng)

@@ -7,9 +7,8 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.sampling import even_grid, is_even, one_about_each, stretches
 from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.test_functions import Bumps
+from ep2sindy.regression.test_functions import Bumps, even_grid, is_even, one_about_each
 from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.systems.systems import System, lorenz, lotka_volterra, van_der_pol
@@ -62,10 +61,9 @@ def test_no_two_windows_stand_about_one_sample() -> None:
 
 def test_windows_never_cross_a_gap() -> None:
     t = np.concatenate([np.arange(100.0), 150.0 + np.arange(8.0), 200.0 + np.arange(60.0)])
-    assert stretches(t) == [(0, 100), (108, 168)]  # 8 samples say nothing of their noise
     states = np.stack([np.sin(0.2 * t), np.cos(0.2 * t)], axis=1)
     run = Trajectory(t=t, states=states, state_names=["x", "y"])
-    halves = [run.window(0, 100), run.window(108, 168)]
+    halves = [run.window(0, 100), run.window(108, 168)]  # 8 samples say nothing of their noise
     system = lotka_volterra()
     whole, apart = assembled(system, [run]), assembled(system, halves)
     for problem, other in zip(whole, apart, strict=True):
@@ -74,8 +72,9 @@ def test_windows_never_cross_a_gap() -> None:
         assert problem.trajectories == (run,)
     t = np.arange(200.0).reshape(20, 10) + 40.0 * np.arange(20)[:, None]
     with pytest.raises(ValueError, match="20 samples without a gap: 19 steps are over 10 times"):
-        stretches(t.ravel())
-    assert stretches(np.arange(8.0)) == [(0, 8)]
+        Trajectory(t.ravel(), np.sin(t).reshape(-1, 1), ["x"]).stretches()
+    short = Trajectory(np.arange(8.0), np.sin(np.arange(8.0))[:, None], ["x"])
+    assert short.stretches() == [short]
 
 
 def test_residuals_of_the_truth_are_white_where_samples_are_missing() -> None:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 # divided into stretches of about 30 samples, and Lorenz was never found.
 LONGEST_STEP = 10.0
 
+MIN_STRETCH = 20  # samples between gaps: fewer determine neither their noise nor a derivative
+
 
 class MissingSamples(UserWarning):
     """Warns that samples are NaN and were left out."""
@@ -67,9 +69,25 @@ def usual_step(t: Float[np.ndarray, " samples"]) -> float:
 
 
 def between_gaps(t: Float[np.ndarray, " samples"]) -> list[tuple[int, int]]:
-    """First and last sample (exclusive) of every stretch of times without a gap."""
-    cuts = np.flatnonzero(np.diff(t) > LONGEST_STEP * usual_step(t)) + 1
+    """First and last sample (exclusive) of every stretch of times without a gap.
+
+    A gap is a step that is long beside the median step, and beside a step next to it: times that
+    grow by a factor from one to the next have long steps, and no gap.
+    """
+    steps = np.diff(t)
+    gaps = steps > LONGEST_STEP * np.median(steps)
+    if not gaps.any():
+        return [(0, len(t))]
+    beside = np.minimum(np.append(np.inf, steps[:-1]), np.append(steps[1:], np.inf))
+    cuts = np.flatnonzero(gaps & (steps > LONGEST_STEP * beside)) + 1
     return list(pairwise([0, *cuts.tolist(), len(t)]))
+
+
+def mean_step(*times: Float[np.ndarray, " samples"]) -> float:
+    """Mean step of the times of one record or several, in their unit, gaps left out."""
+    spans = [(t[b - 1] - t[a], b - 1 - a) for t in times for a, b in between_gaps(t)]
+    duration, n_steps = np.sum(spans, axis=0)
+    return float(duration / n_steps)
 
 
 def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:

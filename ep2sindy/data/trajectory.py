@@ -6,7 +6,9 @@ import copyreg
 import html
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -14,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.export import as_dataframe, as_dataset
+from ep2sindy.data.gaps import LONGEST_STEP, MIN_STRETCH, between_gaps, mean_step, usual_step
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.names import check_state
 from ep2sindy.library.units import SECONDS, Clock
@@ -159,10 +162,10 @@ class Trajectory:
     def n_samples(self) -> int:
         return len(self.t)
 
-    @property
+    @cached_property
     def dt_s(self) -> float:
-        """Mean time step in s."""
-        return float((self.t[-1] - self.t[0]) / (len(self.t) - 1))
+        """Mean time step in s, gaps left out."""
+        return mean_step(self.t)
 
     def columns(self, names: Sequence[str]) -> Float[np.ndarray, "samples columns"]:
         """Samples of some states or inputs, in the order of `names`.
@@ -198,6 +201,29 @@ class Trajectory:
             clock=self.clock,
             missing=None if self.missing is None else self.missing[start:stop],
         )
+
+    def stretches(self, min_samples: int = MIN_STRETCH) -> list[Trajectory]:
+        """The stretches between gaps as trajectories of their own; only itself, if it has no gap.
+
+        Nothing that takes differences or integrates may lead across a gap (`between_gaps`).
+        Stretches of fewer samples, and those in which a state rests, are left out.
+        Raises ValueError if none is left.
+        """
+        pieces = between_gaps(self.t)
+        if len(pieces) == 1:
+            return [self]
+        found = []
+        for start, stop in pieces:
+            if stop - start >= min_samples:
+                with suppress(ConstantStateError):
+                    found.append(self.window(start, stop))
+        if not found:
+            raise ValueError(
+                f"a trajectory must hold {min_samples} samples without a gap: {len(pieces) - 1} "
+                f"steps are over {LONGEST_STEP:g} times the median step of "
+                f"{usual_step(self.t):.4g} s; cut it at its pauses, or interpolate it first"
+            )
+        return found
 
     def to_dataframe(self) -> pd.DataFrame:
         """States, then inputs, as columns in SI over an index `time` in s; NaN where missing."""

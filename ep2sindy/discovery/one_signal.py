@@ -27,7 +27,7 @@ from ep2sindy.discovery.signal_unknowns import (
 )
 from ep2sindy.estimation.explanation import FIRST_MAX_TERMS
 from ep2sindy.forecasting.calibration import calibrate
-from ep2sindy.forecasting.rolling import RollingStarts
+from ep2sindy.forecasting.rolling import RollingStarts, spread_starts
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill, horizon_errors
 from ep2sindy.forecasting.tracking import Tracker, track
 from ep2sindy.library.library import Library, polynomial
@@ -118,7 +118,7 @@ def error_where_fitted(past: Trace, chosen: Chosen, tracker: Tracker) -> float:
     """Error of forecasts up to a period from starts in the last half of the fitted part."""
     record, longest = with_all_states(past, chosen), max(2, round(past.per_period))
     n = record.n_samples
-    first = np.unique(np.linspace(n // 2, n - longest, N_TRIED).round().astype(np.int64))
+    first = spread_starts(record.t, n // 2, longest, N_TRIED)
     rolling = RollingStarts(tracker, record, [past.name], first, longest)
     ahead = rolling.forecasts(partial(states_before, past, chosen.embedding), N_DRAWS_TRIED, seed=0)
     scale = past.x[n // 2 :].std()

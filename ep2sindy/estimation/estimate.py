@@ -5,7 +5,7 @@ Besides the model, the result holds remarks: sentences about the samples and the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from ep2sindy.estimation.explanation import Explanation, explain
 from ep2sindy.estimation.hidden import Entrance, with_guesses
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
-from ep2sindy.estimation.problem import EstimationProblem, scale_problem
+from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import (
     SAMPLES_PER_TERM,
     Solution,
@@ -67,8 +67,9 @@ class Rival:
 class Estimate:
     """Result of estimating states and coefficients together.
 
-    model: carries the covariance of its coefficients, unless it is a misfit. paths: for each run,
-    the estimated states, (samples, d), in SI. runs: that were fitted, hidden states as estimated.
+    model: carries the covariance of its coefficients, unless it is a misfit. runs:
+    as they were fitted, hidden states as estimated. paths: for each of these runs, the estimated
+    states, (samples, d), in SI.
     noise_std: (d,), standard deviation of the samples' noise, in SI; NaN for hidden states. memory:
     (d,), correlation of this noise from one sample to the next, 0 for white noise.
     flow_error: size of the deviation of the states from the model over one sampling step, as a
@@ -196,8 +197,6 @@ def estimate_task(
         if watch.ended or not best[-1][0].misfit:
             break
     answer, runs = min(best, key=lambda each: bool(each[0].misfit))
-    if task.hidden:
-        runs = [_with_path(answer, k, run) for k, run in enumerate(runs)]
     model = _model(answer, task.library, units or runs[0].units, provenance or {})
     return _report(answer, model, runs, progress)
 
@@ -218,15 +217,49 @@ def _try(
         exclude=known.exclude, watch=watch,
     )  # fmt: skip
     found = explain(problem, max_terms=max_terms, align=align)
-    return replace(found, said=(*(way.words for way in ways), *found.said)), known.runs
+    said = (*_lonely_words(known.runs, problem), *(way.words for way in ways), *found.said)
+    return replace(found, said=said), known.runs
 
 
-def _with_path(answer: Explanation, number: int, run: Trajectory) -> Trajectory:
-    """A run as it was fitted, with the estimated path of hidden states among its samples."""
-    problem, fit = answer.problem, answer.solution.annealed.fit
-    record = problem.records[number]
-    states = np.where(problem.measured, record.samples, fit.paths[number]) * problem.scale
-    kept = np.isin((run.t - run.t[0]) / problem.step_s, record.times)
+def _lonely_words(runs: Sequence[Trajectory], problem: EstimationProblem) -> tuple[str, ...]:
+    n_samples = sum(run.n_samples for run in runs)
+    if problem.n_samples == n_samples:
+        return ()
+    return (
+        f"{n_samples - problem.n_samples} of {n_samples} samples are left out: fewer than "
+        f"{MIN_SAMPLES} stand together between gaps",
+    )
+
+
+def _by_run(
+    answer: Explanation, runs: Sequence[Trajectory]
+) -> Iterator[tuple[Trajectory, Float[np.ndarray, "samples d"]]]:
+    """Each run as it was fitted, and its path in SI: the stretches of a run with gaps together."""
+    problem = answer.problem
+    pairs = list(zip(problem.records, answer.solution.annealed.fit.paths, strict=True))
+    for number, run in enumerate(runs):
+        own = [(record, path) for record, path in pairs if record.run == number]
+        times, samples, path = (
+            np.concatenate(parts)
+            for parts in zip(
+                *((record.times, record.samples, path) for record, path in own), strict=True
+            )
+        )
+        yield _as_fitted(problem, times, samples, path, run), path * problem.scale
+
+
+def _as_fitted(
+    problem: EstimationProblem,
+    times: np.ndarray,
+    samples: np.ndarray,
+    path: np.ndarray,
+    run: Trajectory,
+) -> Trajectory:
+    """The samples of a run that were fitted, the estimated path of hidden states among them."""
+    if len(times) == run.n_samples and problem.measured.all():
+        return run
+    states = np.where(problem.measured, samples, path) * problem.scale
+    kept = np.isin((run.t - run.t[0]) / problem.step_s, times)
     missing = None if run.missing is None else run.missing[kept]
     return replace(run, t=run.t[kept], states=states, inputs=run.inputs[kept], missing=missing)
 
@@ -247,10 +280,11 @@ def _report(
             watch, list(enumerate(problem.states)), "equation", "rivals"
         )
     }
+    fitted, paths = zip(*_by_run(answer, runs), strict=True)
     return Estimate(
         model=model,
-        paths=tuple(path * problem.scale for path in fit.paths),
-        runs=runs,
+        paths=paths,
+        runs=fitted,
         noise_std=np.where(problem.measured, found.noise.std * problem.scale, np.nan),
         memory=found.noise.memory,
         flow_error=found.flow_error,
@@ -277,7 +311,7 @@ def check_runs(task: Task) -> None:
         )
     check_domain(task.runs, task.library)
     for run in task.runs:
-        if run.n_samples < 5:
+        if run.n_samples < MIN_SAMPLES:
             raise ValueError(
                 f"a run must have five samples or more: {run.label or 'one'} has "
                 f"{run.n_samples}; leave it out, or join what belongs together"

@@ -25,7 +25,7 @@ from ep2sindy.estimation.lateness import (
 from ep2sindy.estimation.likelihood import STEERED
 from ep2sindy.estimation.missing_state import ROADS, missing_state
 from ep2sindy.estimation.noise import noise_beside
-from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem
 from ep2sindy.estimation.pushed import (
     PushedFit,
     push_words,
@@ -50,7 +50,6 @@ LET_GO = 0.5  # residual, as a share of a state's spread, if the model ignores t
 ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap
 # Moves of late channels (the delay model is linear), and the move, in mean steps, that ends them.
 MAX_MOVES, SETTLED = 3, 0.05
-MIN_LEFT = 5  # fewest samples of a record that a smoother accepts
 # Smoother settings (log10 of process to measurement noise) to try if no other start fits.
 OTHER_STARTS = (-2.0, 0.0, 2.0)
 
@@ -263,7 +262,7 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
     for _ in range(MAX_MOVES):
         delays = delays + step
         here = move_channels(here, now.annealed.fit.paths, step)
-        if min(len(record.samples) for record in here.records) < MIN_LEFT:
+        if min(len(record.samples) for record in here.records) < MIN_SAMPLES:
             return None  # shifts as long as a record are no delays
         with problem.watch.stage("channels that come late"):
             now = from_smooth(here, None, max_terms=max_terms)

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
@@ -17,16 +18,18 @@ from ep2sindy.estimation.flow import Flow, RightHandSides, Steps
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, constraint
 
+MIN_SAMPLES = 5  # of a record: a smoother accepts no fewer
+
 
 @dataclass(frozen=True, eq=False)
 class ScaledRecord:
-    """One trajectory in scaled variables.
+    """A trajectory, or a stretch of it between gaps, in scaled variables.
 
     times: (samples,), and steps: (samples - 1,), in units of the mean step. samples: (samples, d).
     inputs: at the samples; between them they are interpolated by cubics, or linearly if switched.
     limits: of samples that are clipped or rounded. missing: (samples, d), true where nothing was
     measured, as for all of a hidden state; the samples there are nothing but a start. None if all
-    were measured.
+    were measured. run: number of the run that it is a stretch of.
     """
 
     times: Float[np.ndarray, " samples"]
@@ -34,6 +37,7 @@ class ScaledRecord:
     inputs: Float[np.ndarray, "samples n_inputs"]
     limits: Bounds | None = None
     missing: Bool[np.ndarray, "samples d"] | None = None
+    run: int = 0
 
     @property
     def values(self) -> Float[np.ndarray, "samples d"]:
@@ -47,6 +51,25 @@ class ScaledRecord:
     def at_hand(self) -> Bool[np.ndarray, "samples d"]:
         """Mask of the samples that were measured."""
         return np.ones(self.samples.shape, bool) if self.missing is None else ~self.missing
+
+    def stretches(self) -> list[ScaledRecord]:
+        """The stretches between gaps, which no step of the flow may cross; or all, if it has none.
+
+        Stretches of under five samples are left out. If these hold more than half of the samples,
+        the long steps are the way in which the record was sampled, and no gaps.
+        """
+        pieces, n = between_gaps(self.times), len(self.times)
+        long = [(a, b) for a, b in pieces if b - a >= MIN_SAMPLES]
+        if len(pieces) == 1 or 2 * sum(b - a for a, b in long) < n:
+            return [self]
+        places = np.arange(n)
+        inside = [(a <= places) & (places < b) for a, b in long]
+        return [self.kept(each, self.samples[each]) for each in inside]
+
+    def since_gap(self) -> ScaledRecord:
+        """The samples since the last gap, and all if there is none."""
+        kept = np.arange(len(self.times)) >= between_gaps(self.times)[-1][0]
+        return self.kept(kept, self.samples[kept])
 
     def kept(
         self, kept: Bool[np.ndarray, " samples"], samples: Float[np.ndarray, "kept d"]
@@ -162,7 +185,7 @@ class EstimationProblem:
         own = self.equation * n + self.places[self.column]
         return np.isin(self.whole.equation * n + self.whole.column, own)
 
-    def record(self, run: Trajectory) -> ScaledRecord:
+    def record(self, run: Trajectory, number: int = 0) -> ScaledRecord:
         """A run with the same states and inputs, in the scale of this problem."""
         missing = np.tile(~self.measured, (run.n_samples, 1))
         if run.missing is not None:
@@ -174,7 +197,13 @@ class EstimationProblem:
             inputs=run.columns(self.inputs) / self.input_scale,
             limits=_limits(run, self.scale),
             missing=missing if missing.any() else None,
+            run=number,
         )
+
+    def of(self, runs: Sequence[Trajectory]) -> EstimationProblem:
+        """The problem with the stretches of these runs as its records."""
+        whole = [self.record(run, number) for number, run in enumerate(runs)]
+        return replace(self, records=tuple(part for each in whole for part in each.stretches()))
 
     @property
     def n_samples(self) -> int:
@@ -313,7 +342,7 @@ def scale_problem(
     over = library.over(names)
     values = np.concatenate([run.columns(names) for run in runs])
     size = zero_to_one(np.sqrt(np.square(values).mean(axis=0)))
-    step_s = float(np.mean(np.concatenate([np.diff(run.t) for run in runs])))
+    step_s = mean_step(*(run.t for run in runs))
     scaled, numbers = over.scaled(size)
     asked = _asked(over, states, terms or {}, exclude or {})
     held = constraint(over, asked, relations) if relations else None
@@ -339,7 +368,7 @@ def scale_problem(
         inputs=tuple(inputs),
         watch=watch or Watch(),
     )
-    return replace(problem, records=tuple(problem.record(run) for run in runs))
+    return problem.of(runs)
 
 
 def _asked(

@@ -96,9 +96,10 @@ def derivative_figure(
 
     Spikes of the derivative do not set the scale; carets mark where a curve leaves the panel.
     """
-    clock = run.clock
-    slopes = clock.seconds * smoother.derivative(run.t, run.states)
-    data = first_part(run.t, slopes, duration_s, clock)
+    clock, pieces = run.clock, run.stretches()
+    slopes = np.concatenate([smoother.derivative(each.t, each.states) for each in pieces])
+    times = np.concatenate([each.t for each in pieces])
+    data = first_part(times, clock.seconds * slopes, duration_s, clock)
     sides = {}
     for name, model in models.items():
         slopes = clock.seconds * model.derivative(

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
+from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.bands import Forecast, forecasts
 from ep2sindy.forecasting.baselines import Baseline
@@ -18,6 +19,21 @@ from ep2sindy.signals.spectrum import is_uniform
 
 # Makes all states of a past, whose first columns are the measured ones.
 StatesOf = Callable[[Trajectory], Trajectory]
+
+
+def spread_starts(
+    t: Float[np.ndarray, " samples"], first: int, longest: int, n: int
+) -> Int[np.ndarray, " starts"]:
+    """At most n starts of forecasts of `longest` samples, evenly spread from a first one on.
+
+    A forecast and the sample before it lie in one stretch without a gap, unless none of them does.
+    """
+    starts = np.arange(min(first, len(t) - longest), len(t) - longest + 1)
+    end = np.array(between_gaps(t))[:, 1]
+    piece = np.searchsorted(end, starts - 1, side="right")
+    inside = starts + longest <= end[piece]
+    starts = starts[inside] if inside.any() else starts
+    return starts[np.unique(np.linspace(0, len(starts) - 1, n).round().astype(np.int64))]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.bands import LEVEL, Forecast
 from ep2sindy.forecasting.baselines import Autoregression, Baseline, Harmonics, Persistence
 from ep2sindy.forecasting.calibration import calibrate
-from ep2sindy.forecasting.rolling import RollingStarts, StatesOf
+from ep2sindy.forecasting.rolling import RollingStarts, StatesOf, spread_starts
 from ep2sindy.forecasting.tracking import Tracker, measured_states, track
 from ep2sindy.library.units import Clock
 from ep2sindy.model.model import SparseModel
@@ -162,7 +162,7 @@ def forecast_skill(
         tracker = calibrate(track(model, fitted, measured=names), fitted, states_of=states_of)
     period_s = _period_s(fitted, names)
     longest = _longest(record, n_fitted, period_s, horizon_s)
-    first = _spread(n_fitted, record.n_samples - longest, check_count("starts", starts))
+    first = spread_starts(record.t, n_fitted, longest, check_count("starts", starts))
     rolling = RollingStarts(tracker, record, names, first, longest)
     ahead = rolling.forecasts(states_of, check_count("n_draws", n_draws), seed, advance)
     shown = _spread(0, longest - 1, min(longest, N_HORIZONS))

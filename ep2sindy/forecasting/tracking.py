@@ -89,7 +89,7 @@ class Tracker:
         history: has the measured states of the model; others that it has only start the fit.
         """
         last = history.window(max(0, history.n_samples - self.memory), history.n_samples)
-        record = self.problem.record(_of_model(self.model, last))
+        record = self.problem.record(_of_model(self.model, last)).since_gap()
         samples, process = self.scaled_noise()
         path = self.approach(record, record.samples.copy(), samples, process)
         variances = error_variances(len(path), samples, process)
@@ -101,11 +101,17 @@ class Tracker:
         return FittedState(scale * end, np.outer(scale, scale) * covariance)
 
     def along(self, run: Trajectory) -> Trajectory:
-        """All states of the model along a run, fitted to the measured ones under the errors."""
+        """All states of the model along a run, fitted to the measured ones under the errors.
+
+        Between gaps it starts anew. Stretches of under five samples are left out.
+        """
         own = _of_model(self.model, run)
-        record = self.problem.record(own)
-        path = self.approach(record, record.samples.copy(), *self.scaled_noise())
-        return replace(own, states=path * self.problem.scale)
+        whole = self.problem.record(own)
+        pieces = whole.stretches()
+        paths = [self.approach(each, each.samples.copy(), *self.scaled_noise()) for each in pieces]
+        kept = np.isin(whole.times, np.concatenate([each.times for each in pieces]))
+        states = np.concatenate(paths) * self.problem.scale
+        return replace(own, t=own.t[kept], states=states, inputs=own.inputs[kept])
 
     def scaled_noise(self) -> tuple[np.ndarray, np.ndarray]:
         """Noise of samples and pushes, scaled; states that are not measured get the mean of others.
@@ -192,20 +198,21 @@ def track(
     own = _of_model(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
     terms = {state: list(model.terms(state)) for state in model.states}
     problem = scale_problem([own], model.library, terms=terms, measured=names)
-    path, free = problem.records[0].samples.copy(), _free_of(model, problem)
+    paths, free = [record.samples.copy() for record in problem.records], _free_of(model, problem)
     # Differences remove what is smooth; those of white noise have a variance of 20.
-    rough = np.sqrt(np.square(np.diff(path, n=3, axis=0)).mean(axis=0) / 20.0)
+    differences = np.concatenate([np.diff(path, n=3, axis=0) for path in paths])
+    rough = np.sqrt(np.square(differences).mean(axis=0) / 20.0)
     rough = np.clip(rough, LEAST_NOISE, MOST)
     tracker = Tracker(
         model=model,
         problem=problem,
         free=free,
-        n_substeps=_substeps(problem, path, free, rough),
+        n_substeps=_substeps(problem, paths, free, rough),
         per_period=_per_period(own, names),
         noise=_noise_of(problem, rough, 0.1 * rough),
     )
     for _ in range(N_PASSES):
-        tracker, path = _with_likely_noise(tracker, path)
+        tracker, paths = _with_likely_noise(tracker, paths)
     return tracker
 
 
@@ -232,23 +239,26 @@ def estimate_states(
     return track(model, record, measured=measured).along(record)
 
 
-def _with_likely_noise(tracker: Tracker, path: np.ndarray) -> tuple[Tracker, np.ndarray]:
-    """The tracker with the most likely noise about the states, and these states."""
-    (record,) = tracker.problem.records
+def _with_likely_noise(
+    tracker: Tracker, paths: Sequence[np.ndarray]
+) -> tuple[Tracker, list[np.ndarray]]:
+    """The tracker with the most likely noise about the states, and these states, by stretch."""
     samples, process = tracker.scaled_noise()
-    path = tracker.approach(record, path, samples, process)
-    found = likely_errors([tracker.linear(record, path)], tracker.measured, samples, process)
-    noise = _noise_of(tracker.problem, found.samples, found.process)
-    return replace(tracker, noise=noise), path
+    pairs = zip(tracker.problem.records, paths, strict=True)
+    found = [(each, tracker.approach(each, path, samples, process)) for each, path in pairs]
+    linear = [tracker.linear(each, path) for each, path in found]
+    likely = likely_errors(linear, tracker.measured, samples, process)
+    noise = _noise_of(tracker.problem, likely.samples, likely.process)
+    return replace(tracker, noise=noise), [path for _, path in found]
 
 
 def _substeps(
-    problem: EstimationProblem, path: np.ndarray, free: np.ndarray, noise: np.ndarray
+    problem: EstimationProblem, paths: Sequence[np.ndarray], free: np.ndarray, noise: np.ndarray
 ) -> int:
     """Number of Runge-Kutta steps from one sample to the next."""
-    level = Level((np.tile(noise, (len(path), 1)),), 1.0)
+    level = Level(tuple(np.tile(noise, (len(path), 1)) for path in paths), 1.0)
     everything = np.ones(len(free), dtype=np.bool_)
-    fit = TrajectoryFit((path,), free, everything, np.zeros(len(noise)))
+    fit = TrajectoryFit(tuple(paths), free, everything, np.zeros(len(noise)))
     return enough_substeps(problem, fit, level)
 
 
@@ -294,5 +304,4 @@ def _free_of(model: SparseModel, problem: EstimationProblem) -> Float[np.ndarray
 def _per_period(run: Trajectory, measured: Sequence[str]) -> float:
     """Samples to a period of the fastest measured state, or in all if it holds none."""
     frequency_Hz = max(dominant_frequency(run.t, column) for column in run.columns(measured).T)
-    periods = frequency_Hz * float(run.t[-1] - run.t[0])
-    return run.n_samples / max(periods, 1.0)
+    return run.n_samples / max(frequency_Hz * run.dt_s * run.n_samples, 1.0)

@@ -44,9 +44,14 @@ def derivative_r2(
     check_domain([run], library)
     values, data = run.columns(model.library.variables), run.columns(model.states)
     if x_dot is None:
-        smooth = smoother.smooth(run.t, values)
-        values = keep_inside(library, smooth, values)
-        truth = smoother.derivative(run.t, data)
+        pieces = [
+            (e.t, e.columns(model.library.variables), e.columns(model.states))
+            for e in run.stretches()
+        ]
+        values = np.concatenate(
+            [keep_inside(library, smoother.smooth(t, x), x) for t, x, _ in pieces]
+        )
+        truth = np.concatenate([smoother.derivative(t, x) for t, _, x in pieces])
     else:
         truth = np.asarray(x_dot, dtype=np.float64)
         if truth.shape != data.shape:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
-from ep2sindy.data.gaps import between_gaps
+from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum, steps_in
@@ -96,7 +96,7 @@ def cut_windows(
     n = len(states)
     spread, rms = joined[:, :n].std(axis=0), np.sqrt(np.square(joined[:, n:]).mean(axis=0))
     scale = zero_to_one(np.append(spread, rms))
-    step_s = float(np.mean(np.concatenate([np.diff(each.t) for each in trajectories])))
+    step_s = mean_step(*(each.t for each in trajectories))
     stretches = _stretches(trajectories, window)
     lengths = (stretches[:, 2] - stretches[:, 1]).tolist()
     piece, start = _places(lengths, n_windows, window, rng)
@@ -123,7 +123,7 @@ def dominant_window(
     """Length in samples of `periods` periods of the dominant frequency, as far as data allow.
 
     The frequency is that of the state whose peak holds the largest share of its power. The
-    length is the median over trajectories, and at most half of the longest trajectory.
+    length is the median over trajectories, and at most half of the longest stretch without a gap.
     Raises ValueError for no trajectory.
     """
     _check_trajectories(trajectories)
@@ -134,7 +134,7 @@ def dominant_window(
         frequency = dominant_frequency(each.t, sharpest)
         if frequency > 0.0:
             samples.append(steps_in(periods, frequency_Hz=frequency, dt_s=each.dt_s))
-    longest = max(each.n_samples for each in trajectories)
+    longest = _longest(trajectories)
     wanted = np.median(samples) if samples else longest / 2
     return int(np.clip(round(float(wanted)), min(10, longest), max(longest // 2, 10)))
 
@@ -160,24 +160,25 @@ def _check_trajectories(trajectories: Sequence[Trajectory]) -> None:
         raise ValueError("refinement needs at least one trajectory: none came")
 
 
+def _longest(trajectories: Sequence[Trajectory]) -> int:
+    """Samples in the longest stretch without a gap."""
+    return max(stop - start for run in trajectories for start, stop in between_gaps(run.t))
+
+
 def _check_room(trajectories: Sequence[Trajectory], window: int) -> None:
-    longest = max(each.n_samples for each in trajectories)
+    longest = _longest(trajectories)
     if window > longest:
         raise ValueError(
-            f"a window must fit into a trajectory: {window} samples were asked of trajectories "
+            f"a window must fit into a trajectory, between its gaps: {window} samples were asked "
             f"of at most {longest}; shorten it, or leave it out to have it chosen"
         )
 
 
 def _stretches(trajectories: Sequence[Trajectory], window: int) -> Int[np.ndarray, "pieces 3"]:
-    """Trajectory, first and last sample (exclusive) of every stretch without a gap.
-
-    The whole trajectories are returned if no stretch holds a window.
-    """
-    found = [(j, *each) for j, run in enumerate(trajectories) for each in between_gaps(run.t)]
-    if not any(stop - start >= window for _, start, stop in found):
-        found = [(j, 0, run.n_samples) for j, run in enumerate(trajectories)]
-    return np.array(found)
+    """Trajectory, first and last sample (exclusive) of every stretch without a gap."""
+    return np.array(
+        [(j, *each) for j, run in enumerate(trajectories) for each in between_gaps(run.t)]
+    )
 
 
 def _places(

@@ -40,7 +40,7 @@ class Differential:
         *,
         rng: np.random.Generator,
     ) -> tuple[RegressionRows, ...]:
-        """Stack the rows of all trajectories; every row uses samples of one trajectory only.
+        """Stack the rows of all trajectories; every row uses samples of one stretch without a gap.
 
         All equations share their rows, so there is one regression.
         Raises ValueError for no trajectory, trajectories with different states, or a variable of
@@ -48,11 +48,12 @@ class Differential:
         """
         check_agreement(trajectories, library.variables)
         check_domain(trajectories, library)
-        n_samples = [run.n_samples for run in trajectories]
+        pieces = [piece for run in trajectories for piece in run.stretches()]
+        n_samples = [run.n_samples for run in pieces]
         theta = np.empty((sum(n_samples), len(library)))
         target = np.empty((len(theta), len(trajectories[0].state_names)))
         ends = np.cumsum(n_samples)
-        for run, end in zip(trajectories, ends.tolist(), strict=True):
+        for run, end in zip(pieces, ends.tolist(), strict=True):
             rows = slice(end - run.n_samples, end)
             self._fill(run, library, theta[rows], target[rows])
         problem = RegressionRows(

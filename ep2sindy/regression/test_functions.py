@@ -1,4 +1,7 @@
-"""Test functions on windows of samples, and the weights that integrate a signal against them."""
+"""Test functions on windows of samples, and the weights that integrate a signal against them.
+
+Samples at unequal steps are first brought to an even grid.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,19 @@ from functools import lru_cache
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.sparse import csr_array
 
-from ep2sindy.regression.sampling import even_grid, is_even, one_about_each
+from ep2sindy.data.numbers import rounding_s
 from ep2sindy.regression.windows import Windows
 from ep2sindy.runtime.values import set_counts
 
 # Value of a bump, relative to its centre, at the first sample inside its edge.
 EDGE = 1e-10
+
+# Largest deviation from an even grid, in steps, that is attributed to rounding of the recorded
+# times. The error of such a sample is a twentieth of the signal's change in a step.
+ROUNDED = 0.05
 
 
 @runtime_checkable
@@ -214,3 +222,40 @@ def _check_width(n_points: int, n_samples: int, name: str) -> None:
             f"a window must fit the trajectory: {n_points} samples were asked of {n_samples}; "
             f"lower {name} or use more data"
         )
+
+
+def is_even(t: Float[np.ndarray, " samples"]) -> bool:
+    """Return true if the times lie on an even grid, apart from rounding."""
+    step = (t[-1] - t[0]) / (len(t) - 1)
+    off = np.abs(t - t[0] - step * np.arange(len(t))).max()
+    return bool(off <= max(ROUNDED * step, rounding_s(t)))
+
+
+def even_grid(
+    t: Float[np.ndarray, " samples"],
+) -> tuple[Float[np.ndarray, " points"], csr_array]:
+    """Even grid with about the median step, and the matrix (points, samples) that interpolates.
+
+    Interpolation is linear: weights are not negative, so noise is never amplified.
+    """
+    n_steps = max(1, round(float((t[-1] - t[0]) / np.median(np.diff(t)))))
+    grid = np.linspace(t[0], t[-1], n_steps + 1)
+    left = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
+    share = (grid - t[left]) / (t[left + 1] - t[left])
+    weights = np.stack([1.0 - share, share], axis=1)
+    columns = np.stack([left, left + 1], axis=1)
+    starts = np.arange(0, 2 * len(grid) + 1, 2)
+    lines = csr_array((weights.ravel(), columns.ravel(), starts), shape=(len(grid), len(t)))
+    lines.eliminate_zeros()
+    return grid, lines
+
+
+def one_about_each(
+    t: Float[np.ndarray, " samples"], middle: Float[np.ndarray, " windows"]
+) -> Int[np.ndarray, " kept"]:
+    """Indices of windows to keep: the first of all windows nearest to the same sample.
+
+    middle: increasing times of the middles of the windows.
+    """
+    nearest = np.searchsorted(0.5 * (t[1:] + t[:-1]), middle)
+    return np.flatnonzero(np.diff(nearest, prepend=-1) > 0)

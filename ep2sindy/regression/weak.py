@@ -17,7 +17,6 @@ from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
-from ep2sindy.regression.sampling import stretches
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.whitening import whitened_rows
@@ -77,7 +76,7 @@ class Weak:
         """
         check_agreement(trajectories, library.variables)
         check_domain(trajectories, library)
-        pieces = [piece for run in trajectories for piece in _pieces(run)]
+        pieces = [piece for run in trajectories for piece in run.stretches()]
         runs = [self._sample(piece, library, rng) for piece in pieces]
         states = range(len(runs[0].windows))
         return tuple(self._problem(k, runs, library, trajectories) for k in states)
@@ -192,12 +191,6 @@ class _Rows:
     windows: Windows
     segment: Int[np.ndarray, " rows"]
     test: Bool[np.ndarray, " rows"]
-
-
-def _pieces(run: Trajectory) -> list[Trajectory]:
-    """Stretches of a trajectory between its gaps; each one gets its own rows."""
-    parts = stretches(run.t)
-    return [run] if parts == [(0, run.n_samples)] else [run.window(*part) for part in parts]
 
 
 def _noisy_rows(

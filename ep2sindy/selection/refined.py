@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.data.gaps import between_gaps
+from ep2sindy.data.gaps import mean_step
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation
@@ -163,10 +163,7 @@ class RefinedScore:
         self, runs: Sequence[Trajectory], ensemble: Ensemble
     ) -> list[tuple[WindowBatch, WindowBatch]]:
         """Pairs of windows to refine on and windows to judge on; every window judges once."""
-        parts = [(run, part) for run in runs for part in between_gaps(run.t)]
-        apart = [run.window(*part) for run, part in parts if _is_wide(part)]
-        if max((run.n_samples for run in apart), default=0) >= 2 * MIN_SAMPLES:
-            runs = apart
+        runs = [piece for run in runs for piece in run.stretches(2 * MIN_SAMPLES)]
         pieces = self._pieces(runs, self._window(runs, ensemble.states))
         n_folds = min(N_FOLDS, len(pieces))
         nothing_left_to_chance = np.random.default_rng(0)  # one window per trajectory
@@ -209,7 +206,7 @@ class RefinedScore:
             wanted = min(dominant_window(runs, states), room)
             window = min(max(wanted, MIN_SAMPLES), longest // 2)
         else:
-            step_s = np.mean(np.concatenate([np.diff(run.t) for run in runs]))
+            step_s = mean_step(*(run.t for run in runs))
             window = round(self.window_s / step_s) + 1
         if not MIN_SAMPLES <= window <= longest // 2:
             raise ValueError(
@@ -218,10 +215,6 @@ class RefinedScore:
                 "change window_s, or use longer records"
             )
         return window
-
-
-def _is_wide(part: tuple[int, int]) -> bool:
-    return part[1] - part[0] >= 2 * MIN_SAMPLES
 
 
 def _models(ensemble: Ensemble, places: Int[np.ndarray, " models"]) -> list[SparseModel]:

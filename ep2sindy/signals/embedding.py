@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.values import check_count
@@ -29,6 +30,8 @@ MAX_STATES = 5
 
 # Neighbours whose mean predicts the next state, samples at either end and most samples used.
 N_NEIGHBOURS, EDGE, MAX_POINTS = 4, 10, 5000
+
+CUBIC = 3  # degree of a spline, which needs more samples than that
 
 # Noise level, in standard deviations of the signal, above which no derivative is taken.
 DROWNED = 0.5
@@ -177,10 +180,12 @@ class Delays:
     def embed(self, signal: Trace) -> Embedded:
         smoothed, _, noise_std = _smooth(signal, self.harmonics)
         lags_s = self.share * signal.period_s * np.arange(1, self.n_states)
-        late = signal.t >= signal.t[0] + lags_s[-1]
-        t = signal.t[late]
-        past = make_interp_spline(signal.t, smoothed, k=3)
-        states = np.column_stack([smoothed[late], *(past(t - lag_s) for lag_s in lags_s)])
+        parts = [
+            _with_past(signal.t[a:b], smoothed[a:b], lags_s)
+            for a, b in between_gaps(signal.t)
+            if b - a > CUBIC
+        ]
+        t, states = (np.concatenate(each) for each in zip(*parts, strict=True))
         run = _trajectory(signal, t, states, dict.fromkeys(self.names(signal.name), signal.unit))
         return Embedded(run, (), {}, noise_std)
 
@@ -255,6 +260,13 @@ def _chain(signal: str, letters: str) -> tuple[str, ...]:
 
 def _and_derivatives(n_states: int) -> str:
     return "" if n_states == 2 else f", with {n_states - 2} more derivative{'s'[: n_states - 3]}"
+
+
+def _with_past(t: np.ndarray, x: np.ndarray, lags_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times of a stretch without a gap, and its states there: x, and x some lags before."""
+    late = t >= t[0] + lags_s[-1]
+    past = make_interp_spline(t, x, k=CUBIC)
+    return t[late], np.column_stack([x[late], *(past(t[late] - lag_s) for lag_s in lags_s)])
 
 
 def _derivatives(t: np.ndarray, x: np.ndarray, n: int) -> list[np.ndarray]:

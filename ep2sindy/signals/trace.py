@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.values import read_only
@@ -91,7 +92,7 @@ class Trace:
     @property
     def per_period(self) -> float:
         """Mean number of samples in a period."""
-        return (len(self.t) - 1) / self.n_periods
+        return self.period_s / mean_step(self.t)
 
     @property
     def is_positive(self) -> bool:
@@ -191,8 +192,9 @@ def _averaged(
     factor = _spare(t, x) if decimate == "auto" else int(decimate or 1)
     if factor < 2:
         return t, x, ()
-    done = f"means over {factor} samples: {len(t) // factor} are left"
-    return _means(t, factor), _means(x, factor), (done,)
+    pieces = between_gaps(t)
+    t, x = (np.concatenate([_means(each[a:b], factor) for a, b in pieces]) for each in (t, x))
+    return t, x, (f"means over {factor} samples: {len(t)} are left",)
 
 
 def _spare(t: np.ndarray, x: np.ndarray) -> int:
