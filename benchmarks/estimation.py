@@ -2,6 +2,7 @@
 
     python -m benchmarks.estimation counts [--n 100] [--systems ...] [--noises ...] [--kind white]
     python -m benchmarks.estimation misfit [--n 25]     # with each true term left out
+    python -m benchmarks.estimation short [--n 10]      # short and sparse records of Lorenz
     python -m benchmarks.estimation samples             # CPU against the number of samples
     python -m benchmarks.estimation waves [--sizes 5 8 12 20 40] [--n 3]  # Lorenz-96 of many states
     python -m benchmarks.estimation chain [--sizes 20] [--n 3]            # coupled van der Pol's
@@ -12,6 +13,10 @@
 `counts` prints per system and noise: selected exactly right, wrong ones that are called a misfit,
 right ones that are, median CPU-s and the longest; of the right ones the median relative error of a
 coefficient and the share of 95 % intervals that hold the truth.
+
+`short` prints for each kind of record: selected right, wrong and called a misfit, wrong and said
+that the samples do not tell, wrong without a word, and the largest RMS miss of the model's own
+steps, in noise, of those that are no misfit: a path that misses them is no trajectory of the model.
 
 `collection` prints, for every draw of all systems of dysts, how many are exactly right, CPU-s, the
 intervals, and each wrong one in the first class of these that holds: flagged (called a misfit);
@@ -27,7 +32,8 @@ import argparse
 import resource
 import time
 import warnings
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
@@ -130,6 +136,56 @@ def misfits(systems: Sequence[str], n: int) -> None:
 
 def _shares(counts: np.ndarray) -> str:
     return "  ".join(f"{called}/{of}" for called, of in counts.reshape(-1, 2))
+
+
+def short(n: int) -> None:
+    print("record                                right misfit open silent   largest miss, CPU-s")
+    for words, make in SHORT.items():
+        rows, misses, cpu_s = Counter[str](), [0.0], 0.0
+        for number in range(n):
+            runs, start = make(number), time.process_time()
+            found = ep.estimate(runs, LORENZ.model.library)
+            cpu_s += time.process_time() - start
+            right = bool(((found.model.coef != 0.0) == (LORENZ.model.coef != 0.0)).all())
+            said = "misfit" if found.misfit else "open" if found.few else "silent"
+            rows[f"right {said}" if right else said] += 1
+            misses += [] if found.misfit else [_largest_miss(found)]
+        right = sum(count for word, count in rows.items() if word.startswith("right"))
+        counts = f"{right:5d} {rows['misfit']:6d} {rows['open']:4d} {rows['silent']:6d}"
+        print(f"{words:38}{counts}   {max(misses):.1e}  {cpu_s:.0f}", flush=True)
+
+
+def _lorenz_piece(number: int, n_samples: int, noise: float) -> ep.Trajectory:
+    rng = np.random.default_rng(number)
+    start = rng.uniform([-10.0, -10.0, 15.0], [10.0, 10.0, 30.0])
+    return LORENZ.trajectory(noise=noise, rng=rng, initial=start).window(0, n_samples)
+
+
+def _sparse(run: ep.Trajectory) -> ep.Trajectory:
+    """The run with z at every tenth instant."""
+    missing = np.zeros(run.states.shape, dtype=np.bool_)
+    missing[:, 2] = np.arange(run.n_samples) % 10 > 0
+    return replace(run, missing=missing)
+
+
+LORENZ = lorenz()
+SHORT: dict[str, Callable[[int], list[ep.Trajectory]]] = {
+    "60 samples, 20 %": lambda k: [_lorenz_piece(k, 60, 0.2)],
+    "three of 100, 20 %": lambda k: [_lorenz_piece(3 * k + j, 100, 0.2) for j in range(3)],
+    "300, z at every tenth, 20 %": lambda k: [_sparse(_lorenz_piece(k, 300, 0.2))],
+    "1000, z at every tenth, 20 %": lambda k: [_sparse(_lorenz_piece(k, 1000, 0.2))],
+}
+
+
+def _largest_miss(found: ep.discovery.Estimate) -> float:
+    """RMS of what the model, run from each sample of its path, misses of the next, in noise."""
+    squares, n_steps, own = np.zeros(len(found.noise_std)), 0, found.model
+    for path, run in zip(found.paths, found.runs, strict=True):
+        for k in range(0, len(path) - 1, max(1, len(path) // 50)):
+            ends = own.simulate(run.t[k : k + 2], path[k]).states
+            squares += np.square((ends[-1] - path[k + 1]) / found.noise_std)
+            n_steps += 1
+    return float(np.sqrt(squares.max() / n_steps))
 
 
 def samples() -> None:
@@ -295,7 +351,17 @@ def prices(noises: Sequence[float], n: int) -> None:
         )
 
 
-WHAT = ["counts", "misfit", "samples", "thruster", "collection", "prices", "waves", "chain"]
+WHAT = [
+    "counts",
+    "misfit",
+    "short",
+    "samples",
+    "thruster",
+    "collection",
+    "prices",
+    "waves",
+    "chain",
+]
 
 
 def main() -> None:
@@ -322,6 +388,8 @@ def main() -> None:
         chain(asked.sizes or [20], asked.n)
     elif asked.what == "prices":
         prices(asked.noises, asked.n)
+    elif asked.what == "short":
+        short(asked.n)
     elif asked.what == "samples":
         samples()
     else:

@@ -95,8 +95,7 @@ def place_of(kind: type) -> str | None:
 def attach(module: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """`__getattr__` and `__dir__` of a module that has a stub beside it.
 
-    A name stays in the module once it is loaded. One of the version before is found as well,
-    with a warning that says where it is now.
+    A name stays in the module once it is loaded.
     """
 
     def load(name: str) -> Any:
@@ -108,7 +107,8 @@ def attach(module: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
 
             return version(PACKAGE)
         if entry is None:
-            return _load_old(module, name)
+            message = f"module {module!r} has no attribute {name!r}; {_near(f'{module}.{name}')}"
+            raise AttributeError(message)
         if entry.module == module:
             return import_module(f"{module}.{name}")  # a room
         value = entry.load()
@@ -116,25 +116,6 @@ def attach(module: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
         return value
 
     return load, lambda: sorted(read_stub(module))
-
-
-def _load_old(module: str, name: str) -> Any:
-    """What a name of the version before means.
-
-    Raises AttributeError where there was none, or where it is gone, with what there is instead.
-    """
-    from warnings import warn
-
-    from ep2sindy._old_names import gone_text, moved_text, new_name
-
-    old = f"{module}.{name}"
-    new = new_name(old)
-    if new is None:
-        if gone := gone_text(old):  # `from ep2sindy import name` drops the error's text
-            warn(gone, FutureWarning, stacklevel=3)
-        raise AttributeError(f"module {module!r} has no attribute {name!r}; {gone or _near(old)}")
-    warn(moved_text(old), FutureWarning, stacklevel=3)
-    return dotted_names()[new].load()
 
 
 def _near(absent: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,6 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import ep2sindy as ep
+from benchmarks.estimation import LORENZ, SHORT
 from benchmarks.known_systems import noisy
 from ep2sindy._stubs import dotted_names
 from ep2sindy.discovery.recipe import method_of
@@ -19,7 +21,7 @@ from ep2sindy.estimation.kernels import departures, eliminate, filtered
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, fit_paths, gram, squares
 from ep2sindy.estimation.noise import _shown_by_samples, noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import Solution, from_smooth
+from ep2sindy.estimation.solver import EXACT, Solution, from_smooth, squares_of_steps
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
@@ -601,15 +603,6 @@ def test_a_recipe_is_the_method_that_it_stands_for_and_warns(asked: dict, method
     assert eval(written, PUBLIC) == method
 
 
-def test_the_old_name_of_the_argument_warns() -> None:
-    run = ep.lotka_volterra().trajectory(rng=0).window(0, 100)
-    rows = ep.Regression(ep.Differential(), ep.BestSubset(max_terms=2))
-    with pytest.warns(FutureWarning, match="write method=") as told:
-        old = ep.discover(run, recipe=rows).model
-    assert told[0].filename == __file__
-    assert old.text() == ep.discover(run, method=rows).model.text()
-
-
 NO_ROWS = (ep.WeightedWeak(), ep.Bootstraps(n=0))
 RULED = ep.TrajectorySearch(selection=RULE, depth=2)
 
@@ -803,3 +796,38 @@ def test_squares_whose_sum_overflows_are_infinite_and_warn_of_nothing() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert fit.total == np.inf
+
+
+def test_a_path_that_misses_the_steps_of_its_model_is_no_trajectory() -> None:
+    """What annealing lets pass can hold a model up: y' = a x - b x z with b of 5e3, and z' = 0."""
+    rng = np.random.default_rng([5, 300, 1])
+    start = rng.uniform([-10.0, -10.0, 15.0], [10.0, 10.0, 30.0])
+    run = LORENZ.trajectory(noise=0.2, rng=500, initial=start).window(0, 300)
+    missing = np.zeros(run.states.shape, dtype=np.bool_)
+    missing[:, 2] = np.arange(300) % 10 > 0
+    found = ep.estimate(replace(run, missing=missing), LORENZ.model.library)
+    assert found.flow_error > EXACT
+    assert "the states leave the model" in found.misfit
+    assert found.model.covariance is None
+
+
+def test_right_models_meet_their_steps() -> None:
+    run = LORENZ.trajectory(noise=0.2, rng=0)
+    problem = scale_problem([run], LORENZ.model.library)
+    found = from_smooth(problem, None, max_terms=7)
+    missed = squares_of_steps(problem, found.annealed.fit, found.annealed.level)[0]
+    assert found.flow_error == 0.0
+    assert (np.sqrt(missed / problem.n_samples) < 1e-2 * EXACT * found.noise.std).all()
+
+
+def test_pushes_alone_are_no_law() -> None:
+    found = ep.estimate(SHORT["60 samples, 20 %"](3), LORENZ.model.library)
+    assert found.misfit or found.model.coef.any(axis=0).all()
+
+
+def test_samples_that_leave_the_terms_open_are_said_to_tell_nothing() -> None:
+    found = ep.estimate(SHORT["60 samples, 20 %"](0), LORENZ.model.library)
+    assert re.match(
+        r"60 samples do not tell these equations from others: the chance .* is \d+%", found.few
+    )
+    assert found.note.startswith(found.few)

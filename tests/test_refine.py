@@ -372,16 +372,6 @@ def test_one_run_is_a_list_of_one_and_the_seed_is_zero() -> None:
         assert refine(PREY.model, run, settings).model == known
 
 
-def test_the_old_name_of_the_seed_warns() -> None:
-    data, settings = clean(PREY), RefinementSettings(n_windows=3, window=30)
-    with pytest.warns(FutureWarning, match="rng=.*: write seed=") as told:
-        old = refine(PREY.model, data, settings, rng=1)
-    assert told[0].filename == __file__
-    assert old.model == refine(PREY.model, data, settings, seed=1).model
-    with pytest.raises(ValueError, match="seed and rng are one argument"):
-        refine(PREY.model, data, settings, rng=1, seed=1)
-
-
 def test_bad_input_is_refused() -> None:
     rng = np.random.default_rng(0)
     data, model = clean(PREY), PREY.model

@@ -9,11 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from difflib import get_close_matches
 from typing import Any
-from warnings import warn
 
 from omegaconf import DictConfig, OmegaConf
 
-from ep2sindy._old_names import gone_text, moved_text, new_name
 from ep2sindy._stubs import dotted_names
 from ep2sindy.trust.user_code import is_for_configs, load_user_module
 
@@ -22,30 +20,26 @@ FOR_CONFIGS = frozenset(name for name, entry in dotted_names().items() if entry.
 
 
 def target_of(node: DictConfig, place: str) -> Callable[..., Any]:
-    """The object that a node's `_target_` names; old names work with a warning.
+    """The object that a node's `_target_` names.
 
     Raises ValueError for a name that configs may not use, before anything of it is imported.
     """
-    name = _current_name(node, place)
+    name = _known_name(node, place)
     return dotted_names()[name].load() if name in FOR_CONFIGS else _own(name, place)
 
 
-def _current_name(node: DictConfig, place: str) -> str:
-    """The name of a node's `_target_` today: one of FOR_CONFIGS, or of a module of the user's."""
+def _known_name(node: DictConfig, place: str) -> str:
+    """The name of a node's `_target_`: one of FOR_CONFIGS, or of a module of the user's."""
     name = str(node["_target_"])
-    new = new_name(name) or name
-    if new in FOR_CONFIGS:
-        if new != name:
-            # Of this line, so that it shows once, though a target is checked before it is built.
-            warn(f"{place}: {moved_text(name)}", FutureWarning, stacklevel=1)
-        return new
+    if name in FOR_CONFIGS:
+        return name
     module, _, last = name.rpartition(".")
     room = module.partition(".")[0]
     if room and room != "ep2sindy":
         return name
     raise ValueError(
         f"{place} must name a _target_ that there is, such as ep2sindy.EBIC, and that is for "
-        f"configs: {name!r} came; {gone_text(name) or _near(last)}"
+        f"configs: {name!r} came; {_near(last)}"
     )
 
 
@@ -84,7 +78,7 @@ def check_targets(node: Any, place: str = "") -> None:
     of this package are not imported yet: a definition that a run leaves out may need an extra.
     """
     if isinstance(node, DictConfig) and "_target_" in node and _is_there(node, "_target_"):
-        name = _current_name(node, place or "the config")
+        name = _known_name(node, place or "the config")
         if name not in FOR_CONFIGS:
             _own(name, place or "the config")
     keys: Any = node if isinstance(node, DictConfig) else range(len(node))

@@ -23,10 +23,9 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.front import Candidate
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.runtime.values import check_kind, old_keyword
+from ep2sindy.runtime.values import check_kind
 
 
-@old_keyword(recipe="method")
 @one_thread()
 def discover(
     runs: Runs,

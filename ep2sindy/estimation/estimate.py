@@ -37,6 +37,7 @@ MIN_ODDS = 1e-3  # rivals with lower odds are not reported
 HEAVY, STANDARD_ERRORS = 4.0, 5.0  # least kurtosis reported; least excess over 3
 COLLINEAR = 5.0  # standard errors by which a variance may exceed that of noise
 PART = 0.05  # share of the largest part: states with less are left out of a relation
+TOLD = 0.5  # least probability of all supports; with less, the samples do not tell which it is
 EVEN = 0.2  # above these odds of a rival, the choice is reported as undecided
 
 
@@ -289,7 +290,7 @@ def _report(
         memory=found.noise.memory,
         flow_error=found.flow_error,
         misfit=answer.misfit,
-        few=_few(problem, few_terms),
+        few=_few(problem, few_terms) or _open_choice(problem, supports),
         supports=supports,
         rivals=_rivals(problem, found, supports),
         remarks=(*answer.said, *remarks(problem, found.noise)),
@@ -389,6 +390,26 @@ def _few(problem: EstimationProblem, max_terms: int) -> str:
         f"{problem.n_samples} samples do not tell which of {n_terms} terms "
         f"({SAMPLES_PER_TERM * n_terms} would): {max_terms} an equation at most were tried; "
         "name the terms that you know (terms=...), or take a smaller library"
+    )
+
+
+def _open_choice(
+    problem: EstimationProblem, supports: Mapping[str, Sequence[ScoredSupport]]
+) -> str:
+    """A remark if the chosen supports are less likely than all others that were weighed together.
+
+    Prices of terms are log prior odds, so scores give posterior probabilities (Schwarz 1978,
+    doi:10.1214/aos/1176344136).
+    """
+    share = 1.0
+    for weighed in supports.values():
+        share /= sum(float(np.exp(-0.5 * each.deviance)) for each in weighed)
+    if share >= TOLD:
+        return ""
+    return (
+        f"{problem.n_samples} samples do not tell these equations from others: the chance that all "
+        f"terms are right is {share:.0%}; name the terms that you know (terms=...), take a smaller "
+        "library, or a longer record"
     )
 
 

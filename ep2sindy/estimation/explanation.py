@@ -33,6 +33,8 @@ from ep2sindy.estimation.pushed import (
     solve_pushed,
 )
 from ep2sindy.estimation.solver import (
+    ENOUGH_SAMPLES,
+    OTHER_STARTS,
     AnnealedFit,
     Solution,
     astray,
@@ -47,11 +49,8 @@ from ep2sindy.trust.interruption import is_interruption
 
 FIRST_MAX_TERMS, MORE_TERMS = 7, 5  # of one equation, and how many more where all are used
 LET_GO = 0.5  # residual, as a share of a state's spread, if the model ignores the state
-ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap
 # Moves of late channels (the delay model is linear), and the move, in mean steps, that ends them.
 MAX_MOVES, SETTLED = 3, 0.05
-# Smoother settings (log10 of process to measurement noise) to try if no other start fits.
-OTHER_STARTS = (-2.0, 0.0, 2.0)
 
 
 @dataclass(frozen=True, eq=False)

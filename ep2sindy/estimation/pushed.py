@@ -27,7 +27,13 @@ from ep2sindy.estimation.likelihood import (
 )
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import EstimationProblem
-from ep2sindy.estimation.solver import AnnealedFit, Solution, start_from_smooth
+from ep2sindy.estimation.solver import (
+    EXACT,
+    AnnealedFit,
+    Solution,
+    squares_of_steps,
+    start_from_smooth,
+)
 from ep2sindy.estimation.supports import best_support, term_prices
 
 # Bounds on noise and pushes, in RMS of the states.
@@ -42,6 +48,7 @@ LAGS, MORE_DEGREES, MAX_POWERS = range(1, 9), 2, 60
 MOST_SHOWN = (5.0, 4.0, 6.0)
 COLLINEAR = 1e-3  # share of a product that is left beside an equation's terms, if it is another
 RUNAWAY = 1e6  # innovations, in RMS of the states, of a model that follows no samples
+MOST_MISSED = 3.0  # RMS miss of a step, in pushes: the likeliest pushes are smaller than true ones
 SETTLING = 5  # samples from whose start on innovations count
 
 
@@ -58,6 +65,9 @@ class Errors:
 class PushedFit:
     """A fit under random pushes. prices: of the free coefficients.
 
+    moves: (d,), false for a state without a law: one whose equation has no term, and which nothing
+    but pushes moves, or one whose path misses its steps by more than pushes and noise allow.
+
     lasting, single, together: (d,), what innovations show that random ones would not, in standard
     errors: the largest autocorrelation over a few lags, the largest share that one product of
     states explains beside the terms of the equation, and the share that all of them explain.
@@ -67,6 +77,7 @@ class PushedFit:
     errors: Errors
     level: Level
     prices: Float[np.ndarray, " free"]
+    moves: Bool[np.ndarray, " d"]
     lasting: Float[np.ndarray, " d"]
     single: Float[np.ndarray, " d"]
     together: Float[np.ndarray, " d"]
@@ -84,7 +95,7 @@ class PushedFit:
         """
         shown = self.lasting, self.single, self.together
         is_random = [value < most for value, most in zip(shown, MOST_SHOWN, strict=True)]
-        return np.all(is_random, axis=0) & bool(np.isfinite(self.fit.total))
+        return np.all([self.moves, *is_random], axis=0) & bool(np.isfinite(self.fit.total))
 
     @property
     def score(self) -> float:
@@ -167,7 +178,10 @@ def solve_pushed(problem: EstimationProblem, *, max_terms: int) -> PushedFit:
         )
     level = _level(problem, fit, errors)
     fit = fit_paths(problem, fit, level)
-    return PushedFit(fit, errors, level, prices, *_left_over(problem, fit, level))
+    missed = squares_of_steps(problem, fit, level)[0] / problem.n_samples
+    allowed = np.square(MOST_MISSED * errors.process) + np.square(EXACT * errors.samples)
+    moves = problem.coef(fit.free).any(axis=0) & (missed <= allowed)
+    return PushedFit(fit, errors, level, prices, moves, *_left_over(problem, fit, level))
 
 
 def solution_under_pushes(problem: EstimationProblem, pushed: PushedFit) -> Solution:

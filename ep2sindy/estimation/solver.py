@@ -36,6 +36,9 @@ from ep2sindy.estimation.supports import alternatives, best_support, excess, pen
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 
 SAMPLES_PER_TERM = 5  # of the library: fewer samples do not tell which terms are present
+ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap
+# Smoother settings (log10 of process to measurement noise) to try if no other start fits.
+OTHER_STARTS = (-2.0, 0.0, 2.0)
 SAMPLES_PER_COEFFICIENT = 10  # of an equation, if samples are few: more terms would fit noise
 MAX_PASSES = 4  # until noise and support agree; usually two
 # rho, and the share of a term's price charged at that level. Free states hide part of what a term
@@ -43,6 +46,8 @@ MAX_PASSES = 4  # until noise and support agree; usually two
 COOLING = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
 COLD = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
 ASTRAY = 0.1  # RMS miss of the flow, as a share of the steps of a hidden state, if it follows none
+# RMS miss of a step, in noise, from which the path is no trajectory: right models miss by 1e-5.
+EXACT = 1e-3
 MAX_EXCHANGES = 3  # exchanges of supports at one level
 # rho at which supports are compared again. At lower rho the linearised flow says too little about
 # other supports; at higher rho free states hide their differences.
@@ -134,8 +139,11 @@ def _settle(problem: EstimationProblem, found: AnnealedFit, max_terms: int) -> S
     found = reheat(problem, found, prices, max_terms=max_terms)
     noise = noise_beside(problem, found.fit)
     error = steered = 0.0
+    defects, _ = squares_of_steps(problem, found.fit, found.level)
     if np.isfinite(found.score) and (noise.std > FLOOR).any():
         error = flow_error(problem, found.fit, noise, found.level)
+        defect = np.sqrt((defects / np.square(noise.std)).max() / problem.n_samples)
+        error = error if defect < EXACT else max(error, float(defect))  # it lives on the slack
         steered = parting(problem, found.fit, replace(found.level, noise=noise.white))
     return Solution(found, noise, prices, error, astray(problem, found), steered)
 
@@ -145,13 +153,21 @@ def astray(problem: EstimationProblem, found: AnnealedFit) -> Bool[np.ndarray, "
 
     One that has become very small leaves the flow freely, and large coefficients make it count.
     """
-    off, steps = np.zeros(len(problem.states)), np.zeros(len(problem.states))
-    with np.errstate(over="ignore", invalid="ignore"):
-        for record, path in zip(problem.records, found.fit.paths, strict=True):
-            ends = problem.ends(record, path[:-1], found.fit.free, found.level.n_substeps)
-            off += np.square(ends - path[1:]).sum(axis=0)
-            steps += np.square(np.diff(path, axis=0)).sum(axis=0)
-        return ~problem.measured & ~(off <= ASTRAY**2 * steps)
+    defects, steps = squares_of_steps(problem, found.fit, found.level)
+    return ~problem.measured & ~(defects <= ASTRAY**2 * steps)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
+def squares_of_steps(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """Sums of squares, by state: of what the flow from each sample misses, and of the steps."""
+    defects, steps = np.zeros(len(problem.states)), np.zeros(len(problem.states))
+    for record, path in zip(problem.records, fit.paths, strict=True):
+        ends = problem.ends(record, path[:-1], fit.free, level.n_substeps)
+        defects += np.square(ends - path[1:]).sum(axis=0)
+        steps += np.square(np.diff(path, axis=0)).sum(axis=0)
+    return defects, steps
 
 
 @dataclass(frozen=True, eq=False)

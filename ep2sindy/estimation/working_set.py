@@ -21,6 +21,8 @@ from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, hessian, observe
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 from ep2sindy.estimation.solver import (
+    OTHER_STARTS,
+    SAMPLES_PER_COEFFICIENT,
     WEIGHED_AT,
     Solution,
     at_level,
@@ -41,12 +43,33 @@ N_PROBES = 40  # draws of noise that tell how far a score scatters: to 22 % of i
 def search_within(
     problem: EstimationProblem, *, max_terms: int
 ) -> tuple[EstimationProblem, Solution]:
-    """The solution from smoothed states by a working set, and the problem of the set's terms."""
+    """The solution from smoothed states by a working set, and the problem of the set's terms.
+
+    Of a library that is large for its samples the linear terms are tried alone first: where they
+    explain the samples and no other term would pay for itself, that is the solution. A search that
+    begins with all terms would take products that stand in for linear terms over a transient.
+    """
     part = problem.restricted(first_set(problem, max_terms))
+    linear = problem.restricted(problem.required | (problem.degrees <= 1))
+    few = problem.n_samples < SAMPLES_PER_COEFFICIENT * len(problem.library)
+    if few and linear.n_free < problem.n_free > part.n_free:
+        found = _linear_solution(linear, max_terms)
+        if found.fits and with_entrances(linear, found, max_terms=max_terms)[1] is found:
+            return linear, found
     with problem.watch.stage(_weighed(part)):
         found = from_smooth(part, None, max_terms=max_terms)
     # About a solution that does not fit first order tells little, and other starts cost less.
     return with_entrances(part, found, max_terms=max_terms) if found.fits else (part, found)
+
+
+def _linear_solution(linear: EstimationProblem, max_terms: int) -> Solution:
+    """The likeliest solution of the linear terms alone that fits, from any start."""
+    with linear.watch.stage(_weighed(linear)):
+        tried = [
+            from_smooth(linear, log10_ratio, max_terms=max_terms)
+            for log10_ratio in (None, *OTHER_STARTS)
+        ]
+    return min(tried, key=lambda each: (not each.fits, each.score))
 
 
 def with_entrances(

@@ -20,7 +20,7 @@ from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.runtime.values import check_kind, old_keyword
+from ep2sindy.runtime.values import check_kind
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 
@@ -55,7 +55,6 @@ class SharedDiscovery:
     ambiguities: Mapping[str, Sequence[Ambiguity]] = field(repr=False)
 
 
-@old_keyword(recipe="method")
 @one_thread()
 def discover_shared(
     points: Mapping[str, Sequence[Trajectory]],

@@ -29,7 +29,6 @@ from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.runtime.values import old_keyword
 
 # Default settings and method.
 SETTINGS = RefinementSettings(n_reweights=0)
@@ -91,7 +90,6 @@ class Corrected:
         return rate.reshape(states.shape) * self.rate
 
 
-@old_keyword(rng="seed")
 @one_thread()
 def refine_with_correction(
     model: SparseModel,

@@ -17,7 +17,7 @@ from ep2sindy.refinement.ode import unconstrained
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine, with_coef
 from ep2sindy.runtime.progress import Progress, as_progress
-from ep2sindy.runtime.values import check_count, old_keyword
+from ep2sindy.runtime.values import check_count
 
 SETTINGS = RefinementSettings()
 
@@ -75,7 +75,6 @@ def join_names(terms: Sequence[tuple[str, str]]) -> str:
     return ", ".join(f"{state}: {term}" for state, term in terms)
 
 
-@old_keyword(rng="seed")
 def eliminate(
     model: SparseModel | Refinement,
     trajectories: Sequence[Trajectory],

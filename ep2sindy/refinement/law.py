@@ -27,7 +27,6 @@ from ep2sindy.refinement.weighted_law import Basis, weighted_law
 from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.runtime.values import old_keyword
 
 # Default settings; states are weighted by their standard deviation at every point.
 SETTINGS = RefinementSettings(n_windows=20, n_reweights=0)
@@ -59,7 +58,6 @@ class LawRefinement:
     history: tuple[Iteration, ...]
 
 
-@old_keyword(rng="seed")
 @one_thread()
 def refine_law(
     models: Sequence[SparseModel],

@@ -37,7 +37,7 @@ from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.runtime.progress import Advance, Progress, as_progress, nothing
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.runtime.values import check_kind, old_keyword
+from ep2sindy.runtime.values import check_kind
 
 SETTINGS = RefinementSettings()
 
@@ -125,7 +125,6 @@ def refine(
 ) -> list[Refinement]: ...
 
 
-@old_keyword(rng="seed")
 @one_thread()
 def refine(
     model: SparseModel | Sequence[SparseModel],

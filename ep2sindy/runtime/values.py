@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Mapping
-from functools import wraps
+from collections.abc import Mapping
 from operator import index
-from typing import Any, Protocol, SupportsIndex, TypeVar, cast
+from typing import Protocol, SupportsIndex, cast
 
 import numpy as np
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 
 def read_only(values: np.ndarray) -> np.ndarray:
@@ -83,31 +79,3 @@ def check_kind(name: str, value: object, kind: type, example: str) -> None:
         came = repr(value)
         came = came if "\n" not in came else f"a {type(value).__name__}"
         raise ValueError(f"{start}: {came} came{end}")
-
-
-def old_keyword(**names: str) -> Callable[[F], F]:
-    """Decorator: a function takes an argument by its old name as well, until version 0.4.
-
-    names: old name -> new name. The old one warns; both at once are a ValueError.
-    """
-
-    def decorate(function: F) -> F:
-        @wraps(function)
-        def call(*args: Any, **settings: Any) -> Any:
-            for old in names.keys() & settings.keys():
-                new = names[old]
-                if settings.get(new) is not None:
-                    raise ValueError(
-                        f"{new} and {old} are one argument, and both came: write {new}=..."
-                    )
-                warnings.warn(
-                    f"{old}=... goes with the next version: write {new}=...",
-                    FutureWarning,
-                    stacklevel=2,
-                )
-                settings[new] = settings.pop(old)
-            return function(*args, **settings)
-
-        return cast(F, call)
-
-    return decorate
