@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.coerce import check_domain, keep_inside
+from ep2sindy.data.coerce import check_domain, keep_inside, noise_inside
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.rollout import Equations, rates, terms_in_use
 from ep2sindy.signals.smoothers import Smoother
@@ -41,11 +41,11 @@ def derivative_r2(
 ) -> float:
     """Mean over the states of the R2 of their derivatives; see `SparseModel.score`."""
     library, _ = terms_in_use(model.library, model.coef)
-    check_domain([run], library)
+    check_domain([run], library, smooth=x_dot is None)
     values, data = run.columns(model.library.variables), run.columns(model.states)
     if x_dot is None:
         smooth = smoother.smooth(run.t, values)
-        values = keep_inside(library, smooth, values)
+        values = keep_inside(library, smooth, noise_inside(library, values))
         truth = smoother.derivative(run.t, data)
     else:
         truth = np.asarray(x_dot, dtype=np.float64)
