@@ -134,11 +134,22 @@ def test_draws_have_the_covariance_that_was_asked_for() -> None:
     assert np.count_nonzero(coef[0]) == 2
 
 
+def test_draws_move_no_more_than_their_covariance() -> None:
+    """Of equal correlations the eigenvectors are any that rounding makes of them, as by a unit."""
+    covariance = np.full((5, 5), 0.3) + 0.7 * np.eye(5)
+    rounding = 1e-12 * np.random.default_rng(0).standard_normal((5, 5))
+    here, there = (
+        draw_normal(np.zeros(5), each, 3, np.random.default_rng(1))
+        for each in (covariance, covariance + rounding + rounding.T)
+    )
+    np.testing.assert_allclose(there, here, atol=1e-10)
+
+
 def test_drawn_runs_are_those_of_the_solver() -> None:
     t = np.linspace(0.0, 2.0, 41)
     start = np.array([1.0, 2.0, 20.0])
     coef = draw_coef(LORENZ.model, None, 2, np.random.default_rng(0))
-    runs = draw_runs(LORENZ.model, t, np.stack([start, start]), coef)
+    runs = draw_runs(LORENZ.model, t, np.stack([start, start]), coef, reach=start)
     exact = LORENZ.model.simulate(t, start).states
     np.testing.assert_allclose(runs[0], exact, atol=2e-2)
     np.testing.assert_array_equal(runs[0], runs[1])
@@ -164,7 +175,9 @@ def test_a_run_that_diverges_is_not_a_number_and_counts_as_such() -> None:
     library = ep.polynomial(["x"], degree=2)
     model = ep.SparseModel(library, ["x"], ep.coef_matrix(library, [{"x^2": 1.0}]))
     coef = draw_coef(model, None, 2, np.random.default_rng(0))
-    runs = draw_runs(model, np.linspace(0.0, 2.0, 21), np.array([[1.0], [0.1]]), coef)
+    runs = draw_runs(
+        model, np.linspace(0.0, 2.0, 21), np.array([[1.0], [0.1]]), coef, reach=np.ones(1)
+    )
     assert np.isnan(runs[0, -1]).all()
     assert runs[1, -1, 0] == pytest.approx(0.125, rel=1e-4)
     assert quantiles(runs, [0.5])[0, -1, 0] == pytest.approx(0.125, rel=1e-4)

@@ -69,6 +69,15 @@ def test_a_cycle_begins_where_the_fixed_point_turns_unstable() -> None:
     assert np.isnan(found[0].frequency_Hz)
 
 
+def test_a_start_where_a_state_passes_through_zero_ends_no_run() -> None:
+    near = replace(recorded(1.0, 0.0), parameters={"a": 1.0})
+    states = near.run.states.copy()
+    states[near.slowest] = [1.0, 1e-9]
+    near = replace(near, trajectory=replace(near.run, states=states))
+    (found,) = law_map(hopf(), [near], [{"a": 1.0}])
+    assert found.fate is Fate.OSCILLATES
+
+
 def test_a_model_that_runs_away_has_no_cycle() -> None:
     wild = replace(hopf(), coef=np.abs(hopf().coef))
     near = replace(recorded(1.0, 0.0), parameters={"a": 1.0})

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
+import ep2sindy as ep
 from benchmarks.refine import START, STATES, TRUTH, breathing_states, contaminated
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms
@@ -514,3 +515,20 @@ def test_gpu_gives_the_same_coefficients() -> None:
     cpu = refined(seed=np.random.default_rng(1))
     gpu = refined(seed=np.random.default_rng(1), device="cuda")
     np.testing.assert_allclose(gpu.model.coef, cpu.model.coef, rtol=1e-8)
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_intervals_stand_only_where_what_is_left_is_noise(wrong: bool) -> None:
+    """Limited growth of the prey, which the wrong model lacks: its windows are followed poorly."""
+    library = ep.polynomial(["x", "y"], degree=2)
+    prey = {"x": 1.0, "x*y": -1.0, "x^2": -0.2}
+    coef = ep.coef_matrix(library, [prey, {"y": -1.0, "x*y": 1.0}])
+    truth = ep.SparseModel(library, ["x", "y"], coef)
+    clean = truth.simulate(np.linspace(0.0, 20.0, 401), [3.0, 0.5]).trajectory()
+    noise = 0.01 * np.random.default_rng(0).standard_normal(clean.states.shape)
+    run = replace(clean, states=clean.states + noise)
+    given = replace(truth, coef=np.where(truth.coef == -0.2, 0.0, truth.coef)) if wrong else truth
+    found = ep.refine(given, run, n_windows=4, window=100)
+    assert (found.model.covariance is None) == wrong
+    assert found.covariance is not None
+    assert ("no intervals: the model leaves more than noise of x" in found.message) == wrong

@@ -17,6 +17,14 @@ def linear() -> SparseModel:
     return SparseModel(library, ["x", "y"], A.T, {"x": "m", "y": "m/s"})
 
 
+def chain() -> SparseModel:
+    """n' = 1e18, m' = n - m."""
+    library = polynomial(["n", "m"], degree=1)
+    return SparseModel(
+        library, ["n", "m"], coef_matrix(library, [{"1": 1e18}, {"n": 1.0, "m": -1.0}])
+    )
+
+
 def driven() -> SparseModel:
     """x' = -2 x + u + 3 w, whose variables stand in no special order."""
     library = named_terms(["w", "x", "u"], ["w", "x", "u"])
@@ -85,6 +93,50 @@ def test_what_starts_at_zero_has_a_scale_of_its_own() -> None:
     t = np.linspace(0.0, 4.0, 9)
     found = model.simulate(t, [0.0]).states[:, 0]
     np.testing.assert_allclose(found, 1e-15 * (1 - np.exp(-t)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("start", [0.0, 1.0])
+def test_a_chain_from_zero_runs_in_any_unit(start: float) -> None:
+    """n' = 1e18, m' = n - m: m starts at zero (or at nothing beside 1e18), and so does its rate."""
+    t = np.linspace(0.0, 6.0, 25)
+    states = chain().simulate(t, [start, start]).states
+    exact = np.stack([t, t - 1.0 + np.exp(-t)], axis=1)
+    np.testing.assert_allclose(states, 1e18 * exact, rtol=1e-6, atol=10.0)
+
+
+def test_what_an_input_sets_off_has_the_scale_of_that_input() -> None:
+    """n' = u with u = 1e18 sin t: at the start, state, rate and input are all zero."""
+    model = SparseModel(named_terms(["n", "u"], ["u"]), ["n"], np.array([[1.0]]))
+    t = np.linspace(0.0, 6.0, 301)
+    states = model.simulate(t, [0.0], {"u": lambda t: 1e18 * np.sin(t)}).states[:, 0]
+    np.testing.assert_allclose(states, 1e18 * (1.0 - np.cos(t)), atol=1e11)
+
+
+def test_an_oscillation_from_rest_keeps_its_accuracy_over_a_long_time() -> None:
+    """x'' = 1 - x: over a thousand radians, rate times duration would be a thousandfold scale."""
+    library = polynomial(["x", "v"], degree=1)
+    coef = coef_matrix(library, [{"v": 1.0}, {"1": 1.0, "x": -1.0}])
+    found = SparseModel(library, ["x", "v"], coef).simulate([0.0, 1000.0], [0.0, 0.0])
+    assert found.states[-1, 0] == pytest.approx(1.0 - np.cos(1000.0), abs=1e-5)
+
+
+def test_draws_reach_as_far_as_the_run_they_surround() -> None:
+    """x' = x - x^2 grows a thousandfold from 1e-3, and rests at one."""
+    library = polynomial(["x"], degree=2)
+    coef = coef_matrix(library, [{"x": 1.0, "x^2": -1.0}])
+    model = SparseModel(library, ["x"], coef, covariance=np.diag([1e-4, 1e-4]))
+    run = model.simulate(np.linspace(0.0, 15.0, 61), [1e-3], draws=50)
+    low, high = run.band()
+    assert 0.9 < low[-1, 0] < run.states[-1, 0] < high[-1, 0] < 1.1
+
+
+def test_a_run_that_ends_at_its_start_has_draws_of_the_start_alone() -> None:
+    library = polynomial(["x"], degree=1, functions=["log"])
+    coef = coef_matrix(library, [{"log(x)": 1.0}])
+    model = SparseModel(library, ["x"], coef, covariance=np.eye(1))
+    run = model.simulate(np.linspace(0.0, 1.0, 5), [-1.0], draws=3)
+    assert run.diverged
+    np.testing.assert_array_equal(run.draws, np.full((3, 1, 1), -1.0))
 
 
 def test_a_run_that_diverges_is_marked_and_ends_there() -> None:

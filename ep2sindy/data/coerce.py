@@ -207,15 +207,22 @@ def _from_arrays(t: object, x: object) -> Trajectory:
 # Check that the functions of a library are defined along the trajectories.
 
 
-def check_domain(runs: Sequence[Trajectory], library: Library) -> None:
+BEYOND = 5.0  # standard deviations of noise by which a sample may lie outside a domain
+NOISY = 1e-9  # share of a signal's range that counts as noise, and not as rounding
+
+
+def check_domain(runs: Sequence[Trajectory], library: Library, *, smooth: bool) -> None:
     """Raise ValueError naming the first sample at which a function of the library has no value.
 
-    A run must stay in one interval of a function's domain, such as one side of a pole.
+    A run must stay in one interval of a function's domain, such as one side of a pole. smooth: the
+    functions are taken of smoothed or estimated states, so that a sample may lie outside by noise.
     """
     for function in library.functions:
         for k, run in enumerate(runs):
             x = run.columns([function.variable])[:, 0]
-            wrong = function.misplaced(x, x[:1] if function.has_poles else x)
+            noise = _noise_std(x) if smooth else 0.0
+            inside = function.keep_inside(x, noise)
+            wrong = function.misplaced(inside, inside) | (np.abs(inside - x) > BEYOND * noise)
             if not wrong.any():
                 continue
             first = int(np.argmax(wrong))
@@ -226,6 +233,34 @@ def check_domain(runs: Sequence[Trajectory], library: Library) -> None:
                 f"{x[first]:.6g} at t = {run.t[first]:.6g} s{label}{others}; name functions of the "
                 "variables that allow it, as 'log(y)', shift it, as 'log(1+y)', or crop the data"
             )
+
+
+def noise_inside(
+    library: Library, samples: Float[np.ndarray, "samples variables"]
+) -> Float[np.ndarray, "samples variables"]:
+    """The samples of a run; those that noise moved out of a function's domain lie in it again.
+
+    They are as far from its end as the noise is large: nearer, samples tell no difference.
+    """
+    kept = samples.copy()
+    for function in library.functions:
+        x = samples[:, library.variables.index(function.variable)]
+        inside = function.keep_inside(x, _noise_std(x))
+        wrong = function.misplaced(x, inside)
+        kept[wrong, library.variables.index(function.variable)] = inside[wrong]
+    return kept
+
+
+def _noise_std(x: Float[np.ndarray, " samples"]) -> float:
+    """Standard deviation of a signal's white noise, by its third differences, or zero.
+
+    They remove what is smooth, and have 20 times the variance; of a few outliers their median
+    knows nothing.
+    """
+    if len(x) < 4:
+        return 0.0
+    std = float(np.median(np.abs(np.diff(x, n=3)))) / (0.6745 * np.sqrt(20.0))
+    return std if std > NOISY * np.ptp(x) else 0.0
 
 
 def keep_inside(

@@ -73,13 +73,12 @@ def _discovery(
 ) -> Discovery:
     choice = found.choice
     test = noise_test(choice, runs, estimate=found.estimate)
-    # If residuals of its rows exceed the noise, intervals would not cover the truth.
-    withheld = bool(choice.left is not None and test.left and test.misfit)
+    # Intervals of a model that does not explain the data would not cover the truth.
     model = replace(choice.model, clock=runs[0].clock)
     return Discovery(
         fronts={front.equation: front for front in choice.fronts},
         chosen={each.equation: _as_in(choice.model, each) for each in choice.chosen},
-        model=replace(model, covariance=None) if withheld else model,
+        model=replace(model, covariance=None) if test.misfit else model,
         method=method,
         ambiguities=found.ambiguities,
         noise_test=test,

@@ -15,7 +15,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
@@ -212,7 +212,8 @@ def _candidate(state: str, support: ScoredSupport, library: Library) -> Candidat
 def _ambiguities_of_samples(task: Task) -> tuple[Ambiguity, ...]:
     """Terms whose values at the samples cannot be told apart."""
     library = task.library
-    theta = library.evaluate(np.concatenate([r.columns(library.variables) for r in task.runs]))
+    values = [noise_inside(library, run.columns(library.variables)) for run in task.runs]
+    theta = library.evaluate(np.concatenate(values))
     theta = theta / column_norms(theta)
     return find_ambiguities(library, lambda: theta, theta.T @ theta)
 

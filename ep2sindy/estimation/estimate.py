@@ -310,7 +310,7 @@ def check_runs(task: Task) -> None:
             f"a library of {len(task.library)} terms needs more samples than terms: {n_samples} "
             "came; use a smaller library or more data"
         )
-    check_domain(task.runs, task.library)
+    check_domain(task.runs, task.library, smooth=True)
     for run in task.runs:
         if run.n_samples < MIN_SAMPLES:
             raise ValueError(

@@ -97,8 +97,11 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
         left = _pulls(problem, fit, std)
     unit = [e / s for e, s in zip(left, shape, strict=True)]
     memory = _memory(unit)
+    samples = [record.values for record in problem.records]
+    off = [values - path for values, path in zip(samples, fit.paths, strict=True)]
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
-    believed = shows & _forgets(unit, memory) & _shown_by_samples(problem, fit, std, memory)
+    believed = shows & _forgets(unit, memory, problem.n_samples)
+    believed &= _shown_by_samples(samples, off, std, memory, problem.n_samples)
     # Slow residuals of a signal's size tell that the model ignores the signal.
     spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
     believed &= ~((memory > SLOW) & (std > LARGE * spread))
@@ -119,6 +122,22 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
         outliers=outliers,
         deviance=float((logs + n * np.log1p(-np.square(lasting)))[~hidden].sum()),
     )
+
+
+def are_noise(
+    samples: Sequence[Float[np.ndarray, "samples d"]],
+    left: Sequence[Float[np.ndarray, "samples d"]],
+    n: float,
+) -> Bool[np.ndarray, " d"]:
+    """True for states of which a model leaves no more than noise, so that intervals tell something.
+
+    What it leaves is less than any model's error, or white, or lasts as noise does that the samples
+    themselves show. samples, left: pieces of records, scaled, and what is left of them. n: how many
+    of these samples are independent.
+    """
+    std, memory = np.sqrt(np.mean(np.square(np.concatenate(left)), axis=0)), _memory(left)
+    believed = _forgets(left, memory, n) & _shown_by_samples(samples, left, std, memory, n)
+    return believed | (memory <= SIGNIFICANT / np.sqrt(n)) | (std <= FLOOR)
 
 
 def _likeliest_std(
@@ -244,14 +263,13 @@ def _deviance(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> f
 
 
 def _forgets(
-    left: Sequence[Float[np.ndarray, "samples d"]], memory: Float[np.ndarray, " d"]
+    left: Sequence[Float[np.ndarray, "samples d"]], memory: Float[np.ndarray, " d"], n: float
 ) -> Bool[np.ndarray, " d"]:
     """True if the residuals' autocorrelation falls as fast as that of AR(1) noise of this memory.
 
     The error of a model on a signal with white noise stays correlated over longer lags.
     """
     squares = sum(np.square(e).sum(axis=0) for e in left)
-    n = sum(map(len, left))
     faster = np.ones(len(memory), dtype=np.bool_)
     for lag in LAGS:
         products = sum((e[lag:] * e[:-lag]).sum(axis=0) for e in left)
@@ -260,10 +278,11 @@ def _forgets(
 
 
 def _shown_by_samples(
-    problem: EstimationProblem,
-    fit: TrajectoryFit,
+    samples: Sequence[Float[np.ndarray, "samples d"]],
+    left: Sequence[Float[np.ndarray, "samples d"]],
     std: Float[np.ndarray, " d"],
     memory: Float[np.ndarray, " d"],
+    n: float,
 ) -> Bool[np.ndarray, " d"]:
     """True if noise of this size and memory would leave differences as large as the samples'.
 
@@ -271,15 +290,13 @@ def _shown_by_samples(
     A signal that the samples do not resolve makes them larger; then the differences of the
     residuals count.
     """
-    samples = [record.values for record in problem.records]
-    left = [values - path for values, path in zip(samples, fit.paths, strict=True)]
     measured = np.minimum(_squared_differences(samples), _squared_differences(left))
     weights = (np.poly1d([1.0, -1.0]) ** ORDER).coeffs
     own, lags = np.convolve(weights, weights[::-1]), np.abs(np.arange(-ORDER, ORDER + 1))
     expected = np.square(std) * (own * memory[:, None] ** lags).sum(axis=1)
     # The ratio itself may fall to zero: of samples without differences, expected to be large.
-    far = np.abs(np.log(np.maximum(measured, TINY)) - np.log(expected))
-    return far < ALIKE / np.sqrt(problem.n_samples)
+    far = np.abs(np.log(np.maximum(measured, TINY)) - np.log(np.maximum(expected, TINY)))
+    return far < ALIKE / np.sqrt(n)
 
 
 def _squared_differences(

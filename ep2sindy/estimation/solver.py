@@ -13,7 +13,7 @@ from math import inf
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.coerce import keep_inside
+from ep2sindy.data.coerce import keep_inside, noise_inside
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.lateness import (
     DelayedGram,
@@ -377,7 +377,7 @@ def smoothed(problem: EstimationProblem, log10_ratio: float | None) -> Smoothed:
     for each, record in zip(estimates, problem.records, strict=True):
         samples = np.concatenate([record.samples, record.inputs], axis=1)
         values = np.concatenate([each.smoothed, record.inputs], axis=1)
-        inside = keep_inside(problem.library, values, samples)
+        inside = keep_inside(problem.library, values, noise_inside(problem.library, samples))
         paths.append(inside[:, : len(problem.states)])
     std = np.maximum(np.sqrt(variance), FLOOR if log10_ratio is None else UNSURE)
     std[~problem.measured] = std[problem.measured].mean()

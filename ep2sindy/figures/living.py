@@ -25,7 +25,7 @@ from ep2sindy.figures.style import (
 )
 from ep2sindy.library.units import Clock
 from ep2sindy.model.comparison import LONG
-from ep2sindy.model.rollout import Rollout
+from ep2sindy.model.rollout import Rollout, simulate
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.signals.attractor import Cycle, best_shift, find_cycle
 
@@ -118,11 +118,8 @@ def paths_off(cycle: LimitCycle) -> list[Rollout]:
     lowest = cycle.states.min(axis=0)  # of a state that is positive, no start may be below zero
     starts = np.where(lowest > 0.0, np.maximum(starts, 0.5 * lowest), starts)
     t = np.linspace(0.0, N_PERIODS * cycle.period_s, 1200)
-    # A run may go 30 times as far as the cycle; `simulate` counts in initial values.
     reach = np.abs(cycle.states).max(axis=0)
-    factors = 30.0 * (reach / np.maximum(np.abs(starts), 1e-12 * reach)).max(axis=1)
-    pairs = zip(starts, factors.tolist(), strict=True)
-    return [cycle.model.simulate(t, start, blow_up=factor) for start, factor in pairs]
+    return [simulate(cycle.model, t, start, None, blow_up=30.0, reach=reach) for start in starts]
 
 
 def has_waveform(run: Trajectory, rollout: Rollout) -> bool:

@@ -114,6 +114,17 @@ class Function:
         argument = self.scale * x + self.shift
         return next(((low, high) for low, high in self.kind.domain if low < argument < high), None)
 
+    def keep_inside(
+        self, x: Float[np.ndarray, " samples"], margin: float
+    ) -> Float[np.ndarray, " samples"]:
+        """Move values of the variable into the interval of the domain that holds their median.
+
+        They end no nearer to its ends than a margin.
+        """
+        home = self.interval(float(np.median(x))) or self.kind.domain[-1]
+        low, high = sorted((end - self.shift) / self.scale for end in home)
+        return np.clip(x, low + margin, high - margin)
+
     def misplaced(
         self, x: Float[np.ndarray, " samples"], beside: Float[np.ndarray, " _"]
     ) -> Bool[np.ndarray, " samples"]:

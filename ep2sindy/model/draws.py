@@ -26,11 +26,15 @@ def draw_normal(
     n_draws: int,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "draws n"]:
-    """Draws from a normal distribution, of variables whose sizes may differ by any factor."""
+    """Draws from a normal distribution, of variables whose sizes may differ by any factor.
+
+    Of all roots of the correlation the symmetric one is unique, whatever the signs of eigenvectors:
+    the same seed gives the same draws in any unit.
+    """
     size = np.sqrt(zero_to_one(np.maximum(np.diag(covariance), 0.0)))
     values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return mean + (rng.standard_normal((n_draws, len(mean))) @ root.T) * size
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return mean + (rng.standard_normal((n_draws, len(mean))) @ root) * size
 
 
 def draw_coef(
@@ -59,15 +63,17 @@ def draw_runs(
     drive: Drive | None = None,
     push_std: Float[np.ndarray, " n_states"] | None = None,
     push_step_s: float = 1.0,
-    reach: Float[np.ndarray, " n_states"] | None = None,
+    reach: Float[np.ndarray, " n_states"],
     rng: np.random.Generator | None = None,
 ) -> Float[np.ndarray, "draws samples n_states"]:
     """Integrate a model once for every draw, by classical Runge-Kutta steps between the samples.
 
     drive: inputs at a time in s. push_std: standard deviation of the random push that every state
-    receives in push_step_s; None for none. reach: largest states expected, in SI; None takes the
-    starts'. A run that goes a hundred times farther has diverged, and is NaN from there on.
+    receives in push_step_s; None for none. reach: largest states expected, in SI. A run that goes a
+    hundred times farther has diverged, and is NaN from there on.
     """
+    if len(t) < 2:  # of a run that ended at its start
+        return starts[:, None][:, : len(t)]
     library, _ = terms_in_use(model.library, model.coef)
     rows = [model.library.index(name) for name in library.names]
     coef = np.ascontiguousarray(coef[:, rows])
@@ -77,11 +83,10 @@ def draw_runs(
         values = x if drive is None else np.column_stack([x, np.tile(drive(time), (len(x), 1))])
         return np.einsum("nt,nts->ns", library.evaluate(values[:, gather]), c)
 
-    largest = np.abs(starts).max(axis=0) if reach is None else np.abs(reach)
-    bound = BLOW_UP * zero_to_one(largest)
+    bound = BLOW_UP * zero_to_one(reach)
     with np.errstate(over="ignore", invalid="ignore"):
         centre = starts.mean(axis=0)[None], coef.mean(axis=0)[None]
-        n = _enough_substeps(rates, t, *centre, largest)
+        n = _enough_substeps(rates, t, *centre, bound)
         if rng is None or push_std is None or not push_std.any():
             return _integrate(rates, t, starts, coef, n, bound)
         pushes = push_std * np.sqrt(np.diff(t) / push_step_s)[:, None]
@@ -93,10 +98,10 @@ def _enough_substeps(
     t: np.ndarray,
     start: np.ndarray,
     coef: np.ndarray,
-    largest: np.ndarray,
+    bound: np.ndarray,
 ) -> int:
     """Number of Runge-Kutta steps between samples that follow the central run."""
-    n, bound = 1, BLOW_UP * zero_to_one(largest)
+    n = 1
     run = _integrate(rates, t, start, coef, n, bound)
     while n < MAX_SUBSTEPS:
         finer = _integrate(rates, t, start, coef, 2 * n, bound)

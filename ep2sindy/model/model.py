@@ -196,7 +196,7 @@ class SparseModel:
         Returns a `Rollout`, whose `trajectory()` is the run as data. A run that diverges also
         returns one, marked `diverged` and with a message. It ends when a state exceeds `blow_up`
         times its scale, or when the solver gives up (see `rollout`). The scale of a state is its
-        initial value; if that is zero, its initial rate times the duration.
+        initial value; if that is zero, what the model's fastest time scale makes of it.
         draws: number of further runs, from the same start, with coefficients drawn from their
         covariance; `Rollout.band` gives their bounds. For the uncertainty of start, noise and model
         as well, see `ep.forecast`.
@@ -215,7 +215,8 @@ class SparseModel:
         coef = draw_coef(self, self.covariance, draws, np.random.default_rng(seed))
         starts = np.tile(check_start(self.states, x0), (draws, 1))
         drive, _ = driven(self.inputs, inputs, np.asarray(t, dtype=np.float64))
-        return replace(run, draws=draw_runs(self, run.t, starts, coef, drive=drive))
+        reached = np.abs(run.states).max(axis=0, initial=0.0)
+        return replace(run, draws=draw_runs(self, run.t, starts, coef, drive=drive, reach=reached))
 
     def predict(
         self, x: ArrayLike | Run, inputs: ArrayLike | Mapping[str, Any] | None = None

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ep2sindy.data.export import as_dataframe, as_dataset
-from ep2sindy.data.numbers import band_of
+from ep2sindy.data.numbers import band_of, zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import SECONDS, Clock
@@ -22,6 +22,9 @@ from ep2sindy.runtime.screen import one_screen, text_table
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
+
+# A start that is less than this share of what the first rates add tells no size of the state.
+NEGLIGIBLE = 1e-12
 
 
 @runtime_checkable
@@ -168,33 +171,64 @@ def simulate(
     inputs: ArrayLike | Mapping[str, Any] | None,
     *,
     blow_up: float,
-    rtol: float,
-    limit_s: float,
+    rtol: float = 1e-8,
+    limit_s: float = 300.0,
+    reach: Float[np.ndarray, " n_states"] | None = None,
 ) -> Rollout:
-    """Integrate a model freely from one state; see `SparseModel.simulate`."""
+    """Integrate a model freely from one state; see `SparseModel.simulate`.
+
+    reach: (n_states,), largest states expected, in SI, that scale the run in place of its start;
+    a start where a state passes through zero tells nothing of its size.
+    """
     times = np.asarray(t, dtype=np.float64)
     start = check_start(model.states, x0, hint="; the order is simulate(t, x0)")
     check_time(times)
     drive, samples = driven(model.inputs, inputs, times)
-    library, coef = terms_in_use(model.library, model.coef)
-    values, terms = library.at_points([*model.states, *model.inputs])
-    values[:] = np.append(start, samples[0])
-    # The scale of a state that starts at zero is its initial rate times the duration, or else one.
-    with np.errstate(over="ignore", invalid="ignore"):
-        moved = np.abs(terms() @ coef) * (times[-1] - times[0])
-    reach = np.where((start == 0.0) & np.isfinite(moved), moved, np.abs(start))
+    # An input may begin at zero as well: its largest sample tells what it does to a state.
+    driving = np.take_along_axis(samples, np.abs(samples).argmax(axis=0, keepdims=True), axis=0)
+    sizes = start_scale(model, start, driving[0], float(times[-1] - times[0]))
     return _integrate(
         model,
         times,
         start,
         drive=drive,
         samples=samples,
-        scale=np.where(reach > 0.0, reach, 1.0),
+        scale=sizes if reach is None else zero_to_one(reach),
         blow_up=blow_up,
-        bound="its start",
+        bound="its start" if reach is None else "the largest expected",
         rtol=rtol,
         limit_s=limit_s,
     )
+
+
+def start_scale(
+    model: Equations,
+    start: Float[np.ndarray, " n_states"],
+    inputs: Float[np.ndarray, " n_inputs"],
+    duration_s: float,
+) -> Float[np.ndarray, " n_states"]:
+    """Sizes of the states of a run that starts here, in SI: those of the start, where it has any.
+
+    A state that starts at zero has the size that its rate gives it within the duration or, if that
+    is shorter, the fastest time scale of the start. If its rate is zero as well, the rate follows
+    from what the other states have become by then. The size is one for a state that stays at zero.
+    """
+    library, coef = terms_in_use(model.library, model.coef)
+    n, known = len(start), [*model.states, *model.inputs]
+    places = [known.index(name) for name in library.variables]
+    values, terms = library.at_points(known)
+    values[:] = np.append(start, inputs)
+    size, jacobian = np.abs(start), np.zeros((len(known), n))
+    with np.errstate(all="ignore"):  # of functions outside their domain, and of rates that overflow
+        jacobian[places] = library.jacobian(values[places]) @ coef
+        finite = bool(np.isfinite(jacobian).all())
+        fastest = np.abs(np.linalg.eigvals(jacobian[:n])).max() if finite else 0.0
+        for _ in range(n):  # the longest chain of states of which each sets off the next
+            moved = (terms() @ coef) / max(fastest, 1.0 / duration_s)
+            small = (np.abs(start) <= NEGLIGIBLE * np.abs(moved)) & np.isfinite(moved)
+            size = np.where(small, np.maximum(size, np.abs(moved)), size)
+            values[:n] = np.where(small, moved, start)
+    return zero_to_one(size)
 
 
 def check_start(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.coerce import check_domain, keep_inside
+from ep2sindy.data.coerce import check_domain, keep_inside, noise_inside
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.rollout import Equations, rates, terms_in_use
 from ep2sindy.signals.smoothers import Smoother
@@ -41,7 +41,7 @@ def derivative_r2(
 ) -> float:
     """Mean over the states of the R2 of their derivatives; see `SparseModel.score`."""
     library, _ = terms_in_use(model.library, model.coef)
-    check_domain([run], library)
+    check_domain([run], library, smooth=x_dot is None)
     values, data = run.columns(model.library.variables), run.columns(model.states)
     if x_dot is None:
         pieces = [
@@ -49,7 +49,10 @@ def derivative_r2(
             for e in run.stretches()
         ]
         values = np.concatenate(
-            [keep_inside(library, smoother.smooth(t, x), x) for t, x, _ in pieces]
+            [
+                keep_inside(library, smoother.smooth(t, x), noise_inside(library, x))
+                for t, x, _ in pieces
+            ]
         )
         truth = np.concatenate([smoother.derivative(t, x) for t, _, x in pieces])
     else:

@@ -13,6 +13,7 @@ from scipy.integrate import DOP853, OdeSolution
 from ep2sindy.model.draws import halton
 from ep2sindy.model.many import rk4_step
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.rollout import start_scale
 from ep2sindy.model.scaled import ScaledModel
 from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.values import check_positive, read_only
@@ -368,9 +369,9 @@ def free_run(
     model: SparseModel, start: Float[np.ndarray, " n_states"], *, period_s: float, n_periods: float
 ) -> Float[np.ndarray, "samples n_states"] | None:
     """States of a free run from a start, N_SAMPLES per period; None if they diverge."""
-    # The size of a state that starts near zero is its initial rate times the period, or else one.
-    size = np.maximum(np.abs(start), np.abs(model.derivative(start, np.empty(0))) * period_s)
-    size = np.where(size > 0.0, size, 1.0)
+    # A state that starts near zero has at least the size that its rate gives it in a period.
+    moved = np.abs(model.derivative(start, np.empty(0))) * period_s
+    size = np.maximum(start_scale(model, start, np.empty(0), period_s), moved)
     scaled = ScaledModel.of(model, size, period_s)
     y = np.append(start / size, np.zeros(start.size**2))
     path = _path(scaled, y, n_periods, rtol=START_RTOL, blow_up=START_BLOW_UP, keep=True)

@@ -13,6 +13,7 @@ from scipy.optimize import root
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import CycleStability, limit_cycle
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.records import OperatingRecord, values_of
@@ -107,7 +108,7 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, f
     period_s = 1.0 / record.cycle.frequency_Hz
     start = record.run.states[record.slowest]
     mean, frequency_Hz, amplitude, second = record.cycle.mean, np.nan, np.nan, np.nan
-    fate, late = _run(model, start, period_s)
+    fate, late = _run(model, start, period_s, np.abs(record.run.states).max(axis=0))
     if fate is Fate.OSCILLATES:
         cycle = limit_cycle(model, late, period_s=period_s)
         if cycle is None or cycle.stability is CycleStability.REPELLING:
@@ -141,12 +142,15 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, f
 
 
 def _run(
-    model: SparseModel, start: Float[np.ndarray, " n_states"], period_s: float
+    model: SparseModel,
+    start: Float[np.ndarray, " n_states"],
+    period_s: float,
+    reach: Float[np.ndarray, " n_states"],
 ) -> tuple[Fate, Float[np.ndarray, " n_states"]]:
-    """Fate of a run from a start, and its final state."""
+    """Fate of a run from a start, and its final state. reach: largest states of the record."""
     n = 50
     t = np.linspace(0.0, N_PERIODS * period_s, N_PERIODS * n + 1)
-    run = model.simulate(t, start, blow_up=1e3, rtol=1e-7)
+    run = simulate(model, t, start, None, blow_up=1e3, rtol=1e-7, reach=reach)
     if run.diverged or not np.isfinite(run.states).all():
         return Fate.DIVERGES, start
     late = run.states[-5 * n :]

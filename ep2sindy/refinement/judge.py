@@ -8,10 +8,11 @@ from enum import StrEnum
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.special import ndtri, stdtrit
 from torchdiffeq import odeint
 
+from ep2sindy.estimation.noise import are_noise
 from ep2sindy.refinement.kernels import condense, propagate
 from ep2sindy.refinement.methods.multiple_shooting import least_change, step_maps
 from ep2sindy.refinement.problem import LawMap, Method, RefinementFit, RefinementProblem
@@ -82,13 +83,15 @@ class RefinementVerdict:
 
     window_loss: mean square of (trajectory - data) / std in each window, point after point.
     covariance, covariance_naive: covariances of the unknowns, which are the scalings of a point or
-    the theta of a law.
+    the theta of a law. explains: (n_states,), whether the residuals are noise; else intervals would
+    tell how far another stretch of the record moves a wrong model.
     """
 
     status: RefinementStatus
     window_loss: Float[np.ndarray, " windows"]
     covariance: Float[np.ndarray, "unknowns unknowns"]
     covariance_naive: Float[np.ndarray, "unknowns unknowns"]
+    explains: Bool[np.ndarray, " n_states"]
 
 
 def fit_and_judge(
@@ -162,8 +165,11 @@ def _judge_points(
     batch = _join_windows([problem.batches[p] for p in points])
     robust, naive = covariances(rows, batch, n_residuals=max(n_residuals, 1))
     with np.errstate(invalid="ignore", over="ignore"):
-        squares = [np.square(fit.nodes[p] - problem.data[p]) for p in points]
-    window_loss = np.concatenate([square.mean(axis=(1, 2)) for square in squares])
+        left = np.concatenate([fit.nodes[p] - problem.data[p] for p in points])
+        window_loss = np.square(left).mean(axis=(1, 2))
+        samples = np.concatenate([problem.data[p] for p in points])
+        n = samples.shape[0] * samples.shape[1] / batch.multiplicity
+        explains = are_noise(list(samples), list(left), n)
     loss = float(window_loss.mean())
     scaling = fit.scaling[points, : law.n_free]
     by_point = law.spread @ robust @ law.spread.transpose(0, 2, 1)
@@ -177,7 +183,7 @@ def _judge_points(
         settled=bool(fit.finished[points].all()) and stationary,
         coarse=lambda: any(is_coarse(*step) for step in steps),
     )
-    return RefinementVerdict(status, window_loss, robust, naive)
+    return RefinementVerdict(status, window_loss, robust, naive, explains)
 
 
 def _join_windows(batches: Sequence[WindowBatch]) -> WindowBatch:

@@ -46,7 +46,9 @@ SETTINGS = RefinementSettings()
 class Refinement:
     """A model fitted to trajectories, with its uncertainty and status.
 
-    model: with the covariance of its coefficients, a sandwich with windows as clusters.
+    model: with the covariance of its coefficients, if what it leaves of every state is noise; else
+    it explains the data no better than its residuals say, and has no intervals.
+    covariance: a sandwich with windows as clusters, for models that explain the data and others.
     covariance_naive: the same for white, independent residuals.
     window_loss: mean square of (trajectory - data) / std in each window, integrated again from
     the fitted starts. loss: its mean; a constant has a loss of one.
@@ -55,10 +57,11 @@ class Refinement:
     better than a constant; non_finite: the given model is returned, without covariance.
     history: one entry per iteration. trajectories: the fitted states in SI, in windows of `batch`.
     message: for non_finite, flat and max_iter, at which stage (by its memory in samples, see
-    `MultipleShooting`) and in which window the refinement failed; otherwise empty.
+    `MultipleShooting`) and in which window the refinement failed; else why there are no intervals.
     """
 
     model: SparseModel
+    covariance: Float[np.ndarray, "_ _"] | None
     covariance_naive: Float[np.ndarray, "_ _"] | None
     loss: float
     window_loss: Float[np.ndarray, " windows"]
@@ -70,7 +73,7 @@ class Refinement:
 
     def __repr__(self) -> str:
         body = model_lines(self.model, n_lines=N_LINES - 1)
-        return one_screen([self._headline(), *body])
+        return one_screen([self._headline(), *filter(None, [self.message]), *body])
 
     def _repr_html_(self) -> str:
         return f"<div>{html.escape(self._headline())}</div>{model_html(self.model)}"
@@ -261,7 +264,7 @@ def _result(
     batch, ode = problem.batches[point], problem.odes[point]
     relations = unconstrained(model) if constraint is None else constraint
     finite = verdict.status is not RefinementStatus.NON_FINITE
-    refined, naive = replace(model, covariance=None), None
+    refined, robust, naive = replace(model, covariance=None), None, None
     if finite:
         with torch.no_grad():
             ode.scaling.copy_(torch.tensor(fit.scaling[point, : len(ode.free0)]))
@@ -272,11 +275,12 @@ def _result(
             by_scaling @ covariance @ by_scaling.T
             for covariance in (verdict.covariance, verdict.covariance_naive)
         )
-        refined = replace(refined, covariance=robust)
+        refined = replace(refined, covariance=robust if verdict.explains.all() else None)
     with np.errstate(over="ignore"):  # a fit that blew up overflows
         trajectories = fit.nodes[point] * batch.scale[: fit.nodes.shape[-1]]
     return Refinement(
         model=refined,
+        covariance=robust,
         covariance_naive=naive,
         loss=float(verdict.window_loss.mean()) if finite else float("inf"),
         window_loss=verdict.window_loss,
@@ -284,8 +288,13 @@ def _result(
         history=tuple(entry for entry in history if entry.point == point),
         batch=batch,
         trajectories=trajectories,
-        message=failure(problem, fit, point, verdict),
+        message=failure(problem, fit, point, verdict) or _withheld(model, verdict),
     )
+
+
+def _withheld(model: SparseModel, verdict: RefinementVerdict) -> str:
+    more = [s for s, known in zip(model.states, verdict.explains, strict=True) if not known]
+    return f"no intervals: the model leaves more than noise of {', '.join(more)}" if more else ""
 
 
 def with_coef(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.coerce import check_domain, keep_inside
+from ep2sindy.data.coerce import check_domain, keep_inside, noise_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import MOST_ROWS, RegressionRows
@@ -47,7 +47,7 @@ class Differential:
         the library that a trajectory lacks.
         """
         check_agreement(trajectories, library.variables)
-        check_domain(trajectories, library)
+        check_domain(trajectories, library, smooth=self.smooth_library)
         pieces = [piece for run in trajectories for piece in run.stretches()]
         n_samples = [run.n_samples for run in pieces]
         theta = np.empty((sum(n_samples), len(library)))
@@ -77,7 +77,8 @@ class Differential:
         """Write the terms and the derivatives of one trajectory at its samples."""
         values = run.columns(library.variables)
         if self.smooth_library:
-            values = keep_inside(library, self.smoother.smooth(run.t, values), values)
+            smooth = self.smoother.smooth(run.t, values)
+            values = keep_inside(library, smooth, noise_inside(library, values))
         with np.errstate(over="ignore"):  # RegressionRows names a term that is not finite
             for start in range(0, len(values), MOST_ROWS):  # evaluation holds several copies
                 rows = slice(start, start + MOST_ROWS)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ep2sindy.data.coerce import check_domain, keep_inside
+from ep2sindy.data.coerce import check_domain, keep_inside, noise_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.ambiguity import usable_terms
@@ -75,7 +75,7 @@ class Weak:
         Raises ValueError as `Differential.assemble` does, and for windows that do not fit.
         """
         check_agreement(trajectories, library.variables)
-        check_domain(trajectories, library)
+        check_domain(trajectories, library, smooth=self.smooth_library)
         pieces = [piece for run in trajectories for piece in run.stretches()]
         runs = [self._sample(piece, library, rng) for piece in pieces]
         states = range(len(runs[0].windows))
@@ -111,10 +111,11 @@ class Weak:
         estimate = None if kalman is None else kalman.estimate(t, values)
         noise_std = None if estimate is None else estimate.noise_std
         exact = exact_columns(run, names, self.exact_inputs, noise_std)
+        inside = noise_inside(library, values)
         if estimate is not None:
             estimate = replace(
                 estimate,
-                smoothed=keep_inside(library, np.where(exact, values, estimate.smoothed), values),
+                smoothed=keep_inside(library, np.where(exact, values, estimate.smoothed), inside),
                 noise_std=np.where(exact, 0.0, estimate.noise_std),
             )
         if not self.smooth_library:
@@ -122,7 +123,7 @@ class Weak:
         if estimate is not None and kalman is self.smoother:
             return estimate.smoothed, estimate
         smooth = np.where(exact, values, self.smoother.smooth(t, values))
-        return keep_inside(library, smooth, values), estimate
+        return keep_inside(library, smooth, inside), estimate
 
     def _problem(
         self,

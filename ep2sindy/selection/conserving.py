@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Place, Process
@@ -164,8 +164,9 @@ def _system(
 
 def _means(task: Task) -> Float[np.ndarray, " terms"]:
     """Mean of every term over the records."""
-    values = np.concatenate([run.columns(task.library.variables) for run in task.runs])
-    mean: Float[np.ndarray, " terms"] = task.library.evaluate(values).mean(axis=0)
+    library = task.library
+    values = [noise_inside(library, run.columns(library.variables)) for run in task.runs]
+    mean: Float[np.ndarray, " terms"] = library.evaluate(np.concatenate(values)).mean(axis=0)
     return mean
 
 

@@ -39,7 +39,14 @@ from ep2sindy.studies.forecasts import (
     skill_of,
     why_none,
 )
-from ep2sindy.studies.library_result import RECORDS, LibraryResult, frequencies, refit, run_refitted
+from ep2sindy.studies.library_result import (
+    NOISE,
+    RECORDS,
+    LibraryResult,
+    frequencies,
+    refit,
+    run_refitted,
+)
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import Sampling, Source, balances_of, data_summary, zone_sizes_of
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
@@ -446,7 +453,7 @@ class Outcome:
             return None
         left = [each for test in tests for each in test.left.values() if not each.leaves_noise]
         ratios = sorted(each.chi_squared for each in left)
-        size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times the noise" if left else "more than noise"
+        size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {NOISE}" if left else "more than noise"
         return Text(
             f"The equations fitted to derivatives leave {size}: a state or a term is missing "
             "there, so they have no intervals; the free run above is what judges."

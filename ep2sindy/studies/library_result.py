@@ -276,12 +276,16 @@ def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Secti
     return Section(f"{name}: candidates", [*blocks, Picture(f"front_{name}")])
 
 
+# Nobody measured a simulation: what its samples show beside their smooth course is numerical.
+NOISE = "the noise of the samples (of a simulation: its numerical noise)"
+
+
 def left_over(state: str, test: NoiseTest) -> list[str]:
     """A line on the residuals of the selected terms, if the noise of the rows is known."""
     if (left := test.left.get(state)) is None:
         return []
     return [
-        f"left over of {state}': {left.chi_squared:.3g} times the noise, "
+        f"left over of {state}': {left.chi_squared:.3g} times {NOISE}, "
         f"autocorrelation {left.autocorrelation:.2f} (1 and 0 where noise alone is left)"
     ]
 

@@ -280,6 +280,7 @@ def _note(living: Living) -> str:
     """Note on the selection, the stability, and the columns of the table."""
     found = [f"Selection: {living.discovery.note}."]
     found += [living.free.text] if living.free.text else []
+    found += [f"Misfit: {living.discovery.misfit}."] if living.discovery.misfit else []
     found.append(
         "Amplitude: ratio of standard deviations; waveform error: RMS difference in standard "
         "deviations of the data."
