@@ -44,6 +44,7 @@ import ep2sindy as ep
 from benchmarks.known_systems import KINDS, OTHERS, noisy
 from benchmarks.living import DOWNSTREAM, POINTS, parts, record
 from benchmarks.many_states import lorenz_96
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation import supports
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
@@ -132,6 +133,20 @@ def misfits(systems: Sequence[str], n: int) -> None:
         f"equations of misfits by joint that are said to hold: {whole} of {n_whole} whole ones, "
         f"{lacking} of {n_lacking} that lack the term"
     )
+
+
+def chemical(
+    number: int, kind: str = "white", *, noise: float = 0.02, duration_s: float = 60.0, n: int = 600
+) -> Trajectory:
+    """A draw of the Brusselator (A = 1, B = 3) on its cycle of 7.16 s."""
+    system = OTHERS["brusselator"].system("brusselator")
+    settling = replace(system, duration_s=30.0, rate_Hz=100.0).trajectory()
+    on_cycle = replace(system, initial=settling.states[-1], duration_s=duration_s)
+    clean = replace(on_cycle, rate_Hz=n / duration_s).trajectory()
+    draw = np.random.default_rng([number, *kind.encode()]).standard_normal(clean.states.shape)
+    size = np.sqrt(np.square(clean.states).mean(axis=0))
+    states = clean.states + noise * draw * (clean.states if kind == "proportional" else size)
+    return Trajectory(clean.t, states, clean.state_names)
 
 
 def _shares(counts: np.ndarray) -> str:

@@ -432,7 +432,7 @@ def _of_noise(problem: EstimationProblem, noise: Noise) -> list[str]:
     words = []
     error = np.sqrt(24.0 / problem.n_samples)
     for k, state in enumerate(problem.states):
-        if noise.std[k] <= FLOOR or noise.unexplained[k] or not problem.measured[k]:
+        if noise.std[k] <= FLOOR or noise.is_error[k] or not problem.measured[k]:
             continue  # rounding, integration or model error, not noise
         if noise.memory[k]:
             words.append(f"noise of {state} lasts: {noise.memory[k]:.2f} from sample to sample")
@@ -449,7 +449,7 @@ def _of_noise(problem: EstimationProblem, noise: Noise) -> list[str]:
 def _of_collinear_states(problem: EstimationProblem, noise: Noise) -> list[str]:
     """Remark on measured states of which a linear combination varies no more than their noise."""
     own, n = np.flatnonzero(problem.measured), problem.n_samples
-    if len(own) < 2 or noise.unexplained.any():
+    if len(own) < 2 or noise.is_error.any():
         return []  # the residuals then hold model error, perhaps as large as the states
     samples = np.concatenate([record.samples for record in problem.records])[:, own]
     std, scale = noise.std[own], problem.scale[own]

@@ -224,7 +224,7 @@ def _solve(
     def rank(each: Solution) -> tuple[bool, int, float]:
         # The score of states that leave the flow is no likelihood, so those that fit come first. A
         # crude model may score best by following one state exactly and ignoring another.
-        let_go = (each.noise.unexplained > 0.0) & (each.noise.std > LET_GO * spread)
+        let_go = each.noise.is_error & (each.noise.std > LET_GO * spread)
         return not each.fits, int((let_go & problem.measured).sum()), each.score
 
     best, pushed = first, None
@@ -294,6 +294,13 @@ def _misfit(problem: EstimationProblem, found: Solution) -> str:
     for state, memory in zip(problem.states, found.noise.unexplained, strict=True):
         if memory:
             signs.append(f"what is left of {state} lasts ({memory:.2f} from sample to sample)")
+    for state, period in zip(problem.states, found.noise.period * problem.step_s, strict=True):
+        if period:
+            signs.append(f"what is left of {state} holds a line of period {period:.3g} s")
+    signs += [
+        f"what is left of {state} follows the states"
+        for state in compress(problem.states, found.noise.follows)
+    ]
     signs += [
         f"{s} does not follow its own equation" for s in compress(problem.states, found.astray)
     ]

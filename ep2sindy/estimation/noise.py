@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, fit_paths, innovations, observe
 from ep2sindy.estimation.likelihood import squares as squares_of
 from ep2sindy.estimation.problem import EstimationProblem
@@ -20,6 +22,10 @@ ALIKE = 7.0  # tolerance of the log mean square of differences, which scatters b
 LONGER = 6.0  # tolerance of autocorrelations, which scatter by up to 1.7/sqrt(n)
 NOISE_SHARES = 2.0 ** np.arange(-6.0, 1.1, 0.25)  # of the residuals' RMS, tried for limits
 LAGS = (2, 3, 4, 5, 6)
+CHANCE = 1e-5  # that noise holds a line as clean as one that is called the model's error
+# Degrees above the library's, and number, of the products of states that residuals are compared
+# with; and standard errors by which these may explain more of random residuals than their number.
+MORE_DEGREES, MAX_POWERS, FOLLOWS = 2, 60, 6.0
 TINY = float(np.finfo(np.float64).tiny)
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 0.9999)  # of growing variance, tried in turn
 GROWTH_SHOWS = 12.0  # least gain in 2 log likelihood for noise that grows
@@ -40,7 +46,9 @@ class Noise:
     (samples, d), relative size of the noise at each sample in units of std: one, or growing with
     the state. memory: (d,), correlation from one sample to the next if the noise is correlated in
     time, else 0. unexplained: (d,), the same correlation if the samples themselves do not show such
-    noise: then it is the model's error. growth: (d,), share of the variance that grows with the
+    noise: then it is the model's error. period: (d,), in mean steps, of a clean line in the
+    residuals, 0 if they hold none; follows: (d,), True if the residuals are a function of the
+    states. Both are the model's error too. growth: (d,), share of the variance that grows with the
     state. kurtosis: (d,), 3 for normal noise, NaN if all samples are limits. outliers: (d,), number
     of samples off by more than five standard deviations, estimated from the median. deviance: -2
     log likelihood of the residuals.
@@ -50,10 +58,17 @@ class Noise:
     shape: tuple[np.ndarray, ...]
     memory: Float[np.ndarray, " d"]
     unexplained: Float[np.ndarray, " d"]
+    period: Float[np.ndarray, " d"]
+    follows: Bool[np.ndarray, " d"]
     growth: Float[np.ndarray, " d"]
     kurtosis: Float[np.ndarray, " d"]
     outliers: Int[np.ndarray, " d"]
     deviance: float
+
+    @property
+    def is_error(self) -> Bool[np.ndarray, " d"]:
+        """Mask of the states whose residuals are the model's error rather than noise."""
+        return (self.unexplained > 0.0) | (self.period > 0.0) | self.follows
 
     @property
     def white(self) -> tuple[np.ndarray, ...]:
@@ -100,23 +115,28 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
     samples = [record.values for record in problem.records]
     off = [values - path for values, path in zip(samples, fit.paths, strict=True)]
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
+    new = _whiten(unit, memory)
+    period = np.where(std > FLOOR, _find_lines(problem, new), 0.0)
+    follows = _follow_states(problem, fit, new) & (std > FLOOR)
     believed = shows & _forgets(unit, memory, problem.n_samples)
     believed &= _shown_by_samples(samples, off, std, memory, problem.n_samples)
     # Slow residuals of a signal's size tell that the model ignores the signal.
     spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
-    believed &= ~((memory > SLOW) & (std > LARGE * spread))
+    believed &= ~((memory > SLOW) & (std > LARGE * spread)) & (period == 0.0) & ~follows
     std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std[~hidden]).mean()
     logs = n * np.log(alike) + sum(np.log(np.square(s)).sum(axis=0) for s in shape)
     if limited.any():
         logs = np.where(limited, between, logs)
-    kurtosis, outliers = _tails(problem, unit, memory)
+    kurtosis, outliers = _tails(problem, new)
     return Noise(
         std=std,
         shape=shape,
         memory=lasting,
         unexplained=np.where(shows & ~believed, memory, 0.0),
+        period=period,
+        follows=follows,
         growth=growth,
         kurtosis=kurtosis,
         outliers=outliers,
@@ -208,17 +228,16 @@ def _shapes(
 
 
 def _tails(
-    problem: EstimationProblem,
-    left: Sequence[Float[np.ndarray, "samples d"]],
-    memory: Float[np.ndarray, " d"],
+    problem: EstimationProblem, new: Sequence[Float[np.ndarray, "samples d"]]
 ) -> tuple[Float[np.ndarray, " d"], Int[np.ndarray, " d"]]:
     """Kurtosis of the AR(1) innovations of the residuals of values, and the number of outliers."""
-    kurtosis, outliers = np.full(len(memory), np.nan), np.zeros(len(memory), dtype=np.int64)
+    d = len(problem.states)
+    kurtosis, outliers = np.full(d, np.nan), np.zeros(d, dtype=np.int64)
     values = [np.isfinite(record.values) for record in problem.records]
-    new = np.concatenate([e[1:] - memory * e[:-1] for e in left])
+    later = np.concatenate([each[1:] for each in new])
     known = np.concatenate([each[1:] & each[:-1] for each in values])
     for k in np.flatnonzero(known.any(axis=0)):
-        squares = np.square(new[known[:, k], k])
+        squares = np.square(later[known[:, k], k])
         kurtosis[k] = np.square(squares).mean() / max(np.square(squares.mean()), TINY)
         # The median of squares of a normal variable is 0.455 of its variance.
         outliers[k] = (squares > OUTLYING**2 * np.median(squares) / 0.455).sum()
@@ -275,6 +294,73 @@ def _forgets(
         products = sum((e[lag:] * e[:-lag]).sum(axis=0) for e in left)
         faster &= products / np.maximum(squares, TINY) - memory**lag < LONGER / np.sqrt(n)
     return faster
+
+
+def _whiten(
+    left: Sequence[Float[np.ndarray, "samples d"]], memory: Float[np.ndarray, " d"]
+) -> list[Float[np.ndarray, "samples d"]]:
+    """Residuals less what AR(1) noise of this memory keeps of those before."""
+    return [np.concatenate([e[:1], e[1:] - memory * e[:-1]]) for e in left]
+
+
+def _find_lines(
+    problem: EstimationProblem, new: Sequence[Float[np.ndarray, "samples d"]]
+) -> Float[np.ndarray, " d"]:
+    """Period, in mean steps, of the cleanest line in the residuals; 0 if noise may hold such one.
+
+    A model that ignores an oscillation leaves one. Of white residuals the m ordinates of a
+    periodogram are alike: the largest has more than a share g of their sum with a probability of at
+    most m (1 - g)^(m - 1).
+    Source: Fisher 1929, doi:10.1098/rspa.1929.0151.
+    """
+    d = len(problem.states)
+    period, least = np.zeros(d), np.full(d, np.log(CHANCE / len(new)))
+    for record, each in zip(problem.records, new, strict=True):
+        # Samples at unequal steps go to the nearest of equal ones.
+        place = np.rint(record.times - record.times[0]).astype(np.int64)
+        placed = np.zeros((place[-1] + 1, d))
+        np.add.at(placed, place, each)
+        power = np.square(np.abs(np.fft.rfft(placed, axis=0)[1 : (len(placed) + 1) // 2]))
+        share = power.max(axis=0, initial=0.0) / np.maximum(power.sum(axis=0), TINY)
+        m = len(power)
+        chance = np.log(m) + (m - 1) * np.log1p(-np.minimum(share, 1.0 - 1e-12))
+        period = np.where(chance < least, len(placed) / (1 + power.argmax(axis=0)), period)
+        least = np.minimum(chance, least)
+    return period
+
+
+def _follow_states(
+    problem: EstimationProblem, fit: TrajectoryFit, new: Sequence[Float[np.ndarray, "samples d"]]
+) -> Bool[np.ndarray, " d"]:
+    """True if products of the states explain more of the residuals than they would of noise.
+
+    What a library lacks is a function of the states, also where it lasts as noise does. The squares
+    that random residuals share with the products are expected from the squares of each sample
+    alone, so neither outliers nor noise that grows with the state pass for such a function.
+    """
+    states = [
+        np.concatenate([p, r.inputs], 1) for p, r in zip(fit.paths, problem.records, strict=True)
+    ]
+    degree = int(problem.candidates.library.degrees.max()) + MORE_DEGREES
+    basis = np.linalg.qr(powers_of(np.concatenate(states), degree))[0]
+    joined = np.concatenate(new)
+    shared = np.square(basis.T @ joined).sum(axis=0)
+    expected = np.square(basis).sum(axis=1) @ np.square(joined)
+    return shared - expected > FOLLOWS * np.sqrt(2.0 / basis.shape[1]) * expected
+
+
+def powers_of(
+    states: Float[np.ndarray, "samples d"], degree: int
+) -> Float[np.ndarray, "samples _"]:
+    """Products of standardised states up to a degree, the lowest first, at most MAX_POWERS."""
+    scaled = (states - states.mean(axis=0)) / zero_to_one(states.std(axis=0))
+    most = min(MAX_POWERS, len(states) // 5)
+    columns = [np.ones(len(states))]
+    for k in range(1, degree + 1):
+        for chosen in combinations_with_replacement(range(scaled.shape[1]), k):
+            if len(columns) < most:
+                columns.append(scaled[:, list(chosen)].prod(axis=1))
+    return np.stack(columns, axis=1)
 
 
 def _shown_by_samples(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,7 +24,7 @@ from ep2sindy.estimation.likelihood import (
     gram,
     observe,
 )
-from ep2sindy.estimation.noise import noise_beside
+from ep2sindy.estimation.noise import MORE_DEGREES, noise_beside, powers_of
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.solver import (
     EXACT,
@@ -41,9 +40,7 @@ LEAST_NOISE, LEAST_PUSH, MOST = 1e-5, 1e-7, 3.0
 MAX_TRIALS = 120  # likelihoods per size of an error
 SHARES = (0.3, 1.0, 1.0, 1.0, 1.0)  # of the terms' prices, in every round
 MAX_EXCHANGES = 4  # of supports in one round
-# Lags at which innovations are correlated with themselves; degrees above the library's, and number,
-# of the products of states that they are compared with.
-LAGS, MORE_DEGREES, MAX_POWERS = range(1, 9), 2, 60
+LAGS = range(1, 9)  # at which innovations are correlated with themselves
 # Standard errors that random innovations may show: see `PushedFit`.
 MOST_SHOWN = (5.0, 4.0, 6.0)
 COLLINEAR = 1e-3  # share of a product that is left beside an equation's terms, if it is another
@@ -193,6 +190,8 @@ def solution_under_pushes(problem: EstimationProblem, pushed: PushedFit) -> Solu
         std=pushed.errors.samples,
         memory=zero,
         unexplained=zero,
+        period=zero,
+        follows=zero > 0.0,
         deviance=pushed.errors.deviance,
     )
     annealed = AnnealedFit(pushed.fit, pushed.level, pushed.score)
@@ -227,7 +226,7 @@ def _left_over(
     root = np.sqrt(len(joined))
     lasting = root * np.abs(products).max(axis=0) / np.square(size)
     before = np.concatenate([path[SETTLING - 1 : -1] for path in fit.paths])
-    powers = _powers(before, int(problem.candidates.library.degrees.max()) + MORE_DEGREES)
+    powers = powers_of(before, int(problem.candidates.library.degrees.max()) + MORE_DEGREES)
     unit = root * joined / size
     together = np.square(np.linalg.qr(powers)[0].T @ unit).sum(axis=0) - powers.shape[1]
     single = _largest_share(problem, fit, before, powers, unit)
@@ -253,18 +252,6 @@ def _largest_share(
         kept = size > COLLINEAR * np.linalg.norm(powers, axis=0)
         found[k] = np.abs(unit[:, k] @ (beside[:, kept] / size[kept])).max(initial=0.0)
     return found
-
-
-def _powers(states: Float[np.ndarray, "samples d"], degree: int) -> Float[np.ndarray, "samples _"]:
-    """Products of standardised states up to a degree, the lowest first, at most MAX_POWERS."""
-    scaled = (states - states.mean(axis=0)) / zero_to_one(states.std(axis=0))
-    most = min(MAX_POWERS, len(states) // 5)
-    columns = [np.ones(len(states))]
-    for k in range(1, degree + 1):
-        for chosen in combinations_with_replacement(range(scaled.shape[1]), k):
-            if len(columns) < most:
-                columns.append(scaled[:, list(chosen)].prod(axis=1))
-    return np.stack(columns, axis=1)
 
 
 def _level(problem: EstimationProblem, fit: TrajectoryFit, errors: Errors) -> Level:

@@ -96,7 +96,7 @@ class Solution:
     @property
     def fits(self) -> bool:
         """True if the residuals look like noise."""
-        exact = self.flow_error == 0.0 and not self.noise.unexplained.any()
+        exact = self.flow_error == 0.0 and not self.noise.is_error.any()
         followed = exact and not self.astray.any() and self.parting < STEERED
         return followed and bool(np.isfinite(self.score))
 

@@ -1,0 +1,98 @@
+"""What a model leaves over: noise of any kind, or its own error."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from benchmarks.estimation import chemical
+from benchmarks.known_systems import KINDS, noisy
+from ep2sindy.estimation.likelihood import TrajectoryFit
+from ep2sindy.estimation.noise import Noise, noise_beside
+from ep2sindy.estimation.problem import scale_problem
+from ep2sindy.systems.systems import System
+
+
+def noise_of(
+    runs: list[ep.Trajectory], paths: list[np.ndarray], library: ep.Library | None = None
+) -> Noise:
+    """The noise beside given paths, in SI, of a model of no terms."""
+    problem = scale_problem(runs, library or ep.polynomial(runs[0].state_names, degree=2))
+    n, d = problem.n_free, len(problem.states)
+    scaled = tuple(path / problem.scale for path in paths)
+    none = np.zeros(n, dtype=np.bool_)
+    return noise_beside(problem, TrajectoryFit(scaled, np.zeros(n), none, np.zeros(d)))
+
+
+def at_rest(run: ep.Trajectory) -> np.ndarray:
+    return np.tile(run.states.mean(axis=0), (run.n_samples, 1))
+
+
+@pytest.mark.parametrize("n", [160, 1000])
+def test_34_clean_cycles_are_not_the_noise_of_a_state_at_rest(n: int) -> None:
+    run = chemical(0, noise=0.0, duration_s=34 * 7.157, n=n)
+    noise = noise_of([run], [at_rest(run)])
+    overtone = n / 34 / noise.period  # whitening raises the overtones
+    np.testing.assert_allclose(overtone, np.round(overtone), rtol=0.02)
+    assert noise.is_error.all()
+    assert not noise.memory.any()
+
+
+def test_a_line_is_found_in_pieces_of_a_record_and_at_unequal_steps() -> None:
+    run = chemical(0, noise=0.02, duration_s=34 * 7.157, n=1200)
+    pieces = [run.window(k, k + 300) for k in range(0, 1200, 300)]
+    kept = np.flatnonzero(np.random.default_rng(0).random(1200) > 0.5)
+    uneven = ep.Trajectory(run.t[kept], run.states[kept], run.state_names)
+    for runs in (pieces, [uneven]):
+        assert noise_of(runs, [at_rest(each) for each in runs]).period.all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_noise_of_any_kind_is_not_the_error_of_the_true_path(kind: str) -> None:
+    for name, number in product(("lorenz", "lotka_volterra", "brusselator"), range(5)):
+        system, run = noisy(name, 0.2, number, kind)
+        _, clean = noisy(name, 0.0, number, kind)
+        assert not noise_of([run], [clean.states], system.model.library).is_error.any()
+
+
+@pytest.mark.parametrize("memory", [0.7, 0.95])
+def test_noise_that_lasts_is_not_the_error_of_the_true_path(memory: float) -> None:
+    for name, number in product(("lorenz", "lotka_volterra", "brusselator"), range(5)):
+        system, clean = noisy(name, 0.0, number)
+        noise = np.random.default_rng(number).standard_normal(clean.states.shape)
+        for k in range(1, len(noise)):
+            noise[k] = memory * noise[k - 1] + np.sqrt(1.0 - memory**2) * noise[k]
+        states = clean.states + 0.2 * noise * clean.states.std(axis=0)
+        run = ep.Trajectory(clean.t, states, clean.state_names)
+        assert not noise_of([run], [clean.states], system.model.library).is_error.any()
+
+
+def test_a_function_of_the_states_is_no_noise_that_lasts() -> None:
+    system, clean = noisy("lotka_volterra", 0.0, 0)
+    _, run = noisy("lotka_volterra", 0.02, 0)
+    x, y = clean.states.T
+    error = 0.03 * np.sin(3.0 * x) * np.cos(3.0 * y)
+    off = ep.Trajectory(run.t, run.states + np.stack([error, 0.0 * error], axis=1), ["x", "y"])
+    noise = noise_of([off], [clean.states], system.model.library)
+    np.testing.assert_array_equal(noise.follows, [True, False])
+
+
+def lacking(duration_s: float) -> tuple[ep.Trajectory, System]:
+    return chemical(0, noise=0.02, duration_s=duration_s), noisy("brusselator", 0.0, 0)[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("align", [False, True])
+@pytest.mark.parametrize("duration_s", [30.0, 60.0])
+def test_a_library_of_too_low_a_degree_is_no_late_sensor(duration_s: float, align: bool) -> None:
+    run, system = lacking(duration_s)
+    found = ep.estimate([run], ep.polynomial(["x", "y"], degree=2), align=align)
+    assert found.misfit
+    assert found.model.covariance is None
+    assert not found.delays_s.any()
+    right = ep.estimate([run], ep.polynomial(["x", "y"], degree=3), align=align)
+    assert not right.misfit
+    np.testing.assert_array_equal(right.model.coef != 0.0, system.model.coef != 0.0)
