@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,29 @@ def test_exchanges_find_the_best_subsets(n_problems: int) -> None:
     proven = ep.BestSubset(max_terms=5).shared_supports(xx, xy, yy)
     found = exchanged_supports(xx, xy, yy, max_terms=5, n_best=1)
     assert np.array_equal(found, proven)
+
+
+@pytest.mark.parametrize("seed", [3, 7, 8, 10])
+def test_no_support_is_worse_than_a_part_of_the_larger_one(seed: int) -> None:
+    """Columns hang together as products of few states do, so the way up misses some supports."""
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal((200, 3)) + np.array([1.0, 2.0, 3.0])
+    columns = ep.polynomial(["x", "y", "z"], degree=4).evaluate(x)
+    columns /= np.linalg.norm(columns, axis=0)
+    target = columns[:, rng.choice(35, 3, replace=False)] @ rng.standard_normal(3)
+    target += 0.001 * rng.standard_normal(200)
+    masks = exchanged_supports(
+        (columns.T @ columns)[None], (columns.T @ target)[None], np.array([target @ target]),
+        max_terms=6, n_best=1,
+    )  # fmt: skip
+
+    def residual(mask: np.ndarray) -> float:
+        coef = np.linalg.lstsq(columns[:, mask], target, rcond=None)[0]
+        return float(np.square(target - columns[:, mask] @ coef).sum())
+
+    for smaller, larger in pairwise(masks):
+        parts = [larger & (np.arange(35) != term) for term in np.flatnonzero(larger)]
+        assert residual(smaller) <= (1.0 + 1e-9) * min(map(residual, parts))
 
 
 def test_exchanges_start_from_known_supports() -> None:
