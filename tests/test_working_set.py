@@ -18,6 +18,7 @@ from ep2sindy.estimation.supports import inverse_of, term_prices
 from ep2sindy.estimation.working_set import first_set
 from ep2sindy.regression import searches
 from ep2sindy.regression.exchanges import exchanged_supports
+from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System
 from tests.models import model_of
 
@@ -142,6 +143,24 @@ def test_the_first_set_is_small_and_holds_the_truth() -> None:
     kept, true = first_set(problem, 7), mask_of(problem, system)
     assert kept[true].all()
     assert kept.sum() < 0.5 * len(kept)
+
+
+@pytest.mark.parametrize("number", [1, 3, 4])
+def test_the_first_set_holds_the_linear_term_that_cubic_ones_mimic(number: int) -> None:
+    """With all products of degree 4, y*z^2 and y*z^3 follow -y of Lorenz's y'."""
+    system, runs = realization("lorenz", 0.2, number, degree=4)
+    problem = scale_problem(runs, system.model.library)
+    assert first_set(problem, 7)[mask_of(problem, system)].all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [4, 5])
+def test_lorenz_is_found_in_a_library_two_degrees_too_large(degree: int) -> None:
+    for number in range(4):
+        system, runs = realization("lorenz", 0.2, number, degree=degree)
+        found = ep.estimate(runs, system.model.library)
+        for state in system.model.states:
+            assert set(found.model.terms(state)) == set(system.model.terms(state))
 
 
 def test_a_term_that_overflows_is_left_out_of_a_large_set() -> None:
