@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -17,6 +19,7 @@ from ep2sindy.estimation.supports import inverse_of, term_prices
 from ep2sindy.estimation.working_set import first_set
 from ep2sindy.regression import searches
 from ep2sindy.regression.exchanges import exchanged_supports
+from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System
 from tests.models import model_of
 
@@ -61,6 +64,29 @@ def test_exchanges_find_the_best_subsets(n_problems: int) -> None:
     proven = ep.BestSubset(max_terms=5).shared_supports(xx, xy, yy)
     found = exchanged_supports(xx, xy, yy, max_terms=5, n_best=1)
     assert np.array_equal(found, proven)
+
+
+@pytest.mark.parametrize("seed", [3, 7, 8, 10])
+def test_no_support_is_worse_than_a_part_of_the_larger_one(seed: int) -> None:
+    """Columns hang together as products of few states do, so the way up misses some supports."""
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal((200, 3)) + np.array([1.0, 2.0, 3.0])
+    columns = ep.polynomial(["x", "y", "z"], degree=4).evaluate(x)
+    columns /= np.linalg.norm(columns, axis=0)
+    target = columns[:, rng.choice(35, 3, replace=False)] @ rng.standard_normal(3)
+    target += 0.001 * rng.standard_normal(200)
+    masks = exchanged_supports(
+        (columns.T @ columns)[None], (columns.T @ target)[None], np.array([target @ target]),
+        max_terms=6, n_best=1,
+    )  # fmt: skip
+
+    def residual(mask: np.ndarray) -> float:
+        coef = np.linalg.lstsq(columns[:, mask], target, rcond=None)[0]
+        return float(np.square(target - columns[:, mask] @ coef).sum())
+
+    for smaller, larger in pairwise(masks):
+        parts = [larger & (np.arange(35) != term) for term in np.flatnonzero(larger)]
+        assert residual(smaller) <= (1.0 + 1e-9) * min(map(residual, parts))
 
 
 def test_exchanges_start_from_known_supports() -> None:
@@ -118,6 +144,24 @@ def test_the_first_set_is_small_and_holds_the_truth() -> None:
     kept, true = first_set(problem, 7), mask_of(problem, system)
     assert kept[true].all()
     assert kept.sum() < 0.5 * len(kept)
+
+
+@pytest.mark.parametrize("number", [1, 3, 4])
+def test_the_first_set_holds_the_linear_term_that_cubic_ones_mimic(number: int) -> None:
+    """With all products of degree 4, y*z^2 and y*z^3 follow -y of Lorenz's y'."""
+    system, runs = realization("lorenz", 0.2, number, degree=4)
+    problem = scale_problem(runs, system.model.library)
+    assert first_set(problem, 7)[mask_of(problem, system)].all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [4, 5])
+def test_lorenz_is_found_in_a_library_two_degrees_too_large(degree: int) -> None:
+    for number in range(4):
+        system, runs = realization("lorenz", 0.2, number, degree=degree)
+        found = ep.estimate(runs, system.model.library)
+        for state in system.model.states:
+            assert set(found.model.terms(state)) == set(system.model.terms(state))
 
 
 def test_a_term_that_overflows_is_left_out_of_a_large_set() -> None:

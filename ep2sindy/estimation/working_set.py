@@ -136,7 +136,21 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
                 n_best=N_BEST,
             )
             kept[own[masks.any(axis=0)]] = True
+        kept[own] |= _mimicked(problem, own, kept[own])
     return kept
+
+
+def _mimicked(
+    problem: EstimationProblem, own: np.ndarray, chosen: Bool[np.ndarray, " own"]
+) -> Bool[np.ndarray, " own"]:
+    """Constant and linear terms of one equation, of factors that its cubic terms and higher have.
+
+    Where z hovers about a mean, y z^2 and y z^3 together follow y more closely than its noise.
+    """
+    factors = problem.library.exponents[problem.column[own]] > 0
+    degrees = problem.degrees[own]
+    has = factors[chosen & (degrees > 2)].any(axis=0)
+    return (degrees <= 1) & ~factors[:, ~has].any(axis=1)
 
 
 def _integrals(

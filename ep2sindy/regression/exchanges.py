@@ -1,15 +1,20 @@
 """Supports of every size by exchanges of one term for another, for libraries too large for a proof.
 
 Each size starts from the best support of the size below and its best further term. Terms are then
-exchanged, the best exchange first, as long as the residual falls.
+exchanged, the best exchange first, as long as the residual falls. From the largest size the search
+goes back: where the best support of a size, less a term, is better than those of the size below,
+exchanges go on from there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+from ep2sindy.data.numbers import zero_to_one
 
 DEPENDENT = 1e-10  # share of a column's square that the chosen terms leave, if it depends on them
 ROUNDING = 1e-14  # of the target's square: a smaller residual is rounding
@@ -34,16 +39,23 @@ def exchanged_supports(
     starts: dict[int, list[frozenset[int]]] = {}
     for mask in () if known is None else known:
         starts.setdefault(int(mask.sum()), []).append(frozenset(np.flatnonzero(mask).tolist()))
-    found, best = [frozenset[int]()], frozenset[int]()
+    by_size: list[dict[frozenset[int], float]] = []
+    best = frozenset[int]()
     for size in range(1, min(max_terms, n_terms) + 1):
         grown = _best_with_one_more(xx, xy, yy, best)
         if grown is None:
             break
         seen = {support: _residual(xx, xy, yy, support) for support in starts.get(size, [])}
         seen |= _descend(xx, xy, yy, min([*seen.items(), grown], key=lambda each: each[1]))
-        ranked = sorted(seen, key=lambda support: seen[support])[:n_best]
-        best = ranked[0]
-        found += ranked
+        best = min(seen, key=lambda support: seen[support])
+        by_size.append(seen)
+    for fewer, more in reversed([*pairwise(by_size)]):
+        shrunk = _best_with_one_less(xx, xy, yy, min(more, key=lambda support: more[support]))
+        if shrunk[1] < min(fewer.values()):
+            fewer |= _descend(xx, xy, yy, shrunk)
+    found = [frozenset[int]()]
+    for seen in by_size:
+        found += sorted(seen, key=lambda support: seen[support])[:n_best]
     masks = np.zeros((len(found), n_terms), dtype=np.bool_)
     for mask, support in zip(masks, found, strict=True):
         mask[list(support)] = True
@@ -77,6 +89,20 @@ def _best_with_one_more(
     residuals = _residuals_with(xx, xy, yy, sorted(support))
     term = int(np.argmin(residuals))
     return (support | {term}, float(residuals[term])) if np.isfinite(residuals[term]) else None
+
+
+def _best_with_one_less(
+    xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, support: frozenset[int]
+) -> tuple[frozenset[int], float]:
+    """The support without the term whose loss costs least, and the residual."""
+    terms = sorted(support)
+    inverse = np.linalg.pinv(xx[:, terms][:, :, terms], rcond=DEPENDENT, hermitian=True)
+    coef = np.einsum("pst,pt->ps", inverse, xy[:, terms])
+    losses = np.square(coef) / zero_to_one(np.einsum("pss->ps", inverse))
+    left = yy - np.einsum("ps,ps->p", coef, xy[:, terms])
+    residuals = np.log(np.maximum(left[:, None] + losses, ROUNDING * yy[:, None])).sum(axis=0)
+    smaller = support - {terms[int(np.argmin(residuals))]}
+    return smaller, _residual(xx, xy, yy, smaller)
 
 
 def _residual(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, support: frozenset[int]) -> float:
