@@ -13,10 +13,19 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.known_systems import noisy
 from ep2sindy._stubs import dotted_names
+from ep2sindy.data.sensor import Bounds
 from ep2sindy.discovery.recipe import method_of
-from ep2sindy.estimation import cost, explanation, kernels
+from ep2sindy.estimation import cost, explanation, kernels, likelihood
 from ep2sindy.estimation.kernels import departures, eliminate, filtered
-from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, fit_paths, gram, squares
+from ep2sindy.estimation.likelihood import (
+    Gram,
+    Level,
+    TrajectoryFit,
+    fit_paths,
+    gram,
+    innovations,
+    squares,
+)
 from ep2sindy.estimation.noise import _shown_by_samples, noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import Solution, from_smooth
@@ -685,6 +694,72 @@ def many_states(n_states: int) -> ep.Trajectory:
     t = np.linspace(0.0, 20.0, 400)
     states = np.stack([np.sin((1.0 + 0.1 * k) * t) for k in range(n_states)], axis=1)
     return ep.Trajectory(t, states, [f"x{k}" for k in range(n_states)])
+
+
+def three_runs(rng: np.random.Generator) -> tuple[EstimationProblem, TrajectoryFit, Level]:
+    """Runs with an input, of which one lacks samples and one has limits, about some paths."""
+    runs = []
+    for k, n in enumerate((30, 12, 21)):
+        t = np.sort(rng.uniform(0.0, 1.0, n)) + 0.1 * np.arange(n)
+        states, missing = rng.normal(size=(n, 2)), rng.random((n, 2)) < 0.3
+        runs.append(
+            ep.Trajectory(
+                t, states, ["x", "y"], inputs=np.sin(t)[:, None], input_names=["u"],
+                missing=missing if k == 1 else None,
+            )
+        )  # fmt: skip
+    problem = scale_problem(runs, ep.polynomial(["x", "y", "u"], degree=2))
+    first, second, last = problem.records
+    upper = np.where(rng.random(last.samples.shape) < 0.3, np.inf, last.samples)
+    last = replace(last, limits=Bounds(last.samples, upper, ()))
+    problem = replace(problem, records=(first, second, last))
+    paths = tuple(r.samples + 0.1 * rng.normal(size=r.samples.shape) for r in problem.records)
+    free = 0.1 * rng.normal(size=problem.n_free)
+    noise = tuple(rng.uniform(0.2, 0.5, path.shape) for path in paths)
+    fit = TrajectoryFit(paths, free, np.ones(len(free), dtype=bool), np.zeros(2))
+    return problem, fit, Level(noise, 0.3, n_substeps=2)
+
+
+@pytest.mark.parametrize("push", [None, np.array([0.1, 0.2])])
+def test_runs_are_joined_without_a_way_from_one_to_the_next(
+    rng: np.random.Generator, push: np.ndarray | None
+) -> None:
+    problem, fit, level = three_runs(rng)
+    level, change = replace(level, push=push), 0.1 * rng.normal(size=problem.n_free)
+    moves = likelihood._moves(
+        problem, fit, level, likelihood._flow(problem, fit, fit.support, level), change
+    )
+    totals = [0.0] * 5
+    for record, path, noise, move in zip(
+        problem.records, fit.paths, level.noise, moves, strict=True
+    ):
+        alone, own = replace(problem, records=(record,)), replace(fit, paths=(path,))
+        its = replace(level, noise=(noise,))
+        flow = likelihood._flow(alone, own, fit.support, its)
+        (expected,) = likelihood._moves(alone, own, its, flow, change)
+        np.testing.assert_allclose(move, expected, rtol=1e-9, atol=1e-12)
+        pair, (_, least, logs) = gram(alone, own, its), innovations(alone, own, its)
+        parts = pair.quadratic, pair.linear, least, logs, squares(alone, (path,), fit.free, its)
+        totals = [total + part for total, part in zip(totals, parts, strict=True)]
+    pair, (_, least, logs) = gram(problem, fit, level), innovations(problem, fit, level)
+    joined = pair.quadratic, pair.linear, least, logs, squares(problem, fit.paths, fit.free, level)
+    for one, other in zip(joined, totals, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
+
+
+def test_a_pass_over_many_runs_is_a_single_call(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, fit, level = three_runs(rng)
+    calls: list[int] = []
+
+    def tell(flow: np.ndarray, *rest: np.ndarray) -> tuple:
+        calls.append(len(flow))
+        return eliminate(flow, *rest)
+
+    monkeypatch.setattr(likelihood, "eliminate", tell)
+    gram(problem, fit, level)
+    assert calls == [problem.n_samples - 1]
 
 
 def test_more_coefficients_than_memory_holds_are_refused_first(

@@ -27,6 +27,7 @@ from ep2sindy.estimation.likelihood import (
     enough_substeps,
     fit_paths,
     gram,
+    joined,
     parting,
     squares,
 )
@@ -145,13 +146,13 @@ def astray(problem: EstimationProblem, found: AnnealedFit) -> Bool[np.ndarray, "
 
     One that has become very small leaves the flow freely, and large coefficients make it count.
     """
-    off, steps = np.zeros(len(problem.states)), np.zeros(len(problem.states))
+    record, path = problem.all_records, joined(found.fit.paths)
+    steps = np.diff(path, axis=0)
     with np.errstate(over="ignore", invalid="ignore"):
-        for record, path in zip(problem.records, found.fit.paths, strict=True):
-            ends = problem.ends(record, path[:-1], found.fit.free, found.level.n_substeps)
-            off += np.square(ends - path[1:]).sum(axis=0)
-            steps += np.square(np.diff(path, axis=0)).sum(axis=0)
-        return ~problem.measured & ~(off <= ASTRAY**2 * steps)
+        off = problem.ends(record, path[:-1], found.fit.free, found.level.n_substeps) - path[1:]
+        off[record.breaks] = steps[record.breaks] = 0.0
+        follows = np.square(off).sum(axis=0) <= ASTRAY**2 * np.square(steps).sum(axis=0)
+    return ~problem.measured & ~follows
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,12 +308,8 @@ def start_from_smooth(
     Returns the fit, and the residuals' standard deviations, by record (samples, d).
     """
     start = smoothed(problem, log10_ratio)
-    values = [
-        np.concatenate([path, record.inputs], axis=1)
-        for path, record in zip(start.paths, problem.records, strict=True)
-    ]
-    theta = np.concatenate([problem.library.evaluate(each) for each in values])
-    free = _regress(problem, theta, np.concatenate(start.rates))
+    values = np.concatenate([joined(start.paths), problem.all_records.inputs], axis=1)
+    free = _regress(problem, problem.library.evaluate(values), joined(start.rates))
     support = np.ones(problem.n_free, dtype=np.bool_)
     fit = TrajectoryFit(start.paths, free, support, np.full(len(problem.states), np.inf))
     return fit, start.noise
