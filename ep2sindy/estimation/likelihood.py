@@ -119,6 +119,7 @@ def squares(
     problem: EstimationProblem, paths: Sequence[np.ndarray], free: np.ndarray, level: Level
 ) -> Float[np.ndarray, " d"]:
     """The objective (see the module), by state."""
+    problem.watch.look()
     record, path = problem.all_records, joined(paths)
     with np.errstate(over="ignore", invalid="ignore"):
         misses = problem.ends(record, path[:-1], free, level.n_substeps) - path[1:]
@@ -213,6 +214,7 @@ def innovations(
     The latter are the sum of the squares of the innovations, in their standard deviations, and the
     sum of the logarithms of their variances.
     """
+    problem.watch.look()
     seen = observe(problem.all_records, joined(fit.paths), level.variance)
     flow = _flow(problem, fit, np.zeros_like(fit.support), level)
     misses = _misses(problem, fit, flow)
@@ -250,6 +252,7 @@ def enough_substeps(
     most = min(MAX_SUBSTEPS, max(MIN_ALLOWED, MAX_IN_ALL // problem.n_samples))
     record, starts = problem.all_records, joined(fit.paths)[:-1]
     while 2 * n <= most:
+        problem.watch.look()
         with np.errstate(over="ignore", invalid="ignore"):
             change = problem.ends(record, starts, fit.free, n)
             change -= problem.ends(record, starts, fit.free, 2 * n)
@@ -332,6 +335,7 @@ def hessian(
     flow_of: the flow along the paths of all records, joined. Returns half the second derivatives,
     minus half the first, the least squares with these parameters unchanged, and the flow.
     """
+    problem.watch.look()
     record, path = problem.all_records, joined(fit.paths)
     flow = flow_of(record, path)
     flow.slopes[record.breaks] = 0.0

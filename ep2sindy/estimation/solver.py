@@ -352,7 +352,10 @@ class Smoothed:
 
 def smoothed(problem: EstimationProblem, log10_ratio: float | None) -> Smoothed:
     """Smooth the samples; log10_ratio as in `start_from_smooth`."""
-    estimates = [_estimated(problem, record, log10_ratio) for record in problem.records]
+    estimates = []
+    for record in problem.records:
+        problem.watch.look()
+        estimates.append(_estimated(problem, record, log10_ratio))
     variance = np.mean([np.square(e.noise_std) for e in estimates], axis=0)
     paths = []
     for each, record in zip(estimates, problem.records, strict=True):
