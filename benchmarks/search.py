@@ -11,15 +11,18 @@ by default, each with its test whether the model leaves more than noise; and of 
 PySINDy's fit beside it is given one threshold, and tests nothing.
 
     python -m benchmarks.search
-    python -m benchmarks.search long   # one regression on 10,000,000 samples: time and memory
+    python -m benchmarks.search long   # calls on 10,000,000 samples, and on 200 runs
 """
 
 import resource
+import subprocess
 import sys
+import time
 import warnings
 from dataclasses import replace
 from functools import partial
 
+import numba
 import numpy as np
 import pysindy
 import sklearn
@@ -146,22 +149,62 @@ def pysindy_fit(run: ep.Trajectory) -> None:
     model.fit(run.states, t=run.dt_s)
 
 
-def long_record(n_samples: int = 10_000_000) -> None:
-    """CPU time and peak memory of one regression with ten terms, and of the record alone."""
-    walks = np.cumsum(np.random.default_rng(0).normal(scale=0.01, size=(n_samples, 3)), axis=0)
-    np.sin(walks + np.arange(3), out=walks)
-    run = ep.Trajectory(0.01 * np.arange(n_samples), walks, ["x", "y", "z"])
-    del walks
-    before_GiB = peak_GiB()
-    method = replace(METHODS["thesis"], search=ep.BestSubset(), bootstraps=Bootstraps(n=0))
-    call = partial(
-        ep.discover, run, ep.polynomial(run.state_names, degree=2), method=method, seed=0
-    )
+LONG = {
+    "best subsets": replace(METHODS["thesis"], search=ep.BestSubset(), bootstraps=Bootstraps(n=0)),
+    "thesis": METHODS["thesis"],
+    "STLSQ": METHODS["STLSQ"],
+    "weighted weak rows": ep.Regression(),
+    "limit_s=60": ep.TrajectorySearch(limit_s=60.0),
+}
+
+
+def long_record(name: str, n_samples: int = 10_000_000) -> None:
+    """Time and peak memory of one call on a record of Lorenz with ten terms."""
+    start = lorenz().trajectory()
+    states = lorenz_states(n_samples, start.states[0], start.dt_s)
+    rng = np.random.default_rng(0)
+    for column in states.T:
+        column += 0.05 * column.std() * rng.normal(size=n_samples)
+    states.flags.writeable = False  # so that the record takes it, and no copy
+    run = ep.Trajectory(start.dt_s * np.arange(n_samples), states, start.state_names)
+    del states
+    call = partial(ep.discover, method=LONG[name], seed=0)
     with threadpool_limits(limits=1), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        total_s = cpu_s(call, n_runs=1)
-    print(f"{n_samples} samples: {total_s:.0f} CPU-s, {peak_GiB():.2f} GiB at most", end=" ")
+        call(run.window(0, 3000))  # compiles or loads what it needs
+        before_GiB, began, began_cpu = peak_GiB(), time.monotonic(), time.process_time()
+        found = call(run)
+    total_s = time.process_time() - began_cpu
+    print(f"{n_samples} samples, {name}: {total_s:.0f} CPU-s,", end=" ")
+    print(f"{time.monotonic() - began:.0f} s, {peak_GiB():.2f} GiB at most", end=" ")
     print(f"(before the call {before_GiB:.2f})")
+    print(found, flush=True)
+
+
+@numba.njit
+def lorenz_states(n: int, start: np.ndarray, step_s: float) -> np.ndarray:
+    """States of Lorenz's system at n samples, by classical Runge-Kutta steps."""
+    states, slope = np.empty((n, 3)), np.zeros(3)
+    states[0] = start
+    for k in range(1, n):
+        x, total = states[k - 1], np.zeros(3)
+        for lead, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
+            u, v, w = x + lead * step_s * slope
+            slope = np.array([10.0 * (v - u), u * (28.0 - w) - v, u * v - 8.0 / 3.0 * w])
+            total += weight / 6.0 * step_s * slope
+        states[k] = x + total
+    return states
+
+
+def many_runs(n_runs: int = 200, n_samples: int = 60) -> None:
+    """CPU time of the default search on many short runs, and on one record of as many samples."""
+    system = lorenz()
+    record = continued(system, n_runs * n_samples)
+    short = [record.window(k, k + n_samples) for k in range(0, record.n_samples, n_samples)]
+    for runs in ([record], short):
+        with threadpool_limits(limits=1):
+            total_s = cpu_s(partial(ep.discover, runs), n_runs=1)
+        print(f"{len(runs)} runs of {runs[0].n_samples} samples: {total_s:.1f} CPU-s")
 
 
 def peak_GiB() -> float:
@@ -184,4 +227,14 @@ def continued(system: System, n_samples: int) -> ep.Trajectory:
 
 
 if __name__ == "__main__":
-    long_record() if sys.argv[1:] == ["long"] else main()
+    match sys.argv[1:]:
+        case ["long"]:  # each call in a process of its own, which has its own peak of memory
+            for name in LONG:
+                subprocess.run(
+                    [sys.executable, "-m", "benchmarks.search", "long", name], check=True
+                )
+            many_runs()
+        case ["long", name]:
+            long_record(name)
+        case _:
+            main()

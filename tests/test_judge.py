@@ -8,8 +8,8 @@ import pytest
 from scipy.sparse import diags_array
 
 import ep2sindy as ep
+from ep2sindy.data.trajectory import spread_blocks
 from ep2sindy.discovery import choice
-from ep2sindy.discovery.choice import spread_blocks
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.test_functions import spectral_change_point
 from ep2sindy.regression.whitening import _covariance, _Sums
@@ -89,8 +89,8 @@ def test_long_records_are_tested_in_blocks_spread_over_them() -> None:
     t, rng = np.arange(50_000.0), np.random.default_rng(0)
     long = ep.Trajectory(t, np.cumsum(rng.normal(size=(50_000, 1)), axis=0), ["x"])
     short = long.window(0, 20_000)
-    assert spread_blocks([short]) == [short]
-    blocks = spread_blocks([long, short, short])
+    assert spread_blocks([short], most=20_000, block=4_000) == [short]
+    blocks = spread_blocks([long, short, short], most=20_000, block=4_000)
     assert sum(block.n_samples for block in blocks) <= 20_000
     assert len(blocks) == 5
     assert {block.n_samples for block in blocks} == {3846, 3847, 4000}
@@ -100,7 +100,8 @@ def test_long_records_are_tested_in_blocks_spread_over_them() -> None:
 
 def test_blocks_in_which_a_state_rests_are_left_out() -> None:
     x = np.append(np.zeros(30_000), np.sin(0.01 * np.arange(30_000.0)))
-    blocks = spread_blocks([ep.Trajectory(np.arange(60_000.0), x[:, None], ["x"])])
+    run = ep.Trajectory(np.arange(60_000.0), x[:, None], ["x"])
+    blocks = spread_blocks([run], most=20_000, block=4_000)
     assert len(blocks) == 3
     assert all(block.t[0] >= 28_000.0 for block in blocks)
 

@@ -199,6 +199,7 @@ def test_a_long_record_in_blocks_gives_the_same_regression(monkeypatch: pytest.M
         monkeypatch.setattr(module, "MOST_ROWS", 300)
     for one, other in zip(whole, method.search_equations(Task(runs, library), rng=0), strict=True):
         assert "train_columns" not in vars(other.front.rows)  # no scaled copy of all rows was made
+        assert isinstance(other.front.rows.theta, rows.TermsAt)  # nor were all terms held
         assert one.supports.masks.tolist() == other.supports.masks.tolist()
         for a, b in zip(one.front.candidates, other.front.candidates, strict=True):
             assert a.terms == b.terms

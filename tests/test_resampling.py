@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
 
+from ep2sindy.regression import bootstraps
 from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.systems.systems import lorenz
 
 
@@ -51,6 +53,29 @@ def test_bootstraps_draw_neighbours_together() -> None:
     sums, _ = whole.draw(problem, terms, np.random.default_rng(0))
     once = problem.train_products[np.triu_indices(len(problem.train_products))]
     np.testing.assert_allclose(sums, np.array([once, once]), rtol=1e-12, atol=1e-14)
+
+
+def test_weights_of_a_long_record_are_held_for_some_draws_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    system = lorenz()
+    (problem,) = Differential().assemble(
+        [system.trajectory().window(0, 400)], system.model.library, rng=np.random.default_rng(0)
+    )
+    terms, held = np.ones(len(system.model.library), dtype=np.bool_), []
+    together = Bootstraps(n=7).draw(problem, terms, np.random.default_rng(0))
+    resampled_sums = RegressionRows.resampled_sums
+
+    def tell(problem: RegressionRows, weights: np.ndarray) -> np.ndarray:
+        held.append(weights.size)
+        return resampled_sums(problem, weights)
+
+    monkeypatch.setattr(RegressionRows, "resampled_sums", tell)
+    monkeypatch.setattr(bootstraps, "MOST_WEIGHTS", 2 * problem.n_train)
+    in_parts = Bootstraps(n=7).draw(problem, terms, np.random.default_rng(0))
+    assert max(held) <= 2 * problem.n_train
+    np.testing.assert_allclose(in_parts[0], together[0], rtol=1e-12, atol=1e-15)
+    np.testing.assert_array_equal(in_parts[1], together[1])
 
 
 def test_blocks_never_cross_trajectories() -> None:

@@ -3,6 +3,7 @@ import pytest
 from scipy.signal import periodogram
 
 from ep2sindy.library.units import Clock
+from ep2sindy.signals import smoothers
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay, difference
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
@@ -14,6 +15,16 @@ UNEQUAL = EQUAL + 0.02 * np.sin(9.0 * EQUAL)
 def test_differences_are_exact_for_parabolas(t: np.ndarray) -> None:
     values = (3.0 * t**2 - t + 1.0)[:, None]
     assert np.allclose(difference(t, values)[:, 0], 6.0 * t - 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [3, 7, 8, 9, 15, 41])
+def test_blocks_of_a_long_record_have_the_differences_of_the_whole(
+    n: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values, t = np.random.default_rng(0).normal(size=(n, 2)), UNEQUAL[:n]
+    monkeypatch.setattr(smoothers, "BLOCK", 7)
+    whole = np.gradient(values, t, axis=0, edge_order=2)
+    np.testing.assert_allclose(difference(t, values), whole, rtol=1e-12)
 
 
 @pytest.mark.parametrize("t", [EQUAL, UNEQUAL], ids=["equal", "unequal"])

@@ -47,13 +47,14 @@ def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]
     start, or until the end, do not count as clipped.
     Returns None if all samples are exact values.
     """
+    # Most records repeat no value; to count the levels or to copy the samples takes far more.
+    repeating = [j for j in range(len(names)) if _n_repeats(values[:, j]) >= FEWEST]
+    if not repeating:
+        return None
     lower, upper, words = values.copy(), values.copy(), []
-    for j, name in enumerate(names):
-        x = np.ascontiguousarray(values[:, j])
-        ordered = np.sort(x)
-        if np.count_nonzero(ordered[1:] == ordered[:-1]) < FEWEST:
-            continue  # as in most records; to count the levels takes several times as long
-        levels, counts = np.unique(ordered, return_counts=True)
+    for j in repeating:
+        name, x = names[j], np.ascontiguousarray(values[:, j])
+        levels, counts = np.unique(x, return_counts=True)
         if step := _coarse_step(x, levels):
             lower[:, j] -= step / 2.0
             upper[:, j] += step / 2.0
@@ -71,6 +72,11 @@ def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]
         if ends:
             words.append(f"{name} is clipped, {' and '.join(ends)}")
     return Bounds(lower, upper, tuple(words)) if words else None
+
+
+def _n_repeats(x: Float[np.ndarray, " samples"]) -> int:
+    ordered = np.sort(x)
+    return int(np.count_nonzero(ordered[1:] == ordered[:-1]))
 
 
 def _is_clipped(

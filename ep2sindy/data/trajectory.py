@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -383,3 +384,25 @@ def _way_to_agree(first: Trajectory, missing: Sequence[str]) -> str:
             "terms out, or derive it (+exp=trace does, of one signal)"
         )
     return "give all of them the same states, named alike and in the same order"
+
+
+def spread_blocks(runs: Sequence[Trajectory], *, most: int, block: int) -> list[Trajectory]:
+    """Blocks of neighbouring samples that tell a law or a misfit nearly as well as a long record.
+
+    They are spread evenly over the records, whose noise may change, and have at most `most` samples
+    together, each at most `block`. Records of at most `most` samples together come back whole.
+    """
+    if sum(run.n_samples for run in runs) <= most:
+        return list(runs)
+    bounds = [
+        (run, np.linspace(0, run.n_samples, -(-run.n_samples // block) + 1).astype(int))
+        for run in runs
+    ]
+    pieces = [(run, *pair) for run, each in bounds for pair in pairwise(each.tolist())]
+    longest = max(last - first for _, first, last in pieces)
+    chosen = np.linspace(0, len(pieces) - 1, most // longest).round().astype(int)
+    found = []
+    for run, first, last in (pieces[k] for k in np.unique(chosen)):
+        with suppress(ValueError):  # a state may rest, or be missing, for as long as a block
+            found.append(run.window(first, last))
+    return found or list(runs)

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import islice, pairwise
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
-from ep2sindy.data.trajectory import ConstantStateError, Trajectory
+from ep2sindy.data.trajectory import Trajectory, spread_blocks
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding, constraint
@@ -226,7 +226,8 @@ def _left_of_weak_rows(
         used = np.isin(model.library.names, [name for s in states for name in model.terms(s)])
         used[0] |= not used.any()  # a library needs a term
         form, rng = Weak(split=RandomSplit(0.0)), np.random.default_rng(0)
-        rows = form.assemble(spread_blocks(runs), model.library.take(used), rng=rng)
+        blocks = spread_blocks(runs, most=MOST_TESTED, block=BLOCK)
+        rows = form.assemble(blocks, model.library.take(used), rng=rng)
     except (ValueError, np.linalg.LinAlgError):
         return {}
     problems = {problem.equations[0]: problem for problem in rows}
@@ -238,28 +239,6 @@ def _left_of_weak_rows(
             else:
                 left[state] = _left_of_terms(problem, fit)
     return left
-
-
-def spread_blocks(runs: Sequence[Trajectory]) -> list[Trajectory]:
-    """Blocks of neighbouring samples that tell a misfit as well as all of a long record.
-
-    They are spread evenly over the records, whose noise may change. Records of at most MOST_TESTED
-    samples together come back whole.
-    """
-    if sum(run.n_samples for run in runs) <= MOST_TESTED:
-        return list(runs)
-    bounds = [
-        (run, np.linspace(0, run.n_samples, -(-run.n_samples // BLOCK) + 1).astype(int))
-        for run in runs
-    ]
-    pieces = [(run, *pair) for run, each in bounds for pair in pairwise(each.tolist())]
-    longest = max(last - first for _, first, last in pieces)
-    chosen = np.linspace(0, len(pieces) - 1, MOST_TESTED // longest).round().astype(int)
-    found = []
-    for run, first, last in (pieces[k] for k in np.unique(chosen)):
-        with suppress(ConstantStateError):  # a state may rest for as long as a block
-            found.append(run.window(first, last))
-    return found or list(runs)
 
 
 def _fit_in(model: SparseModel, state: str) -> EquationFit:

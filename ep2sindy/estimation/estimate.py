@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.coerce import Runs, Task, check_domain, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.estimation.cost import Watch, check_limit_s, check_size
+from ep2sindy.estimation.cost import Watch, check_limit_s, check_size, growing_parts
 from ep2sindy.estimation.explanation import Explanation, explain
 from ep2sindy.estimation.hidden import Entrance, with_guesses
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
@@ -146,7 +146,8 @@ def estimate(
     known but for its coefficients, all terms of that equation. hidden: states that nobody measured,
     which the library has; all ways in which they may enter are compared. exclude: for each state
     that is named, terms of the library that its equation may not have. limit_s: wall time after
-    which the search ends with the best that it has, and says so. progress: True shows bars, see
+    which the search ends with the best that it has, and says so; of long records it takes
+    parts first. progress: True shows bars, see
     `Progress`; an interruption (Ctrl-C) then ends the search in the same way.
     Raises ValueError for fewer than one term, a limit that is not positive, a library that needs
     more samples than there are or more memory, or whatever a `Task` refuses.
@@ -186,8 +187,25 @@ def estimate_task(
         max_terms = check_count("max_terms", max_terms)
     check_limit_s(limit_s)
     tied = bool(task.relations or task.hidden)
-    check_size(task.runs, task.library, task.terms, tied=tied, told=limit_s is None)
-    watch, best = Watch(progress, limit_s), []
+    bytes_each = check_size(task.runs, task.library, task.terms, tied=tied, limit_s=limit_s)
+    watch, found, part = Watch(progress, limit_s), None, task.runs
+    for larger in growing_parts(task.runs, bytes_each, watch):
+        latest = _answer(replace(task, runs=larger), max_terms, align, watch)
+        if found is None or not watch.ended:  # a larger part tells more, once it is done with
+            found, part = latest, larger
+    assert found is not None
+    answer, runs = found
+    if part is not task.runs:
+        answer = replace(answer, said=(_part_words(part, task.runs, limit_s), *answer.said))
+    model = _model(answer, task.library, units or runs[0].units, provenance or {})
+    return _report(answer, model, runs, progress)
+
+
+def _answer(
+    task: Task, max_terms: int | None, align: bool, watch: Watch
+) -> tuple[Explanation, Sequence[Trajectory]]:
+    """Answer a task from all of its runs."""
+    best = []
     for group in with_guesses(task) if task.hidden else [[(task, ())]]:
         tried = []
         for known, ways in group:
@@ -198,8 +216,17 @@ def estimate_task(
         if watch.ended or not best[-1][0].misfit:
             break
     answer, runs = min(best, key=lambda each: bool(each[0].misfit))
-    model = _model(answer, task.library, units or runs[0].units, provenance or {})
-    return _report(answer, model, runs, progress)
+    return answer, runs
+
+
+def _part_words(
+    part: Sequence[Trajectory], runs: Sequence[Trajectory], limit_s: float | None
+) -> str:
+    some, n = (sum(run.n_samples for run in each) for each in (part, runs))
+    return (
+        f"the equations come from {some} of {n} samples, {len(part)} blocks spread over the "
+        f"record: limit_s={limit_s:g} leaves no time for more, or memory does not hold them"
+    )
 
 
 def _try(

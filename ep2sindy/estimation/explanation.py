@@ -113,6 +113,8 @@ def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -
         watch.ended = True
         by = "limit_s" if late else "an interruption"
         return _unfinished(*watch.best, f"ended by {by} after {watch.elapsed_s:.3g} s", max_terms)
+    finally:
+        watch.best = None  # what follows is a report, which nothing ends
 
 
 def _unfinished(

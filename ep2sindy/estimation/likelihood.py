@@ -12,10 +12,10 @@ an apparent noise, so that the same filter serves both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import log, pi
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -55,14 +55,23 @@ class Level:
     push: Float[np.ndarray, " d"] | None = None
 
     @property
-    def variances(self) -> list[Float[np.ndarray, "samples d"]]:
-        return [np.square(noise) for noise in self.noise]
+    def variance(self) -> Float[np.ndarray, "samples d"]:
+        """Variances of the samples of all records, one after the other."""
+        return np.square(joined(self.noise))
 
     @property
-    def processes(self) -> list[Float[np.ndarray, "steps d"]]:
+    def process(self) -> Float[np.ndarray, "steps d"]:
+        """Variances of the flow's error over all steps.
+
+        Those between records are of states of which nothing is known, so that a filter whose slopes
+        and misses are zero there begins each record anew.
+        """
         if self.push is not None:
-            return [np.tile(np.square(self.push), (len(noise) - 1, 1)) for noise in self.noise]
-        return [np.square(self.rho * noise[:-1]) for noise in self.noise]
+            found = np.tile(np.square(self.push), (sum(map(len, self.noise)) - 1, 1))
+        else:
+            found = np.square(self.rho * joined(self.noise)[:-1])
+        found[np.cumsum([len(noise) for noise in self.noise])[:-1] - 1] = FREE_START
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,18 +110,22 @@ class Gram:
         return bool(np.isfinite(self.quadratic).all() and np.isfinite(self.linear).all())
 
 
+def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """The parts of all records as one array; that of a single record is not copied."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
 def squares(
     problem: EstimationProblem, paths: Sequence[np.ndarray], free: np.ndarray, level: Level
 ) -> Float[np.ndarray, " d"]:
     """The objective (see the module), by state."""
-    total = np.zeros(len(problem.states))
+    problem.watch.look()
+    record, path = problem.all_records, joined(paths)
     with np.errstate(over="ignore", invalid="ignore"):
-        for record, path, variance, process in zip(
-            problem.records, paths, level.variances, level.processes, strict=True
-        ):
-            misses = problem.ends(record, path[:-1], free, level.n_substeps) - path[1:]
-            total += observe(record, path, variance).squares.sum(axis=0)
-            total += (np.square(misses) / process).sum(axis=0)
+        misses = problem.ends(record, path[:-1], free, level.n_substeps) - path[1:]
+        misses[record.breaks] = 0.0
+        total = observe(record, path, level.variance).squares.sum(axis=0)
+        total = total + (np.square(misses) / level.process).sum(axis=0)
     return np.where(np.isfinite(total), total, np.inf)
 
 
@@ -168,11 +181,8 @@ def _follow(
     for _ in range(MAX_FOLLOWING):
         if fit.total < below or not np.isfinite(fit.total):
             break
-        flows = [
-            problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
-            for record, path in zip(problem.records, fit.paths, strict=True)
-        ]
-        moves = _moves(problem, fit, level, flows, np.empty(0))
+        flow = _flow(problem, fit, none, level)
+        moves = _moves(problem, fit, level, flow, np.empty(0))
         paths = tuple(p + m for p, m in zip(fit.paths, moves, strict=True))
         tried = _at(problem, fit, paths, level)
         if not tried.total < WORTH_FOLLOWING * fit.total:
@@ -189,33 +199,28 @@ def parting(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> flo
     is large, the least error of the flow steers the path to any sample, and the squares are no
     likelihood.
     """
-    told = 0.0
-    for _, seen, _, logs in innovations(problem, fit, level):
-        precision = np.where(np.isfinite(seen.residuals), 1.0 / seen.variance, 0.0)
-        at_rest = np.log1p(FREE_START * precision.sum(axis=0)).sum()
-        told += logs + np.log(precision[precision > 0.0]).sum() - at_rest
+    seen, _, logs = innovations(problem, fit, level)
+    precision = np.where(np.isfinite(seen.residuals), 1.0 / seen.variance, 0.0)
+    by_record = np.add.reduceat(precision, np.append(0, problem.all_records.breaks + 1))
+    told = logs + np.log(precision[precision > 0.0]).sum() - np.log1p(FREE_START * by_record).sum()
     return max(float(told), 0.0) / problem.n_samples
 
 
 def innovations(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> Iterator[tuple[ScaledRecord, Seen, float, float]]:
-    """Of each record what a fit leaves of its samples, and what these add to what came before.
+) -> tuple[Seen, float, float]:
+    """What a fit leaves of all samples, and what these add to what came before.
 
     The latter are the sum of the squares of the innovations, in their standard deviations, and the
     sum of the logarithms of their variances.
     """
-    none = np.zeros_like(fit.support)
-    for record, path, variance, process in zip(
-        problem.records, fit.paths, level.variances, level.processes, strict=True
-    ):
-        flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
-        seen = observe(record, path, variance)
-        misses = flow.ends - path[1:]
-        _, _, least, logs = eliminate(
-            flow.slopes, misses, seen.residuals, seen.variance, process, FREE_START
-        )
-        yield record, seen, least, logs
+    problem.watch.look()
+    seen = observe(problem.all_records, joined(fit.paths), level.variance)
+    flow = _flow(problem, fit, np.zeros_like(fit.support), level)
+    misses = _misses(problem, fit, flow)
+    case = misses, seen.residuals, seen.variance, level.process
+    _, _, least, logs = eliminate(flow.slopes, *case, FREE_START)
+    return seen, least, logs
 
 
 @np.errstate(over="ignore", invalid="ignore")  # `Gram.finite` says whether the result counts
@@ -245,19 +250,14 @@ def enough_substeps(
     """Number of Runge-Kutta steps between samples for an error below a share of the flow's."""
     n = level.n_substeps
     most = min(MAX_SUBSTEPS, max(MIN_ALLOWED, MAX_IN_ALL // problem.n_samples))
+    record, starts = problem.all_records, joined(fit.paths)[:-1]
     while 2 * n <= most:
+        problem.watch.look()
         with np.errstate(over="ignore", invalid="ignore"):
-            errors = [
-                np.square(
-                    problem.ends(record, path[:-1], fit.free, n)
-                    - problem.ends(record, path[:-1], fit.free, 2 * n)
-                )
-                / process
-                for record, path, process in zip(
-                    problem.records, fit.paths, level.processes, strict=True
-                )
-            ]
-        if (np.concatenate(errors).mean(axis=0) <= share**2).all():
+            change = problem.ends(record, starts, fit.free, n)
+            change -= problem.ends(record, starts, fit.free, 2 * n)
+            errors = np.delete(np.square(change) / level.process, record.breaks, axis=0)
+        if (errors.mean(axis=0) <= share**2).all():
             break
         n *= 2
     return n
@@ -267,7 +267,7 @@ def _step(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> tuple[Float[np.ndarray, " free"], list[np.ndarray]]:
     """One Gauss-Newton step: changes of the free coefficients and of every path."""
-    hessian, gradient, _, flows = _hessian(problem, fit, fit.support, level)
+    hessian, gradient, _, flow = _hessian(problem, fit, fit.support, level)
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
         return np.full_like(fit.free, np.nan), []
     size = unit_sizes(hessian)
@@ -275,31 +275,46 @@ def _step(
     step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
     change = np.zeros_like(fit.free)
     change[fit.support] = step
-    return change, _moves(problem, fit, level, flows, step)
+    return change, _moves(problem, fit, level, flow, step)
 
 
 def _moves(
     problem: EstimationProblem,
     fit: TrajectoryFit,
     level: Level,
-    flows: list[Flow],
+    flow: Flow,
     change: Float[np.ndarray, " support"],
 ) -> list[np.ndarray]:
     """Changes of every path, for a change of the support's coefficients."""
-    d, moves = len(problem.states), []
-    for k, (record, path, flow) in enumerate(zip(problem.records, fit.paths, flows, strict=True)):
-        misses = flow.ends - path[1:] + flow.slopes[:, :, d:] @ change
-        by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
-        residuals, variance, _ = observe(record, path, level.variances[k])
-        moves.append(
-            departures(by_state, misses, residuals, variance, level.processes[k], FREE_START)
-        )
-    return moves
+    d = len(problem.states)
+    misses = _misses(problem, fit, flow) + flow.slopes[:, :, d:] @ change
+    by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
+    residuals, variance, _ = observe(problem.all_records, joined(fit.paths), level.variance)
+    moves = departures(by_state, misses, residuals, variance, level.process, FREE_START)
+    return np.split(moves, problem.all_records.breaks + 1)
+
+
+def _flow(
+    problem: EstimationProblem, fit: TrajectoryFit, support: Bool[np.ndarray, " free"], level: Level
+) -> Flow:
+    """The flow along the paths of all records, which ends with each of them."""
+    record, path = problem.all_records, joined(fit.paths)
+    flow = problem.flow(record, path[:-1], fit.free, support, level.n_substeps)
+    flow.slopes[record.breaks] = 0.0
+    return flow
+
+
+def _misses(
+    problem: EstimationProblem, fit: TrajectoryFit, flow: Flow
+) -> Float[np.ndarray, "steps d"]:
+    misses = flow.ends - joined(fit.paths)[1:]
+    misses[problem.all_records.breaks] = 0.0
+    return misses
 
 
 def _hessian(
     problem: EstimationProblem, fit: TrajectoryFit, support: Bool[np.ndarray, " free"], level: Level
-) -> tuple[np.ndarray, np.ndarray, float, list[Flow]]:
+) -> tuple[np.ndarray, np.ndarray, float, Flow]:
     """`hessian` with respect to the coefficients of a support."""
     return hessian(
         problem,
@@ -314,25 +329,20 @@ def hessian(
     fit: TrajectoryFit,
     level: Level,
     flow_of: Callable[[ScaledRecord, np.ndarray], Flow],
-) -> tuple[np.ndarray, np.ndarray, float, list[Flow]]:
+) -> tuple[np.ndarray, np.ndarray, float, Flow]:
     """Derivatives of the squares by the parameters that the flow has slopes of, states eliminated.
 
-    Returns half the second derivatives, minus half the first, the least squares with these
-    parameters unchanged, and the flows.
+    flow_of: the flow along the paths of all records, joined. Returns half the second derivatives,
+    minus half the first, the least squares with these parameters unchanged, and the flow.
     """
-    total: list[Any] = [0.0, 0.0, 0.0]
-    flows = []
-    for record, path, variance, process in zip(
-        problem.records, fit.paths, level.variances, level.processes, strict=True
-    ):
-        flow = flow_of(record, path)
-        residuals, apparent, _ = observe(record, path, variance)
-        parts = eliminate(
-            flow.slopes, flow.ends - path[1:], residuals, apparent, process, FREE_START
-        )
-        total = [whole + part for whole, part in zip(total, parts[:3], strict=True)]
-        flows.append(flow)
-    return total[0], total[1], total[2], flows
+    problem.watch.look()
+    record, path = problem.all_records, joined(fit.paths)
+    flow = flow_of(record, path)
+    flow.slopes[record.breaks] = 0.0
+    misses = _misses(problem, fit, flow)
+    residuals, apparent, _ = observe(record, path, level.variance)
+    case = misses, residuals, apparent, level.process
+    return *eliminate(flow.slopes, *case, FREE_START)[:3], flow
 
 
 def unit_sizes(hessian: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:

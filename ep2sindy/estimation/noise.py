@@ -10,7 +10,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit, fit_paths, innovations, observe
+from ep2sindy.estimation.likelihood import (
+    Level,
+    TrajectoryFit,
+    fit_paths,
+    innovations,
+    joined,
+    observe,
+)
 from ep2sindy.estimation.likelihood import squares as squares_of
 from ep2sindy.estimation.problem import EstimationProblem
 
@@ -168,15 +175,13 @@ def _likeliest_std(
     The second value replaces that of `noise_beside` for states with limits.
     """
     best, found = np.full(len(std), np.inf), std
-    n_values = np.sum(
-        [np.isfinite(record.values).sum(axis=0) for record in problem.records], axis=0
-    )
+    record, path = problem.all_records, joined(fit.paths)
+    n_values = np.isfinite(record.values).sum(axis=0)
     for share in NOISE_SHARES:
         tried = np.maximum(share * std, FLOOR)
         deviance = n_values * (np.log(np.square(tried)) - 1.0)
-        for record, path in zip(problem.records, fit.paths, strict=True):
-            variance = np.broadcast_to(np.square(tried), path.shape)
-            deviance = deviance + observe(record, path, variance).squares.sum(axis=0)
+        variance = np.broadcast_to(np.square(tried), path.shape)
+        deviance = deviance + observe(record, path, variance).squares.sum(axis=0)
         found = np.where(deviance < best, tried, found)
         best = np.minimum(deviance, best)
     return found, best
@@ -269,13 +274,11 @@ def _deviance(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> f
     With limits it uses Laplace's approximation and does not rescale the noise, which is then no
     mere scale factor.
     """
-    least = spread = by_limits = 0.0
-    for record, seen, squares, logs in innovations(problem, fit, level):
-        least, spread = least + squares, spread + logs
-        if record.limits is not None:
-            known = record.limits.at & np.isfinite(seen.residuals)
-            by_limits -= np.log(seen.variance[known]).sum()
+    seen, least, spread = innovations(problem, fit, level)
     if problem.limited.any():
+        assert problem.all_records.limits is not None
+        known = problem.all_records.limits.at & np.isfinite(seen.residuals)
+        by_limits = -np.log(seen.variance[known]).sum()
         return spread + by_limits + float(squares_of(problem, fit.paths, fit.free, level).sum())
     n = problem.n_squares
     return spread + n * np.log(max(least, TINY) / n)

@@ -29,7 +29,8 @@ class ScaledRecord:
     inputs: at the samples; between them they are interpolated by cubics, or linearly if switched.
     limits: of samples that are clipped or rounded. missing: (samples, d), true where nothing was
     measured, as for all of a hidden state; the samples there are nothing but a start. None if all
-    were measured. run: number of the run that it is a stretch of.
+    were measured. run: number of the run that it is a stretch of. parts: the records of which this
+    one is made, one after the other; none for most.
     """
 
     times: Float[np.ndarray, " samples"]
@@ -38,6 +39,31 @@ class ScaledRecord:
     limits: Bounds | None = None
     missing: Bool[np.ndarray, "samples d"] | None = None
     run: int = 0
+    parts: tuple[ScaledRecord, ...] = ()
+
+    @staticmethod
+    def joined(records: Sequence[ScaledRecord]) -> ScaledRecord:
+        """All records as one, so that each pass over the samples is a single call."""
+        if len(records) == 1:
+            return records[0]
+        limits, at_hand = None, np.concatenate([record.at_hand for record in records])
+        if any(record.limits is not None for record in records):
+            exact = [
+                record.limits or Bounds(record.samples, record.samples, ()) for record in records
+            ]
+            lower, upper = ([getattr(each, end) for each in exact] for end in ("lower", "upper"))
+            limits = Bounds(np.concatenate(lower), np.concatenate(upper), ())
+        times, samples, inputs = (
+            np.concatenate([getattr(record, name) for record in records])
+            for name in ("times", "samples", "inputs")
+        )
+        missing = None if at_hand.all() else ~at_hand
+        return ScaledRecord(times, samples, inputs, limits, missing, parts=tuple(records))
+
+    @cached_property
+    def breaks(self) -> Int[np.ndarray, " breaks"]:
+        """Numbers of the steps between parts: no flow leads from one record to the next."""
+        return np.cumsum([len(part.times) for part in self.parts], dtype=np.int64)[:-1] - 1
 
     @property
     def values(self) -> Float[np.ndarray, "samples d"]:
@@ -89,12 +115,17 @@ class ScaledRecord:
 
     @cached_property
     def steps(self) -> Float[np.ndarray, " steps"]:
+        if self.parts:  # those between parts have no length
+            return np.concatenate([np.append(part.steps, 0.0) for part in self.parts])[:-1]
         return np.diff(self.times)
 
     def inputs_at(self, share: float) -> Float[np.ndarray, "steps n_inputs"]:
         """Inputs at a given share of every step."""
         if not self.inputs.shape[1]:
             return np.empty((len(self.steps), 0))
+        if self.parts:
+            rows = [(part.inputs_at(share), part.inputs[-1:]) for part in self.parts]
+            return np.concatenate([each for pair in rows for each in pair])[:-1]
         return self._curve(self.times[:-1] + share * self.steps)
 
     def divided(self, n_substeps: int) -> Steps:
@@ -205,6 +236,11 @@ class EstimationProblem:
         whole = [self.record(run, number) for number, run in enumerate(runs)]
         return replace(self, records=tuple(part for each in whole for part in each.stretches()))
 
+    @cached_property
+    def all_records(self) -> ScaledRecord:
+        """All records as one."""
+        return ScaledRecord.joined(self.records)
+
     @property
     def n_samples(self) -> int:
         return sum(len(record.samples) for record in self.records)
@@ -212,9 +248,8 @@ class EstimationProblem:
     @cached_property
     def limited(self) -> Bool[np.ndarray, " d"]:
         """Mask of the measured states that have limits among their samples."""
-        limits = [r.limits.at.any(axis=0) for r in self.records if r.limits is not None]
-        found = np.any([np.zeros(len(self.states), dtype=np.bool_), *limits], axis=0)
-        return found & self.measured
+        limits = self.all_records.limits
+        return self.measured & (False if limits is None else limits.at.any(axis=0))
 
     @property
     def n_squares(self) -> int:
@@ -224,7 +259,7 @@ class EstimationProblem:
     @cached_property
     def n_measured(self) -> Int[np.ndarray, " d"]:
         """Number of measured samples of each state."""
-        return np.sum([record.at_hand.sum(axis=0) for record in self.records], axis=0)
+        return self.all_records.at_hand.sum(axis=0)
 
     @cached_property
     def partial(self) -> bool:

@@ -266,8 +266,8 @@ def _linear(
     """Slopes of the flow by the state, misses and residuals of every record."""
     none = np.zeros_like(fit.support)
     found = []
-    for record, path, variance in zip(problem.records, fit.paths, level.variances, strict=True):
+    for record, path, noise in zip(problem.records, fit.paths, level.noise, strict=True):
         flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
-        residuals = observe(record, path, variance).residuals
+        residuals = observe(record, path, np.square(noise)).residuals
         found.append((np.ascontiguousarray(flow.slopes), flow.ends - path[1:], residuals))
     return found

@@ -27,6 +27,7 @@ from ep2sindy.estimation.likelihood import (
     enough_substeps,
     fit_paths,
     gram,
+    joined,
     parting,
     squares,
 )
@@ -162,12 +163,11 @@ def squares_of_steps(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
     """Sums of squares, by state: of what the flow from each sample misses, and of the steps."""
-    defects, steps = np.zeros(len(problem.states)), np.zeros(len(problem.states))
-    for record, path in zip(problem.records, fit.paths, strict=True):
-        ends = problem.ends(record, path[:-1], fit.free, level.n_substeps)
-        defects += np.square(ends - path[1:]).sum(axis=0)
-        steps += np.square(np.diff(path, axis=0)).sum(axis=0)
-    return defects, steps
+    record, path = problem.all_records, joined(fit.paths)
+    steps = np.diff(path, axis=0)
+    missed = problem.ends(record, path[:-1], fit.free, level.n_substeps) - path[1:]
+    missed[record.breaks] = steps[record.breaks] = 0.0
+    return np.square(missed).sum(axis=0), np.square(steps).sum(axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,12 +323,8 @@ def start_from_smooth(
     Returns the fit, and the residuals' standard deviations, by record (samples, d).
     """
     start = smoothed(problem, log10_ratio)
-    values = [
-        np.concatenate([path, record.inputs], axis=1)
-        for path, record in zip(start.paths, problem.records, strict=True)
-    ]
-    theta = np.concatenate([problem.library.evaluate(each) for each in values])
-    free = _regress(problem, theta, np.concatenate(start.rates))
+    values = np.concatenate([joined(start.paths), problem.all_records.inputs], axis=1)
+    free = _regress(problem, problem.library.evaluate(values), joined(start.rates))
     support = np.ones(problem.n_free, dtype=np.bool_)
     fit = TrajectoryFit(start.paths, free, support, np.full(len(problem.states), np.inf))
     return fit, start.noise
@@ -371,7 +367,10 @@ class Smoothed:
 
 def smoothed(problem: EstimationProblem, log10_ratio: float | None) -> Smoothed:
     """Smooth the samples; log10_ratio as in `start_from_smooth`."""
-    estimates = [_estimated(problem, record, log10_ratio) for record in problem.records]
+    estimates = []
+    for record in problem.records:
+        problem.watch.look()
+        estimates.append(_estimated(problem, record, log10_ratio))
     variance = np.mean([np.square(e.noise_std) for e in estimates], axis=0)
     paths = []
     for each, record in zip(estimates, problem.records, strict=True):

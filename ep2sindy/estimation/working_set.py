@@ -8,8 +8,8 @@ slowly with those of the library.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,8 +18,15 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.cost import SMALL
 from ep2sindy.estimation.flow import Flow
 from ep2sindy.estimation.kernels import departures, eliminate
-from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, hessian, observe
-from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
+from ep2sindy.estimation.likelihood import (
+    FREE_START,
+    Level,
+    TrajectoryFit,
+    hessian,
+    joined,
+    observe,
+)
+from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.solver import (
     OTHER_STARTS,
     SAMPLES_PER_COEFFICIENT,
@@ -115,10 +122,7 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
     if problem.C is not None or not problem.measured.all() or (sizes <= SMALL).all():
         return np.ones_like(kept)
     start = smoothed(problem, None)
-    steps = [
-        _integrals(problem, record, path)
-        for record, path in zip(problem.records, start.paths, strict=True)
-    ]
+    steps = _integrals(problem, start.paths)
     for block in np.flatnonzero(sizes).tolist():
         own = np.flatnonzero((problem.block == block) & ~problem.required)
         if len(own) <= SMALL:
@@ -154,12 +158,13 @@ def _mimicked(
 
 
 def _integrals(
-    problem: EstimationProblem, record: ScaledRecord, path: Float[np.ndarray, "samples d"]
+    problem: EstimationProblem, paths: Sequence[Float[np.ndarray, "samples d"]]
 ) -> Float[np.ndarray, "steps terms"]:
-    """Integral of every term over each step along a path, by the trapezoidal rule.
+    """Integral of every term over each step along all paths, by the trapezoidal rule.
 
-    A term that overflows on the path is not available: zero.
+    It is zero from one path to the next. A term that overflows is not available: zero.
     """
+    record, path = problem.all_records, joined(paths)
     with np.errstate(over="ignore", invalid="ignore"):
         values = problem.library.evaluate(np.concatenate([path, record.inputs], axis=1))
         integrals = 0.5 * record.steps[:, None] * (values[1:] + values[:-1])
@@ -170,7 +175,7 @@ def _own_squares(
     problem: EstimationProblem,
     paths: tuple[np.ndarray, ...],
     level: Level,
-    steps: list[Float[np.ndarray, "steps terms"]],
+    steps: Float[np.ndarray, "steps terms"],
     block: int,
     own: np.ndarray,
 ) -> tuple[Float[np.ndarray, "own own"], Float[np.ndarray, " own"], float]:
@@ -178,22 +183,17 @@ def _own_squares(
 
     steps: integrals of the terms over each step. Returns the parts of `likelihood.Gram`.
     """
-    total: list[Any] = [0.0, 0.0, 0.0]
-    one = slice(block, block + 1)
-    for record, path, variance, process, integrals in zip(
-        problem.records, paths, level.variances, level.processes, steps, strict=True
-    ):
-        columns = integrals[:, problem.column[own]]
-        flow = np.concatenate([np.ones((len(columns), 1)), columns], axis=1)[:, None]
-        residuals, apparent, _ = observe(record, path, variance)
-        misses = -np.diff(path[:, one], axis=0)
-        parts = eliminate(
-            np.ascontiguousarray(flow), misses, np.ascontiguousarray(residuals[:, one]),
-            np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(process[:, one]),
-            FREE_START,
-        )  # fmt: skip
-        total = [whole + part for whole, part in zip(total, parts[:3], strict=True)]
-    quadratic, linear, offset = total
+    record, path, one = problem.all_records, joined(paths), slice(block, block + 1)
+    columns = steps[:, problem.column[own]]
+    flow = np.concatenate([np.ones((len(columns), 1)), columns], axis=1)[:, None]
+    residuals, apparent, _ = observe(record, path, level.variance)
+    misses = -np.diff(path[:, one], axis=0)
+    flow[record.breaks] = misses[record.breaks] = 0.0
+    quadratic, linear, offset, _ = eliminate(
+        np.ascontiguousarray(flow), misses, np.ascontiguousarray(residuals[:, one]),
+        np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(level.process[:, one]),
+        FREE_START,
+    )  # fmt: skip
     return quadratic, linear, float(offset)
 
 
@@ -230,7 +230,7 @@ def _gains(
     level: Level,
 ) -> Float[np.ndarray, " free"]:
     """Fall of the squares that each coefficient by itself would bring, to first order."""
-    quadratic, _, _, flows = hessian(
+    quadratic, _, _, flow = hessian(
         part,
         fit,
         level,
@@ -238,59 +238,43 @@ def _gains(
     )
     if not np.isfinite(quadratic).all():
         return np.zeros(problem.n_free)
-    terms = np.concatenate(
-        [
-            _integrals(problem, record, path)
-            for record, path in zip(problem.records, fit.paths, strict=True)
-        ]
-    )
-    left = [flow.ends - path[1:] for flow, path in zip(flows, fit.paths, strict=True)]
-    score = np.square(terms.T @ _weighted(left, level))
+    # Neither terms nor slopes lead from one record to the next, whatever is missed there.
+    terms, std = _integrals(problem, fit.paths), joined(level.noise)
+    score = np.square(terms.T @ ((flow.ends - joined(fit.paths)[1:]) / level.process))
     with_states, with_all = np.zeros_like(score), np.zeros_like(score)
     rng, inverse = np.random.default_rng(0), inverse_of(quadratic)
     for _ in range(N_PROBES):
-        noise = [std * rng.standard_normal(std.shape) for std in level.noise]
-        without = _misses(part, fit, level, flows, noise, np.zeros(len(inverse)))
-        slopes = [flow.slopes[:, :, len(part.states) :] for flow in flows]
-        weighted = np.split(_weighted(without, level), np.cumsum([len(e) for e in without])[:-1])
-        gradient = sum(
-            np.einsum("kd,kds->s", each, slope)
-            for each, slope in zip(weighted, slopes, strict=True)
-        )
-        fitted = _misses(part, fit, level, flows, noise, -inverse @ gradient)
-        with_states += np.square(terms.T @ _weighted(without, level)) / N_PROBES
-        with_all += np.square(terms.T @ _weighted(fitted, level)) / N_PROBES
+        noise = std * rng.standard_normal(std.shape)
+        without = _weighted_misses(part, fit, level, flow, noise, np.zeros(len(inverse)))
+        gradient = np.einsum("kd,kds->s", without, flow.slopes[:, :, len(part.states) :])
+        fitted = _weighted_misses(part, fit, level, flow, noise, -inverse @ gradient)
+        with_states += np.square(terms.T @ without) / N_PROBES
+        with_all += np.square(terms.T @ fitted) / N_PROBES
     # A term that the chosen ones span leaves only rounding: it is not available.
     tells = with_all > DEPENDENT * with_states
     gains = np.where(tells, score / np.where(tells, with_all, 1.0), 0.0)
     return gains[problem.column, problem.equation]
 
 
-def _misses(
+def _weighted_misses(
     part: EstimationProblem,
     fit: TrajectoryFit,
     level: Level,
-    flows: list[Flow],
-    noise: list[Float[np.ndarray, "samples d"]],
+    flow: Flow,
+    noise: Float[np.ndarray, "samples d"],
     change: Float[np.ndarray, " support"],
-) -> list[Float[np.ndarray, "steps d"]]:
-    """How far states that follow a draw of noise leave the flow, the coefficients changed."""
-    d, found = len(part.states), []
-    for k, (record, path, flow) in enumerate(zip(part.records, fit.paths, flows, strict=True)):
-        by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
-        moved = flow.slopes[:, :, d:] @ change
-        seen = observe(record, path, level.variances[k])
-        draw = np.where(np.isfinite(seen.residuals), noise[k], np.nan)
-        off = departures(by_state, moved, draw, seen.variance, level.processes[k], FREE_START)
-        found.append(np.einsum("kij,kj->ki", by_state, off[:-1]) + moved - off[1:])
-    return found
-
-
-def _weighted(
-    misses: list[Float[np.ndarray, "steps d"]], level: Level
 ) -> Float[np.ndarray, "steps d"]:
-    """Misses of all records over the variance of the flow's error."""
-    return np.concatenate([m / p for m, p in zip(misses, level.processes, strict=True)])
+    """How far states that follow a draw of noise leave the flow, the coefficients changed.
+
+    Over the variance of the flow's error.
+    """
+    d, process = len(part.states), level.process
+    by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
+    moved = flow.slopes[:, :, d:] @ change
+    seen = observe(part.all_records, joined(fit.paths), level.variance)
+    draw = np.where(np.isfinite(seen.residuals), noise, np.nan)
+    off = departures(by_state, moved, draw, seen.variance, process, FREE_START)
+    return (np.einsum("kij,kj->ki", by_state, off[:-1]) + moved - off[1:]) / process
 
 
 def _spread(values: np.ndarray, kept: Bool[np.ndarray, " free"]) -> np.ndarray:

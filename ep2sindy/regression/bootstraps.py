@@ -21,6 +21,7 @@ from ep2sindy.regression.searches import Search, SearchOfDraws
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.runtime.values import set_counts
 
+MOST_WEIGHTS = 2**24  # weights of rows, over the draws that are made at once
 WORK_AT_ONCE = 1_000_000  # cubes of terms, over the draws whose searches are one call
 
 
@@ -66,6 +67,10 @@ class Bootstraps:
                 f"blocks of {self.block} would cross from one trajectory to the next: "
                 f"{len(problem.trajectories)} trajectories came; use block=1"
             )
+        if self.n > 1 and self.n * problem.n_train > MOST_WEIGHTS:  # the draws come one by one
+            halves = [replace(self, n=n) for n in (self.n // 2, self.n - self.n // 2)]
+            parts = [half.draw(problem, terms, rng) for half in halves]
+            return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
         group = problem.groups[~problem.test]
         if (group[1:] > group[:-1]).all():  # each row alone, which is told at a tenth of the cost
             counts, kept = self.draw_groups(len(group), terms, rng)

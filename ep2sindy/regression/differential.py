@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ep2sindy.data.coerce import check_domain, keep_inside, noise_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
-from ep2sindy.regression.rows import MOST_ROWS, RegressionRows
+from ep2sindy.regression.rows import MOST_ROWS, RegressionRows, TermsAt
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.runtime.values import check_kind, locked
 from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
@@ -50,18 +50,19 @@ class Differential:
         check_domain(trajectories, library, smooth=self.smooth_library)
         pieces = [piece for run in trajectories for piece in run.stretches()]
         n_samples = [run.n_samples for run in pieces]
-        theta = np.empty((sum(n_samples), len(library)))
-        target = np.empty((len(theta), len(trajectories[0].state_names)))
+        values = np.empty((sum(n_samples), len(library.variables)))
+        target = np.empty((len(values), len(trajectories[0].state_names)))
         ends = np.cumsum(n_samples)
         for run, end in zip(pieces, ends.tolist(), strict=True):
             rows = slice(end - run.n_samples, end)
-            self._fill(run, library, theta[rows], target[rows])
+            self._fill(run, library, values[rows], target[rows])
+        terms = TermsAt(library, values)
         problem = RegressionRows(
-            theta=locked(theta),
+            theta=terms if len(values) > MOST_ROWS else terms[:],
             target=locked(target),
             library=library,
             equations=trajectories[0].state_names,
-            groups=np.arange(len(theta)),
+            groups=np.arange(len(values)),
             test=np.concatenate([self.split.held_out(n, rng) for n in n_samples]),
             trajectories=tuple(trajectories),
         )
@@ -71,16 +72,12 @@ class Differential:
         self,
         run: Trajectory,
         library: Library,
-        theta: Float[np.ndarray, "samples terms"],
+        values: Float[np.ndarray, "samples variables"],
         target: Float[np.ndarray, "samples n_states"],
     ) -> None:
-        """Write the terms and the derivatives of one trajectory at its samples."""
-        values = run.columns(library.variables)
+        """Write the library's variables and the derivatives of one trajectory at its samples."""
+        target[:] = self.smoother.derivative(run.t, run.states)
+        values[:] = run.columns(library.variables)
         if self.smooth_library:
             smooth = self.smoother.smooth(run.t, values)
-            values = keep_inside(library, smooth, noise_inside(library, values))
-        with np.errstate(over="ignore"):  # RegressionRows names a term that is not finite
-            for start in range(0, len(values), MOST_ROWS):  # evaluation holds several copies
-                rows = slice(start, start + MOST_ROWS)
-                theta[rows] = library.evaluate(values[rows])
-        target[:] = self.smoother.derivative(run.t, run.states)
+            values[:] = keep_inside(library, smooth, noise_inside(library, values))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,7 +15,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.regression.row_kernels import dot, fill_products, gather_columns
 from ep2sindy.regression.windows import Windows
-from ep2sindy.runtime.values import read_only
+from ep2sindy.runtime.values import locked, read_only
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.trust.memory import check_memory
 
@@ -65,6 +65,24 @@ class NoisyRows:
 
 
 @dataclass(frozen=True, eq=False)
+class TermsAt:
+    """Terms of a library at (rows, variables) values, evaluated for the rows that are asked for.
+
+    For long records, whose terms take several times the memory of their samples.
+    """
+
+    library: Library
+    values: Float[np.ndarray, "rows variables"]
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, rows: Any) -> Float[np.ndarray, "_ terms"]:
+        with np.errstate(over="ignore"):  # RegressionRows names a term that is not finite
+            return locked(np.ascontiguousarray(self.library.evaluate(self.values[rows])))
+
+
+@dataclass(frozen=True, eq=False)
 class RegressionRows:
     """Rows of library terms and targets, in SI units, ready for a search.
 
@@ -76,7 +94,7 @@ class RegressionRows:
     Raises ValueError for values that are not finite or fewer training rows than terms.
     """
 
-    theta: Float[np.ndarray, "rows terms"]
+    theta: Float[np.ndarray, "rows terms"] | TermsAt
     target: Float[np.ndarray, "rows equations"]
     library: Library
     equations: Sequence[str]
@@ -86,18 +104,20 @@ class RegressionRows:
     noisy: NoisyRows | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "theta", read_only(self.theta))
+        if not isinstance(self.theta, TermsAt):
+            object.__setattr__(self, "theta", read_only(self.theta))
         object.__setattr__(self, "target", read_only(self.target))
         object.__setattr__(self, "equations", tuple(self.equations))
         rates = [f"d({e})/dt" for e in self.equations]
         for names, values in ((self.library.names, self.theta), (rates, self.target)):
-            finite = np.isfinite(values)
-            if not finite.all():
-                row, column = np.argwhere(~finite)[0]
-                raise ValueError(
-                    f"every term must be finite on every row: {names[column]!r} is not on row "
-                    f"{row}; lower the degree or rescale the variables"
-                )
+            for start in range(0, len(values), MOST_ROWS):
+                finite = np.isfinite(values[start : start + MOST_ROWS])
+                if not finite.all():
+                    row, column = np.argwhere(~finite)[0]
+                    raise ValueError(
+                        f"every term must be finite on every row: {names[column]!r} is not on row "
+                        f"{start + row}; lower the degree or rescale the variables"
+                    )
         n_train = int((~self.test).sum())
         if n_train < len(self.library):
             raise ValueError(
@@ -113,20 +133,20 @@ class RegressionRows:
     @cached_property
     def theta_scale(self) -> Float[np.ndarray, " terms"]:
         """L2 norm of each column over the training rows; 1 for a column of zeros."""
-        return _norms(self.theta, self._train_places)
+        return _norms(self.theta, ~self.test)
 
     @cached_property
     def target_scale(self) -> Float[np.ndarray, " equations"]:
-        return _norms(self.target, self._train_places)
+        return _norms(self.target, ~self.test)
 
     @cached_property
     def train_columns(self) -> Float[np.ndarray, "columns train"]:
         """Scaled terms, then scaled targets, of the training rows, each contiguous in memory."""
-        return self._scaled(self._train_places)
+        return self._scaled(~self.test)
 
     @cached_property
     def test_columns(self) -> Float[np.ndarray, "columns test"]:
-        return self._scaled(np.flatnonzero(self.test))
+        return self._scaled(self.test)
 
     @property
     def train_rows(self) -> Float[np.ndarray, "train columns"]:
@@ -136,13 +156,9 @@ class RegressionRows:
     def test_rows(self) -> Float[np.ndarray, "test columns"]:
         return self.test_columns.T
 
-    @cached_property
-    def _train_places(self) -> Int[np.ndarray, " train"]:
-        return np.flatnonzero(~self.test)
-
     @property
     def n_train(self) -> int:
-        return len(self._train_places)
+        return len(self.test) - int(np.count_nonzero(self.test))
 
     def blocks(self, *, test: bool) -> Iterator[Float[np.ndarray, "columns _"]]:
         """Scaled columns, of training or held-out rows in order: of all at once, or of a long
@@ -152,8 +168,7 @@ class RegressionRows:
             yield self.test_columns if test else self.train_columns
             return
         for start in range(0, len(self.test), MOST_ROWS):
-            here = self.test[start : start + MOST_ROWS] == test
-            yield self._scaled(start + np.flatnonzero(here))
+            yield self._scaled(self.test[start : start + MOST_ROWS] == test, start)
 
     @property
     def train_theta(self) -> Float[np.ndarray, "train terms"]:
@@ -244,24 +259,33 @@ class RegressionRows:
             return columns[len(self.library) + equation]
         return self.target[self.test == test, equation] / self.target_scale[equation]
 
-    def _scaled(self, places: Int[np.ndarray, " _"]) -> Float[np.ndarray, "columns _"]:
-        n = len(self.library)
+    def _scaled(
+        self, chosen: Bool[np.ndarray, " rows"], start: int = 0
+    ) -> Float[np.ndarray, "columns _"]:
+        """Scaled columns of the rows that are chosen among those from `start` on."""
+        n, places = len(self.library), np.flatnonzero(chosen)
         scaled = np.empty((n + len(self.equations), len(places)))
-        gather_columns(self.theta, places, self.theta_scale, 0, scaled)
-        gather_columns(self.target, places, self.target_scale, n, scaled)
+        rows = slice(start, start + len(chosen))
+        gather_columns(self.theta[rows], places, self.theta_scale, 0, scaled)
+        gather_columns(self.target[rows], places, self.target_scale, n, scaled)
         return scaled
 
 
 def _norms(
-    values: Float[np.ndarray, "rows columns"], places: Int[np.ndarray, " _"]
+    values: Float[np.ndarray, "rows columns"] | TermsAt, chosen: Bool[np.ndarray, " rows"]
 ) -> Float[np.ndarray, " columns"]:
     """L2 norms of the columns over some rows, as `column_norms`, in a third of its time."""
-    columns = np.empty((values.shape[1], len(places)))
-    gather_columns(values, places, np.ones(len(columns)), 0, columns)
-    squares = np.array([dot(column, column) for column in columns])
+    parts = []
+    for start in range(0, len(chosen), MOST_ROWS):
+        places = np.flatnonzero(chosen[start : start + MOST_ROWS])
+        part = values[start : start + MOST_ROWS]
+        columns = np.empty((part.shape[1], len(places)))
+        gather_columns(part, places, np.ones(len(columns)), 0, columns)
+        parts.append([dot(column, column) for column in columns])
+    squares = np.sum(parts, axis=0)
     if ((squares > SMALL) & (squares < 1.0 / SMALL)).all():
         return np.sqrt(squares)
-    return column_norms(values.take(places, axis=0))
+    return column_norms(values[chosen])
 
 
 @runtime_checkable

@@ -12,6 +12,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ep2sindy.signals.spectrum import is_uniform
 
+BLOCK = 262_144  # samples that are differentiated at once
+
 
 @runtime_checkable
 class Smoother(Protocol):
@@ -32,7 +34,13 @@ def difference(
     """Second-order finite differences, exact for parabolas, also at unequal steps and the ends."""
     if len(t) < 3:
         raise ValueError(f"second-order differences need three samples or more: {len(t)} came")
-    return np.gradient(values, t, axis=0, edge_order=2)
+    found = np.empty(values.shape)
+    for start in range(0, len(t), BLOCK):  # differences hold several copies
+        first = max(start - 2, 0)
+        some, own = slice(first, start + BLOCK + 1), slice(start, start + BLOCK)
+        part = np.gradient(values[some], t[some], axis=0, edge_order=2)
+        found[own] = part[start - first :][:BLOCK]
+    return found
 
 
 @dataclass(frozen=True)
