@@ -363,16 +363,10 @@ def lasting(run: ep.Trajectory, size: float, memory: float, seed: int) -> ep.Tra
 
 
 def test_samples_that_a_fit_follows_exactly_show_no_noise_of_any_size() -> None:
-    t = np.arange(40.0)
-    run = ep.Trajectory(t, np.square(t)[:, None], ["x"])
-    problem = scale_problem([run], ep.polynomial(["x"], degree=1))
-    n_free = 2
-    fit = TrajectoryFit(
-        tuple(record.values for record in problem.records),
-        np.zeros(n_free), np.zeros(n_free, dtype=np.bool_), np.zeros(1),
-    )  # fmt: skip
+    samples = np.square(np.arange(40.0))[:, None]
+    nothing = np.zeros_like(samples)
     with np.errstate(all="raise", under="ignore"):
-        shown = _shown_by_samples(problem, fit, np.array([1e9]), np.array([0.5]))
+        shown = _shown_by_samples([samples], [nothing], np.array([1e9]), np.array([0.5]), 40.0)
     assert not shown.any()
 
 

@@ -119,17 +119,11 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
         left = _pulls(problem, fit, std)
     unit = [e / s for e, s in zip(left, shape, strict=True)]
     memory = _memory(unit)
-    samples = [record.values for record in problem.records]
-    off = [values - path for values, path in zip(samples, fit.paths, strict=True)]
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
     new = _whiten(unit, memory)
     period = np.where(std > FLOOR, _find_lines(problem, new), 0.0)
     follows = _follow_states(problem, fit, new) & (std > FLOOR)
-    believed = shows & _forgets(unit, memory, problem.n_samples)
-    believed &= _shown_by_samples(samples, off, std, memory, problem.n_samples)
-    # Slow residuals of a signal's size tell that the model ignores the signal.
-    spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
-    believed &= ~((memory > SLOW) & (std > LARGE * spread)) & (period == 0.0) & ~follows
+    believed = shows & _last_as_noise(problem, fit, unit, std, memory) & (period == 0.0) & ~follows
     std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std[~hidden]).mean()
@@ -149,6 +143,23 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
         outliers=outliers,
         deviance=float((logs + n * np.log1p(-np.square(lasting)))[~hidden].sum()),
     )
+
+
+def _last_as_noise(
+    problem: EstimationProblem,
+    fit: TrajectoryFit,
+    unit: Sequence[Float[np.ndarray, "samples d"]],
+    std: Float[np.ndarray, " d"],
+    memory: Float[np.ndarray, " d"],
+) -> Bool[np.ndarray, " d"]:
+    """True where residuals are correlated as noise of this size and memory would be."""
+    samples = [record.values for record in problem.records]
+    off = [values - path for values, path in zip(samples, fit.paths, strict=True)]
+    # Slow residuals of a signal's size tell that the model ignores the signal.
+    spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
+    ignored = (memory > SLOW) & (std > LARGE * spread)
+    shown = _shown_by_samples(samples, off, std, memory, problem.n_samples)
+    return _forgets(unit, memory, problem.n_samples) & shown & ~ignored
 
 
 def are_noise(
