@@ -2,6 +2,7 @@
 
     python -m benchmarks.estimation counts [--n 100] [--systems ...] [--noises ...] [--kind white]
     python -m benchmarks.estimation misfit [--n 25]     # with each true term left out
+    python -m benchmarks.estimation degrees [--n 10]    # a library too small; delays at 20 % noise
     python -m benchmarks.estimation samples             # CPU against the number of samples
     python -m benchmarks.estimation waves [--sizes 5 8 12 20 40] [--n 3]  # Lorenz-96 of many states
     python -m benchmarks.estimation chain [--sizes 20] [--n 3]            # coupled van der Pol's
@@ -145,6 +146,28 @@ def chemical(
 
 def _shares(counts: np.ndarray) -> str:
     return "  ".join(f"{called}/{of}" for called, of in counts.reshape(-1, 2))
+
+
+def degrees(n: int) -> None:
+    """The Brusselator in libraries of degree 2 and 3; right models at 20 % noise called late."""
+    true = OTHERS["brusselator"].system("brusselator").model.coef != 0.0
+    for degree, align, kind in product((2, 3), (False, True), ("proportional", "white")):
+        library, counted = ep.polynomial(["x", "y"], degree=degree), np.zeros(3, dtype=int)
+        for number in range(n):
+            found = ep.estimate([chemical(number, kind)], library, align=align)
+            right = degree == 3 and bool(((found.model.coef != 0.0) == true).all())
+            counted += right, bool(found.misfit), bool(found.delays_s.any())
+        print(
+            f"degree {degree} {align=} {kind:12} right, misfit, late: {counted} of {n}", flush=True
+        )
+    total = np.zeros(2, dtype=int)
+    for name in [*DRAWS, *OTHERS]:
+        for number in range(2 * n):
+            system, run = noisy(name, 0.2, number)
+            found = ep.estimate([run], system.model.library)
+            late, coef = bool(found.delays_s.any()), found.model.coef != 0.0
+            total += late, bool((coef == (system.model.coef != 0.0)).all())
+    print(f"20 % noise, {2 * n} draws of each system: {total[0]} called late, {total[1]} right")
 
 
 def samples() -> None:
@@ -310,7 +333,17 @@ def prices(noises: Sequence[float], n: int) -> None:
         )
 
 
-WHAT = ["counts", "misfit", "samples", "thruster", "collection", "prices", "waves", "chain"]
+WHAT = [
+    "counts",
+    "misfit",
+    "degrees",
+    "samples",
+    "thruster",
+    "collection",
+    "prices",
+    "waves",
+    "chain",
+]
 
 
 def main() -> None:
@@ -329,6 +362,8 @@ def main() -> None:
         counts(asked.systems, asked.noises, asked.kind, asked.n)
     elif asked.what == "misfit":
         misfits(asked.systems, asked.n)
+    elif asked.what == "degrees":
+        degrees(asked.n)
     elif asked.what == "collection":
         collection(asked.noises, asked.n)
     elif asked.what == "waves":

@@ -14,7 +14,7 @@ from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import Watch
 from ep2sindy.estimation.flow import Flow, RightHandSides, Steps
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Relation, constraint
 
 
@@ -104,7 +104,7 @@ class EstimationProblem:
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
     measured: (d,), False for hidden states. watch: told of every step of a fit. whole: the
     problem with all terms, if this one has only those of a working set; places: (terms,), their
-    positions in its library.
+    positions in its library. widen: makes the problem with all products of one degree more.
     """
 
     library: Library
@@ -125,6 +125,7 @@ class EstimationProblem:
     inputs: tuple[str, ...] = ()
     watch: Watch = field(default_factory=Watch)
     whole: EstimationProblem | None = None
+    widen: Callable[[], EstimationProblem] | None = None
 
     def restricted(self, kept: Bool[np.ndarray, " free"]) -> EstimationProblem:
         """The same records with some of the coefficients; the others are zero."""
@@ -339,7 +340,14 @@ def scale_problem(
         inputs=tuple(inputs),
         watch=watch or Watch(),
     )
-    return replace(problem, records=tuple(problem.record(run) for run in runs))
+
+    def widen() -> EstimationProblem:
+        wider = library + polynomial(library.variables, degree=int(library.degrees.max()) + 1)
+        return scale_problem(
+            runs, wider, relations, terms, measured=measured, exclude=exclude, watch=watch
+        )
+
+    return replace(problem, records=tuple(problem.record(run) for run in runs), widen=widen)
 
 
 def _asked(
