@@ -3,6 +3,7 @@
     python -m benchmarks.estimation counts [--n 100] [--systems ...] [--noises ...] [--kind white]
     python -m benchmarks.estimation misfit [--n 25]     # with each true term left out
     python -m benchmarks.estimation short [--n 10]      # short and sparse records of Lorenz
+    python -m benchmarks.estimation degrees [--n 10]    # a library too small; delays at 20 % noise
     python -m benchmarks.estimation samples             # CPU against the number of samples
     python -m benchmarks.estimation waves [--sizes 5 8 12 20 40] [--n 3]  # Lorenz-96 of many states
     python -m benchmarks.estimation chain [--sizes 20] [--n 3]            # coupled van der Pol's
@@ -203,6 +204,28 @@ def _largest_miss(found: ep.discovery.Estimate) -> float:
     return float(np.sqrt(squares.max() / n_steps))
 
 
+def degrees(n: int) -> None:
+    """The Brusselator in libraries of degree 2 and 3; right models at 20 % noise called late."""
+    true = OTHERS["brusselator"].system("brusselator").model.coef != 0.0
+    for degree, align, kind in product((2, 3), (False, True), ("proportional", "white")):
+        library, counted = ep.polynomial(["x", "y"], degree=degree), np.zeros(3, dtype=int)
+        for number in range(n):
+            found = ep.estimate([chemical(number, kind)], library, align=align)
+            right = degree == 3 and bool(((found.model.coef != 0.0) == true).all())
+            counted += right, bool(found.misfit), bool(found.delays_s.any())
+        print(
+            f"degree {degree} {align=} {kind:12} right, misfit, late: {counted} of {n}", flush=True
+        )
+    total = np.zeros(2, dtype=int)
+    for name in [*DRAWS, *OTHERS]:
+        for number in range(2 * n):
+            system, run = noisy(name, 0.2, number)
+            found = ep.estimate([run], system.model.library)
+            late, coef = bool(found.delays_s.any()), found.model.coef != 0.0
+            total += late, bool((coef == (system.model.coef != 0.0)).all())
+    print(f"20 % noise, {2 * n} draws of each system: {total[0]} called late, {total[1]} right")
+
+
 def samples() -> None:
     print("samples  CPU-s  right")
     for n in (1000, 3000, 10_000, 30_000, 100_000):
@@ -370,6 +393,7 @@ WHAT = [
     "counts",
     "misfit",
     "short",
+    "degrees",
     "samples",
     "thruster",
     "collection",
@@ -395,6 +419,8 @@ def main() -> None:
         counts(asked.systems, asked.noises, asked.kind, asked.n)
     elif asked.what == "misfit":
         misfits(asked.systems, asked.n)
+    elif asked.what == "degrees":
+        degrees(asked.n)
     elif asked.what == "collection":
         collection(asked.noises, asked.n)
     elif asked.what == "waves":

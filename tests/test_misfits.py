@@ -10,10 +10,13 @@ import pytest
 import ep2sindy as ep
 from benchmarks.estimation import chemical
 from benchmarks.known_systems import KINDS, noisy
+from benchmarks.spoilt import spoilt
 from ep2sindy.data.gaps import between_gaps
+from ep2sindy.estimation import explanation
 from ep2sindy.estimation.likelihood import TrajectoryFit
 from ep2sindy.estimation.noise import Noise, noise_beside
 from ep2sindy.estimation.problem import scale_problem
+from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.systems.systems import System
 
 
@@ -36,9 +39,7 @@ def at_rest(run: ep.Trajectory) -> np.ndarray:
 def test_34_clean_cycles_are_not_the_noise_of_a_state_at_rest(n: int) -> None:
     run = chemical(0, noise=0.0, duration_s=34 * 7.157, n=n)
     noise = noise_of([run], [at_rest(run)])
-    overtone = n / 34 / noise.period  # whitening raises the overtones
-    np.testing.assert_allclose(overtone, np.round(overtone), rtol=0.02)
-    assert noise.is_error.all()
+    assert noise.patterned.all()
     assert not noise.memory.any()
 
 
@@ -48,7 +49,7 @@ def test_a_line_is_found_in_pieces_of_a_record_and_at_unequal_steps() -> None:
     kept = np.flatnonzero(np.random.default_rng(0).random(1200) > 0.5)
     uneven = ep.Trajectory(run.t[kept], run.states[kept], run.state_names)
     for runs in (pieces, [uneven]):
-        assert noise_of(runs, [at_rest(each) for each in runs]).period.all()
+        assert noise_of(runs, [at_rest(each) for each in runs]).patterned.all()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -80,7 +81,7 @@ def test_a_function_of_the_states_is_no_noise_that_lasts() -> None:
     error = 0.03 * np.sin(3.0 * x) * np.cos(3.0 * y)
     off = ep.Trajectory(run.t, run.states + np.stack([error, 0.0 * error], axis=1), ["x", "y"])
     noise = noise_of([off], [clean.states], system.model.library)
-    np.testing.assert_array_equal(noise.follows, [True, False])
+    np.testing.assert_array_equal(noise.patterned, [True, False])
 
 
 def lacking(duration_s: float) -> tuple[ep.Trajectory, System]:
@@ -99,3 +100,23 @@ def test_a_library_of_too_low_a_degree_is_no_late_sensor(duration_s: float, alig
     right = ep.estimate([run], ep.polynomial(["x", "y"], degree=3), align=align)
     assert not right.misfit
     np.testing.assert_array_equal(right.model.coef != 0.0, system.model.coef != 0.0)
+
+
+@pytest.mark.parametrize(("draw", "lacks"), [("brusselator", True), ("late", False)])
+def test_a_delay_competes_with_products_of_one_degree_more(draw: str, lacks: bool) -> None:
+    run = chemical(0) if lacks else spoilt("lotka_volterra", "lag 2", 0, 0.02)[1]
+    problem = scale_problem([run], ep.polynomial(["x", "y"], degree=2))
+    found = from_smooth(problem, None, max_terms=7)
+    late = explanation._align(problem, found, 7)
+    if lacks:  # whatever delay its false equations may have
+        late = explanation.Aligned(problem, found, np.array([0.5, 0.0]), found.score)
+    assert late is not None
+    assert ("up to degree 3" in explanation._lacks_terms(problem, late, 7)) == lacks
+
+
+def test_a_delay_at_three_standard_errors_is_none() -> None:
+    """The likeliest of two delays, one sample at three standard errors, is what noise shows."""
+    system, run = noisy("brusselator", 0.2, 12)
+    found = ep.estimate([run], system.model.library)
+    assert not found.misfit
+    np.testing.assert_array_equal(found.model.coef != 0.0, system.model.coef != 0.0)

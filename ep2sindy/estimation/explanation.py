@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import compress
-from math import log
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +15,8 @@ from jaxtyping import Float
 from ep2sindy.estimation.cost import OutOfTimeError
 from ep2sindy.estimation.lateness import (
     PAYS,
+    SURE,
+    delay_price,
     delay_words,
     fit_delays,
     late_words,
@@ -38,6 +39,7 @@ from ep2sindy.estimation.solver import (
     AnnealedFit,
     Solution,
     astray,
+    enough_samples,
     from_smooth,
     max_terms_for,
     settle,
@@ -51,6 +53,7 @@ FIRST_MAX_TERMS, MORE_TERMS = 7, 5  # of one equation, and how many more where a
 LET_GO = 0.5  # residual, as a share of a state's spread, if the model ignores the state
 # Moves of late channels (the delay model is linear), and the move, in mean steps, that ends them.
 MAX_MOVES, SETTLED = 3, 0.05
+MAX_WIDER = 500  # terms of a library that a late channel competes with: more would take too long
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +147,8 @@ def _explain(problem: EstimationProblem, max_terms: int | None, align: bool) -> 
     few_terms = max_terms_for(problem, max_terms)
     best, late, pushed = _solve(problem, first, few_terms)
     none = np.zeros(len(problem.states))
+    if late is not None and (words := _lacks_terms(problem, late, max_terms)):
+        return Explanation(problem, best, few_terms, words, none, none)
     if late is not None and not align:
         words = late_words(problem, late.delays)
         return Explanation(problem, best, few_terms, words, late.delays, none)
@@ -270,13 +275,34 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
         if now.annealed.around is None:
             return None
         around, support = now.annealed.around, now.annealed.fit.support
-        step = fit_delays(here, around, late, support, now.prices, max_terms=max_terms)[1]
+        _, step, errors = fit_delays(here, around, late, support, now.prices, max_terms=max_terms)
         if np.abs(step).max() < SETTLED:
             break
     # Samples at the ends are left out: scale the likelihood to the full number of samples.
     score = now.score + now.noise.deviance * (problem.n_samples / here.n_samples - 1.0)
-    score += late.sum() * log(problem.n_samples) + PAYS
-    return Aligned(here, now, delays, score) if now.fits and score < found.score else None
+    score += late.sum() * delay_price(problem) + PAYS
+    sure = (np.abs(delays) >= SURE * errors).all()
+    return Aligned(here, now, delays, score) if sure and now.fits and score < found.score else None
+
+
+def _lacks_terms(problem: EstimationProblem, late: Aligned, max_terms: int) -> str:
+    """Why terms are missing rather than a sensor late; empty unless one degree more is as good.
+
+    With a channel that is moved, wrong equations may stand in for terms that the library lacks. But
+    higher products also stand in for a delay: they count if there are no more terms of them.
+    """
+    wider = problem.widen and problem.widen()
+    if wider is None or len(wider.library) > MAX_WIDER or not enough_samples(wider):
+        return ""
+    _, found = search_within(wider, max_terms=max_terms)
+    n_more = found.annealed.fit.support.sum() - late.solution.annealed.fit.support.sum()
+    if not found.fits or found.score > late.score or n_more > 0:
+        return ""
+    return (
+        f"this library lacks terms: with products up to degree {wider.library.degrees.max()} the "
+        "samples are explained, and with no channel late; add these products. The equations are "
+        "the nearest found"
+    )
 
 
 def _misfit(problem: EstimationProblem, found: Solution) -> str:
@@ -293,16 +319,11 @@ def _misfit(problem: EstimationProblem, found: Solution) -> str:
             f"paths beside the fit part by a factor of {factor:.2g} per sample, so it could follow "
             "any samples"
         )
-    for state, memory in zip(problem.states, found.noise.unexplained, strict=True):
-        if memory:
+    for k, state in enumerate(problem.states):
+        if memory := found.noise.unexplained[k]:
             signs.append(f"what is left of {state} lasts ({memory:.2f} from sample to sample)")
-    for state, period in zip(problem.states, found.noise.period * problem.step_s, strict=True):
-        if period:
-            signs.append(f"what is left of {state} holds a line of period {period:.3g} s")
-    signs += [
-        f"what is left of {state} follows the states"
-        for state in compress(problem.states, found.noise.follows)
-    ]
+        if found.noise.patterned[k]:
+            signs.append(f"what is left of {state} holds a line or follows the states")
     signs += [
         f"{s} does not follow its own equation" for s in compress(problem.states, found.astray)
     ]

@@ -19,6 +19,7 @@ from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 from ep2sindy.estimation.supports import PenalisedFit, best_support, inverse_of, penalise
 
 PAYS = 1.0  # least fall of squares plus prices, beyond the delays' own price
+SURE = 6.0  # standard errors of every delay: true ones of a sample show ten and more
 MAX_SAMPLES = 10.0  # largest delay that is believed: more is no small clock error
 
 
@@ -103,11 +104,16 @@ def suspect_delays(
         return None
     best = fit_delays(problem, around, late, support, prices, max_terms=max_terms)[0]
     gain = penalise(around.at_rest, support, prices).score - best.score
-    if gain < log(problem.n_samples) + PAYS:
+    if gain < delay_price(problem) + PAYS:
         return None
     delays = _those_that_show(problem, around, best.support, late)
-    gain -= np.count_nonzero(delays) * log(problem.n_samples)
+    gain -= np.count_nonzero(delays) * delay_price(problem)
     return delays if gain > PAYS and 0.0 < np.abs(delays).max() <= MAX_SAMPLES else None
+
+
+def delay_price(problem: EstimationProblem) -> float:
+    """Price of a delay: that of a coefficient, chosen among as many as there are channels."""
+    return log(problem.n_samples) + 2.0 * log(problem.measured.sum())
 
 
 def fit_delays(
@@ -118,13 +124,13 @@ def fit_delays(
     prices: Float[np.ndarray, " free"],
     *,
     max_terms: int,
-) -> tuple[PenalisedFit, Float[np.ndarray, " d"]]:
-    """The best terms if some states are delayed, and the delays, in mean steps."""
+) -> tuple[PenalisedFit, Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """The best terms if some states are delayed, the delays, in mean steps, and their errors."""
     own = around.of(late)
     best = best_support(problem, own.freed, prices, support, max_terms=max_terms)
-    delays = np.zeros(len(late))
-    delays[late] = own.delays(best.support)[0]
-    return best, delays
+    delays, errors = np.zeros((2, len(late)))
+    delays[late], errors[late] = own.delays(best.support)
+    return best, delays, errors
 
 
 def _those_that_show(
@@ -146,7 +152,7 @@ def _those_that_show(
         shown = np.where(late, 0.0, np.inf)  # zero if rounding leaves no error to compare with
         tells = errors > 0.0
         shown[np.flatnonzero(late)[tells]] = np.square(delays[late][tells] / errors[tells])
-        if shown.min() > log(problem.n_samples):
+        if shown.min() > SURE**2:
             return delays
         late = late & (np.arange(len(late)) != int(np.argmin(shown)))
     return np.zeros(len(late))

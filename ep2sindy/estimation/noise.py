@@ -53,20 +53,18 @@ class Noise:
     (samples, d), relative size of the noise at each sample in units of std: one, or growing with
     the state. memory: (d,), correlation from one sample to the next if the noise is correlated in
     time, else 0. unexplained: (d,), the same correlation if the samples themselves do not show such
-    noise: then it is the model's error. period: (d,), in mean steps, of a clean line in the
-    residuals, 0 if they hold none; follows: (d,), True if the residuals are a function of the
-    states. Both are the model's error too. growth: (d,), share of the variance that grows with the
-    state. kurtosis: (d,), 3 for normal noise, NaN if all samples are limits. outliers: (d,), number
-    of samples off by more than five standard deviations, estimated from the median. deviance: -2
-    log likelihood of the residuals.
+    noise: then it is the model's error. patterned: (d,), True if the residuals hold a clean line or
+    are a function of the states, which is the model's error too. growth: (d,), share of the
+    variance that grows with the state. kurtosis: (d,), 3 for normal noise, NaN if all samples are
+    limits. outliers: (d,), number of samples off by more than five standard deviations, estimated
+    from the median. deviance: -2 log likelihood of the residuals.
     """
 
     std: Float[np.ndarray, " d"]
     shape: tuple[np.ndarray, ...]
     memory: Float[np.ndarray, " d"]
     unexplained: Float[np.ndarray, " d"]
-    period: Float[np.ndarray, " d"]
-    follows: Bool[np.ndarray, " d"]
+    patterned: Bool[np.ndarray, " d"]
     growth: Float[np.ndarray, " d"]
     kurtosis: Float[np.ndarray, " d"]
     outliers: Int[np.ndarray, " d"]
@@ -75,7 +73,7 @@ class Noise:
     @property
     def is_error(self) -> Bool[np.ndarray, " d"]:
         """Mask of the states whose residuals are the model's error rather than noise."""
-        return (self.unexplained > 0.0) | (self.period > 0.0) | self.follows
+        return (self.unexplained > 0.0) | self.patterned
 
     @property
     def white(self) -> tuple[np.ndarray, ...]:
@@ -120,10 +118,9 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
     unit = [e / s for e, s in zip(left, shape, strict=True)]
     memory = _memory(unit)
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
-    new = _whiten(unit, memory)
-    period = np.where(std > FLOOR, _find_lines(problem, new), 0.0)
-    follows = _follow_states(problem, fit, new) & (std > FLOOR)
-    believed = shows & _last_as_noise(problem, fit, unit, std, memory) & (period == 0.0) & ~follows
+    new = [np.concatenate([e[:1], e[1:] - memory * e[:-1]]) for e in unit]
+    patterned = (_hold_line(problem, new) | _follow_states(problem, fit, new)) & (std > FLOOR)
+    believed = shows & _last_as_noise(problem, fit, unit, std, memory) & ~patterned
     std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std[~hidden]).mean()
@@ -136,8 +133,7 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
         shape=shape,
         memory=lasting,
         unexplained=np.where(shows & ~believed, memory, 0.0),
-        period=period,
-        follows=follows,
+        patterned=patterned,
         growth=growth,
         kurtosis=kurtosis,
         outliers=outliers,
@@ -310,37 +306,23 @@ def _forgets(
     return faster
 
 
-def _whiten(
-    left: Sequence[Float[np.ndarray, "samples d"]], memory: Float[np.ndarray, " d"]
-) -> list[Float[np.ndarray, "samples d"]]:
-    """Residuals less what AR(1) noise of this memory keeps of those before."""
-    return [np.concatenate([e[:1], e[1:] - memory * e[:-1]]) for e in left]
+def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray]) -> Bool[np.ndarray, " d"]:
+    """True if whitened residuals hold a cleaner line than noise: the model ignores an oscillation.
 
-
-def _find_lines(
-    problem: EstimationProblem, new: Sequence[Float[np.ndarray, "samples d"]]
-) -> Float[np.ndarray, " d"]:
-    """Period, in mean steps, of the cleanest line in the residuals; 0 if noise may hold such one.
-
-    A model that ignores an oscillation leaves one. Of white residuals the m ordinates of a
-    periodogram are alike: the largest has more than a share g of their sum with a probability of at
-    most m (1 - g)^(m - 1).
+    Of white residuals the m ordinates of a periodogram are alike: the largest has more than a share
+    g of their sum with a probability of at most m (1 - g)^(m - 1).
     Source: Fisher 1929, doi:10.1098/rspa.1929.0151.
     """
-    d = len(problem.states)
-    period, least = np.zeros(d), np.full(d, np.log(CHANCE / len(new)))
+    held = np.zeros(len(problem.states), dtype=np.bool_)
     for record, each in zip(problem.records, new, strict=True):
         # Samples at unequal steps go to the nearest of equal ones.
         place = np.rint(record.times - record.times[0]).astype(np.int64)
-        placed = np.zeros((place[-1] + 1, d))
+        placed = np.zeros((place[-1] + 1, each.shape[1]))
         np.add.at(placed, place, each)
         power = np.square(np.abs(np.fft.rfft(placed, axis=0)[1 : (len(placed) + 1) // 2]))
         share = power.max(axis=0, initial=0.0) / np.maximum(power.sum(axis=0), TINY)
-        m = len(power)
-        chance = np.log(m) + (m - 1) * np.log1p(-np.minimum(share, 1.0 - 1e-12))
-        period = np.where(chance < least, len(placed) / (1 + power.argmax(axis=0)), period)
-        least = np.minimum(chance, least)
-    return period
+        held |= len(power) * (1.0 - share) ** (len(power) - 1) < CHANCE / len(new)
+    return held
 
 
 def _follow_states(
@@ -352,21 +334,17 @@ def _follow_states(
     that random residuals share with the products are expected from the squares of each sample
     alone, so neither outliers nor noise that grows with the state pass for such a function.
     """
-    states = [
-        np.concatenate([p, r.inputs], 1) for p, r in zip(fit.paths, problem.records, strict=True)
-    ]
+    inputs = np.concatenate([record.inputs for record in problem.records])
     degree = int(problem.candidates.library.degrees.max()) + MORE_DEGREES
-    basis = np.linalg.qr(powers_of(np.concatenate(states), degree))[0]
-    joined = np.concatenate(new)
+    powers = powers_of(np.column_stack([np.concatenate(fit.paths), inputs]), degree)
+    basis, joined = np.linalg.qr(powers)[0], np.concatenate(new)
     shared = np.square(basis.T @ joined).sum(axis=0)
     expected = np.square(basis).sum(axis=1) @ np.square(joined)
     return shared - expected > FOLLOWS * np.sqrt(2.0 / basis.shape[1]) * expected
 
 
-def powers_of(
-    states: Float[np.ndarray, "samples d"], degree: int
-) -> Float[np.ndarray, "samples _"]:
-    """Products of standardised states up to a degree, the lowest first, at most MAX_POWERS."""
+def powers_of(states: Float[np.ndarray, "samples d"], degree: int) -> np.ndarray:
+    """Products of standardised states up to a degree, lowest first, at most MAX_POWERS columns."""
     scaled = (states - states.mean(axis=0)) / zero_to_one(states.std(axis=0))
     most = min(MAX_POWERS, len(states) // 5)
     columns = [np.ones(len(states))]

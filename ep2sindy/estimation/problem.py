@@ -15,7 +15,7 @@ from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import Watch
 from ep2sindy.estimation.flow import Flow, RightHandSides, Steps
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Relation, constraint
 
 MIN_SAMPLES = 5  # of a record: a smoother accepts no fewer
@@ -158,7 +158,7 @@ class EstimationProblem:
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
     measured: (d,), False for hidden states. watch: told of every step of a fit. whole: the
     problem with all terms, if this one has only those of a working set; places: (terms,), their
-    positions in its library.
+    positions in its library. widen: makes the problem with all products of one degree more.
     """
 
     library: Library
@@ -179,6 +179,7 @@ class EstimationProblem:
     inputs: tuple[str, ...] = ()
     watch: Watch = field(default_factory=Watch)
     whole: EstimationProblem | None = None
+    widen: Callable[[], EstimationProblem] | None = None
 
     def restricted(self, kept: Bool[np.ndarray, " free"]) -> EstimationProblem:
         """The same records with some of the coefficients; the others are zero."""
@@ -403,7 +404,18 @@ def scale_problem(
         inputs=tuple(inputs),
         watch=watch or Watch(),
     )
-    return problem.of(runs)
+
+    def widen() -> EstimationProblem:
+        wider = _with_degree_more(library)
+        return scale_problem(
+            runs, wider, relations, terms, measured=measured, exclude=exclude, watch=watch
+        )
+
+    return replace(problem.of(runs), widen=widen)
+
+
+def _with_degree_more(library: Library) -> Library:
+    return library + polynomial(library.variables, degree=int(library.degrees.max()) + 1)
 
 
 def _asked(

@@ -190,8 +190,7 @@ def solution_under_pushes(problem: EstimationProblem, pushed: PushedFit) -> Solu
         std=pushed.errors.samples,
         memory=zero,
         unexplained=zero,
-        period=zero,
-        follows=zero > 0.0,
+        patterned=zero > 0.0,
         deviance=pushed.errors.deviance,
     )
     annealed = AnnealedFit(pushed.fit, pushed.level, pushed.score)
