@@ -13,7 +13,10 @@ from shutil import which
 
 import numpy as np
 import pytest
+import yaml
+from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy as ep
 from ep2sindy._stubs import dotted_names
@@ -81,6 +84,70 @@ def test_a_command_is_one_that_can_be_given(page: Path) -> None:
             except Exception as error:
                 error.add_note(f"{page.name}: {' '.join(words)}")
                 raise
+
+
+INLINE = re.compile(r"(?<!`)`(ep2sindy \+exp=[^`]*|ep2sindy -m [^`]*)`(?!`)")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_config_and_a_command_in_the_text_compose(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Configs lie where the page says, in a folder that also holds the page's own modules."""
+    monkeypatch.chdir(tmp_path)
+    text = page.read_text("utf-8")
+    configs = [b.text for b in blocks(page) if b.language == "yaml"]
+    names = [check_config(config, text) for config in configs]
+    own = re.compile(r"thruster=mine|\+exp=(my_\w+)")
+    for command in set(INLINE.findall(FENCE.sub("", text))):
+        if (found := own.search(command)) is None:
+            check_command(shlex.split(command.partition(" | ")[0].removesuffix(" --cfg job")))
+        else:
+            assert found[1] in names, command
+
+
+def check_config(config: str, page: str) -> str:
+    """Compose and build what a block of YAML holds, and return the name of its experiment."""
+    header, _, rest = config.partition("\n")
+    package = header.removeprefix("# @package ")
+    if package == "_global_":
+        name = re.search(r"^experiment: (\w+)$", rest, re.M)[1]
+        write_modules(page)
+        own = composed_with("exp", name, config, f"+exp={name}", *DATA.get(name, ()))
+        study_of(study_class(own.study), own)
+        return name
+    if package == header:  # part of the experiment of its page
+        (group,) = yaml.safe_load(config)
+        changed = OmegaConf.merge(composed("+exp=predict"), {group: None}, yaml.safe_load(config))
+        study_of(study_class(changed.study), changed)
+        return group
+    name = package.rpartition(".")[2]
+    Path("B.csv").write_text("z_mm,B_G\n0,50\n25,150\n50,40\n")
+    own = composed_with(name, "mine", config, "+exp=breathing", f"{name}=mine")
+    study_of(study_class(own.study), own)
+    return "mine"
+
+
+DATA = {"my_spread": ("data=recognised", "data.path=run.csv", "trajectory.states=[x,y]")}
+
+
+def composed_with(group: str, name: str, config: str, *overrides: str) -> DictConfig:
+    """As `composed`, with one more config below the current folder."""
+    folder = Path("conf") / group
+    folder.mkdir(parents=True)
+    (folder / f"{name}.yaml").write_text(config)
+    found = f"hydra.searchpath=[file://{folder.parent.resolve()}]"
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=[found, *overrides])
+
+
+def write_modules(page: str) -> None:
+    """The modules of which a page says that they lie in a folder of one's own."""
+    for module, code in re.findall(
+        r"`(my_\w+/\w+\.py)`.*?^```python\n(.*?)^```", page, re.M | re.S
+    ):
+        Path(module).parent.mkdir(exist_ok=True)
+        Path(module).write_text(code)
 
 
 def check_command(words: list[str]) -> None:

@@ -9,8 +9,9 @@ from benchmarks.known_systems import noisy
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.comparison import FreeRunBounds, Verdict
-from ep2sindy.model.free_run import free_run, samples_in
+from ep2sindy.model.free_run import FreeCycle, free_run, samples_in
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.studies.views import found_model, worst_run
 from ep2sindy.systems.systems import lorenz
 
 LIBRARY = polynomial(["x", "y"], degree=3)
@@ -174,3 +175,38 @@ def test_a_density_below_zero_is_a_verdict_of_its_own(radius, unit, verdict) -> 
     assert found.verdict is verdict
     if verdict is Verdict.NEGATIVE:
         assert found.text == "turns negative"
+
+
+def test_over_samples_that_it_was_fitted_to_no_model_lives() -> None:
+    run = free_run(hopf(), record())
+    assert run.verdict is Verdict.LIVES
+    for verdict in Verdict:
+        judged = replace(run, verdict=verdict)
+        assert judged.words(seen=False) == judged.text
+        assert not {"lives", "alike", "follows"} & {judged.words(seen=True)}
+    assert run.words(seen=True) == "follows the record it was fitted to"
+    headline = found_model("Found", run, file="a", picture="", where="the record", seen=True).title
+    assert headline == "Found: a model that follows the record it was fitted to"
+
+
+def test_a_model_that_does_not_explain_the_data_is_not_like_them() -> None:
+    run = replace(free_run(hopf(), record()), verdict=Verdict.ALIKE)
+    for seen in (False, True):
+        told = found_model(
+            "Found", run, file="a", picture="", where="the record", seen=seen, misfit="no law"
+        )
+        assert told.title == "Found: a model that does not explain the data"
+        assert "alike" not in run.words(seen=seen, misfit="no law")
+
+
+def test_of_several_records_the_worst_run_counts() -> None:
+    run = free_run(hopf(), record())
+    apart = replace(run, verdict=Verdict.DIVERGES)
+    assert worst_run([run, apart, run]) is apart
+
+
+def test_a_neutral_cycle_is_told_and_an_attracting_one_is_not() -> None:
+    neutral, attracting = hopf(growth=0.0), hopf()
+    cautions = [FreeCycle.of(free_run(each, record())).caution for each in (neutral, attracting)]
+    assert "neither attracts nor repels" in cautions[0]
+    assert not cautions[1]

@@ -1,3 +1,5 @@
+from itertools import combinations
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from ep2sindy.studies.pysindy_variants import (
     PySINDySmoothing,
     PySINDySsr,
     PySINDyStlsq,
+    PySINDySubsets,
     PySINDyVariant,
     PySINDyWeakForm,
     SINDyRows,
@@ -24,6 +27,8 @@ METHODS = [
     PySINDySsr(),
     pytest.param(PySINDyEnsemble(), marks=pytest.mark.slow),
     PySINDyWeakForm(),
+    PySINDySubsets(PySINDySmoothing()),
+    PySINDySubsets(PySINDyWeakForm()),
 ]
 
 
@@ -93,6 +98,19 @@ def test_r2_is_that_of_a_least_squares_refit() -> None:
         assert r2 == pytest.approx(1.0 - residual.var() / rows.x_dot[:, 0].var(), abs=1e-3)
         total = np.square(rows.x_dot[:, 0] - rows.x_dot[:, 0].mean()).sum()
         assert r2 == pytest.approx(1.0 - residual @ residual / total, abs=1e-12)
+
+
+def test_subsets_are_the_best_of_every_size_on_pysindys_rows() -> None:
+    system = lotka_volterra()
+    rng = np.random.default_rng(2)
+    run, library = system.trajectory(noise=0.2, rng=rng), system.model.library
+    found = PySINDySubsets(PySINDySmoothing()).candidates([run], library, rng=rng)
+    rows = PySINDySmoothing().rows([run], library)
+    every = [c for n in range(1, 7) for c in combinations(range(len(library)), n)]
+    masks = np.array([[[j in c for j in range(len(library))]] * 2 for c in every])
+    tried = rows.candidates(masks, library, run.state_names)
+    for state in run.state_names:
+        assert best_of_each_size(found[state]) == best_of_each_size(tried[state])
 
 
 def test_the_triangle_keeps_the_gram_matrix() -> None:

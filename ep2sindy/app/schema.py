@@ -217,7 +217,10 @@ def _dataclass(kind: type, node: Any, place: str) -> Any:
         came = sorted(given) if given is not None else contents(node)
         near = "".join(near_words(each, names) for each in sorted((given or set()) - set(names)))
         if len(needed) == len(names):
-            raise ValueError(f"{place} must have {joined(needed)}: {came} came{near}")
+            how = f"must have {joined(needed)}"
+            if given is not None and given >= set(needed):  # nothing is lacking
+                how = f"may have {joined(needed)} alone"
+            raise ValueError(f"{place} {how}: {came} came{near}")
         raise ValueError(
             f"{place} may have {sorted(names)} and needs {joined(needed) or 'none'}: {came} came"
             f"{near}"

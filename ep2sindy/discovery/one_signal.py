@@ -373,9 +373,10 @@ class SignalDiscovery:
         where = (
             "its end, which was not fitted" if self.skill else "all of it, too short to hold out"
         )
+        run, misfit = self.free.run, self.discovery.misfit
         head = [
             f"{self.signal.name}: {self.best.chosen.embedding.says} ({self.best.chosen.reason})",
-            f"run freely over {where}: {self.free.run.text}",
+            f"run freely over {where}: {run.words(seen=not self.skill, misfit=misfit)}",
         ]
         tail = sentences(self.discovery.note) if self.discovery.note else []
         n_lines = N_LINES - len(head) - len(tail)

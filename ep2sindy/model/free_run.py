@@ -16,7 +16,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Verdict, record_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
-from ep2sindy.model.stability import LimitCycle, limit_cycle, share_reaching
+from ep2sindy.model.stability import CycleStability, LimitCycle, limit_cycle, share_reaching
 from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.attractor import phase_along
@@ -66,6 +66,18 @@ class FreeRun:
         lasted = self.rollout.lasted_text if self.rollout.diverged else ""
         return f"{self.verdict}{of} after {lasted}" if lasted else str(self.verdict)
 
+    def words(self, *, seen: bool, misfit: str = "") -> str:
+        """The verdict in words. Over samples that a model was fitted to (`seen`) none lives.
+
+        misfit: why the model does not explain the data, which then are not like it; may be empty.
+        """
+        if self.verdict is Verdict.ALIKE and misfit:
+            return "does not explain the data"
+        does = {Verdict.LIVES: "follows", Verdict.FOLLOWS: "follows"}
+        does |= {Verdict.ALIKE: "keeps the statistics of"}
+        is_kept = seen and self.verdict in does
+        return f"{does[self.verdict]} the record it was fitted to" if is_kept else self.text
+
     def plot(self) -> Figure:
         """Figure of the model over the record: its first periods and its last, a row per state."""
         return draw("free_run_plot", self)
@@ -95,6 +107,16 @@ class FreeCycle:
         if self.cycle is None:
             return float("nan")
         return float(np.abs(self.cycle.multipliers[1:]).max(initial=0.0))
+
+    @property
+    def caution(self) -> str:
+        """A sentence if the cycle is neutral; else empty."""
+        if self.cycle is None or self.cycle.stability is not CycleStability.NEUTRAL:
+            return ""
+        return (
+            "the cycle is neutral: it neither attracts nor repels, and every start has a cycle of "
+            "its own, so the model says nothing of what sets the amplitude"
+        )
 
     @property
     def text(self) -> str:

@@ -148,7 +148,7 @@ class Confirmed:
 
     def text(self, n_living: int, n_systems: int) -> str:
         """How the system was confirmed, in words."""
-        how = str(self.run.verdict)
+        how = self.run.words(seen=not n_living)
         if self.run.verdict is Verdict.LIVES and not self.share:
             how = f"{how}, on a cycle that {'repels' if self.repels else 'does not attract'}"
         elif self.share and not self.run.model.inputs:

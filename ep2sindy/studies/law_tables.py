@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +16,8 @@ from ep2sindy.operating.choice import Branch, StructureCase, StructureTrial
 from ep2sindy.operating.constraint import Known, law_constraint
 from ep2sindy.operating.fit import LeaveOneOut, error_statistics
 from ep2sindy.operating.map import Fate, MapPoint
+from ep2sindy.operating.point_fits import Case
+from ep2sindy.operating.quantities import PointResult
 from ep2sindy.operating.quantity_law import ControlLaw
 from ep2sindy.operating.records import OperatingRecord, point_label
 from ep2sindy.report.document import Equation, places
@@ -338,6 +340,18 @@ def left_out_text(branch: Branch) -> str:
     )
 
 
+def best_fit(fits: Iterable[str], results: Sequence[PointResult], laws: Laws) -> str:
+    """The fit whose laws miss left-out points least, of those done at the most points."""
+
+    def rank(fit: str) -> tuple[int, float]:
+        n_done = sum(result.usable(fit) for result in results)
+        errors = [law.search_error for law in laws.get(fit, {}).values()]
+        mean = float(np.mean(errors)) if errors else np.inf
+        return -n_done, mean if np.isfinite(mean) else np.inf
+
+    return min(fits, key=rank)
+
+
 def control_laws_table(laws: Laws) -> pd.DataFrame:
     """One row per control law, with its errors at points left out."""
     rows = [
@@ -353,6 +367,17 @@ def control_laws_table(laws: Laws) -> pd.DataFrame:
         for name, law in by_quantity.items()
     ]
     return pd.DataFrame(rows, columns=["fit", "quantity", "law", "r2", "loo_error", "search_error"])
+
+
+def law_errors(laws: Laws, fits: Mapping[str, Case]) -> dict[str, float]:
+    """Prediction error of the laws by fit and quantity; NaN for a law that was not found."""
+    errors = {}
+    for fit, case in fits.items():
+        for name in case.quantities:
+            law = laws.get(fit, {}).get(name)
+            errors[f"law/{fit}/{name}/loo_error"] = law.loo_error if law else float("nan")
+            errors[f"law/{fit}/{name}/search_error"] = law.search_error if law else float("nan")
+    return errors
 
 
 def control_laws_summary(laws: Laws) -> dict[str, Any]:

@@ -61,6 +61,7 @@ from ep2sindy.studies.views import (
     rollout_tables,
     run_figures,
     trajectories,
+    worst_run,
 )
 from ep2sindy.trust.user_code import load_user_module
 
@@ -403,7 +404,7 @@ class Outcome:
         runs = [
             (name, file, each)
             for name, result in self.results.items()
-            for file, each in zip(self.files, [result.selected, *result.elsewhere], strict=True)
+            for file, each in zip(self.files, result.runs, strict=True)
         ]
         return ResultTable(runs, RECORDS)
 
@@ -422,42 +423,42 @@ class Outcome:
             drawn |= living.figures(name)
         for name, result in self.results.items():
             drawn |= result.balance.figures(name) if result.balance is not None else {}
-        for name, skill in self.skills.items():
-            drawn[f"forecast_{name}"] = forecast_picture(self.data, skill)
-        return drawn
+        skills = self.skills.items()
+        return drawn | {f"forecast_{name}": forecast_picture(self.data, s) for name, s in skills}
 
     def in_short(self) -> Result:
         """The living model, or the best of those that were run; and what its rows leave over."""
-        runs = {name: each.living.run for name, each in self.results.items() if each.living}
-        runs = runs or self.selected
+        runs = {name: each.run for name, each in self.living.items()}
+        runs = runs or {name: worst_run(each.runs) for name, each in self.results.items()}
         best = best_run(runs)
-        is_living = best in self.living
-        drawn = self.figures()
-        shown = [f"free_run_{best}", "trajectories", *drawn]
+        is_living = bool(self.living)
+        records = f"the worst of {len(self.files)} records" if len(self.files) > 1 else "the record"
+        shown = [f"free_run_{best}", "trajectories", *(drawn := self.figures())]
         return found_model(
             f"Found with the library {best}",
             runs[best],
             file=f"{best}_living" if is_living else best,
             picture=next((name for name in shown if name in drawn), ""),
-            more=[text] if (text := self._left_over(best)) else [],
-            where="held-out time" if is_living else "the record",
+            more=self._cautions(best) if is_living else [],
+            where="held-out time" if is_living else records,
+            seen=not is_living,
+            misfit="" if is_living else self.results[best].discovery.misfit,
         )
 
-    def _left_over(self, best: str) -> Text | None:
-        """What the best equations, or those fitted to derivatives, leave beyond noise."""
+    def _cautions(self, best: str) -> list[Block]:
+        """A neutral cycle of the living model, and what fits of derivatives leave beyond noise."""
         tests = [result.discovery.noise_test for result in self.results.values()]
-        if best not in self.living:
-            misfit = self.results[best].discovery.misfit
-            return Text(misfit, warning=True) if misfit else None
+        found: list[Block] = [Text(c, warning=True) for c in [self.living[best].free.caution] if c]
         if not any(test.misfit for test in tests):
-            return None
+            return found
         left = [each for test in tests for each in test.left.values() if not each.leaves_noise]
         ratios = sorted(each.chi_squared for each in left)
         size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {NOISE}" if left else "more than noise"
-        return Text(
+        text = (
             f"The equations fitted to derivatives leave {size}: a state or a term is missing "
             "there, so they have no intervals; the free run above is what judges."
         )
+        return [*found, Text(text)]
 
     def sections(self) -> list[Section]:
         found = [self._of_all()]
@@ -472,13 +473,12 @@ class Outcome:
                 where = "that it has seen" if result.living is None else "held out"
                 title = f"{name}: forecasts over time {where}"
                 found.append(forecast_section(result.skill, f"forecast_{name}", title=title))
-        note = FROM_DERIVATIVES if any(r.living for r in self.results.values()) else ""
+        note = FROM_DERIVATIVES if self.living else ""
         rows = self.comparison.screen("model", by_state=True)
-        compared = Table(rows, title=INTEGRATED, note=note)
-        found.append(Section("Run freely from the first sample", [compared, *pictures(FIGURES)]))
+        compared = [Table(rows, title=INTEGRATED, note=note), *pictures(FIGURES)]
+        found.append(Section("Run freely from the first sample", compared))
         if len(self.files) > 1:
-            records = Table(self.records.screen(), title=EVERY_RECORD)
-            found.append(Section("Every record", [records]))
+            found.append(Section("Every record", [Table(self.records.screen(), EVERY_RECORD)]))
         return found
 
     def _of_all(self) -> Section:
@@ -487,7 +487,7 @@ class Outcome:
         for name, result in self.results.items():
             living, clock = result.living, self.data.clock
             run = result.selected if living is None else living.run
-            text = f"{name}: equations {result.how}; run freely: {run.text}"
+            text = f"{name}: equations {result.how}; run freely: {run.words(seen=living is None)}"
             blocks.append(Text(text, page_only=True))
             for state in run.model.states:
                 blocks.append(display_equation(run.model, state, clock, on_screen=False))

@@ -80,6 +80,11 @@ class LibraryResult:
     skill: ForecastSkill | None = None
 
     @property
+    def runs(self) -> list[FreeRun]:
+        """Free runs of the selected model over every record."""
+        return [self.selected, *self.elsewhere]
+
+    @property
     def label(self) -> str:
         """The name of the selection score."""
         return self.method.selection.label
@@ -451,7 +456,8 @@ def frequencies(data: Trajectory) -> Metrics[FreeRun]:
         Metric("f_data", lambda run: f_data, View.SCREEN, "frequency of the data", text),
         Metric("f_model", lambda run: run.frequency_Hz, View.SCREEN, "of the model", text),
         Metric("nrmse", lambda run: run.nrmse, View.SHOWN, format="{:.3f}"),
-        Metric("verdict", lambda run: run.text, View.SHOWN),
+        Metric("verdict", lambda run: run.text, View.CSV),
+        Metric("verdict", lambda run: run.words(seen=True), View.SCREEN),
     ]
 
 
@@ -459,5 +465,6 @@ RECORDS: Metrics[tuple[str, str, FreeRun]] = [
     Metric("model", lambda row: row[0], View.SHOWN),
     Metric("record", lambda row: row[1], View.SHOWN),
     Metric("nrmse", lambda row: row[2].nrmse, View.SHOWN, format="{:.3f}"),
-    Metric("verdict", lambda row: row[2].text, View.SHOWN),
+    Metric("verdict", lambda row: row[2].text, View.CSV),
+    Metric("verdict", lambda row: row[2].words(seen=True), View.SCREEN),
 ]

@@ -40,13 +40,16 @@ from ep2sindy.report.document import (
     Text,
     pictures,
 )
+from ep2sindy.report.results import percent
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.law_tables import (
     Laws,
+    best_fit,
     control_laws_summary,
     control_laws_table,
+    law_errors,
     published_table,
 )
 from ep2sindy.studies.points import QUIET, GivenPoints, given_points, open_points
@@ -298,13 +301,15 @@ class Outcome:
     def _trends(self, case: str) -> Captioned:
         """Quantities of one case: of least squares, refined, and published."""
         kinds = {case: "least squares", case + REFINED: "refined"}
+        best = best_fit(kinds, self.results, self.laws)
         ours = self._tables["quantities"].query("usable and fit in @kinds")
+        ours = ours.sort_values("fit", key=lambda fit: fit != best, kind="stable")
         theirs = rows_at(self.published, {"fit": case})
         theirs = theirs.assign(low=theirs["value"], high=theirs["value"], kind=PUBLISHED)
         table = pd.concat([ours.assign(kind=ours["fit"].map(kinds)), theirs])
-        laws = self.laws.get(case, {})
+        laws = self.laws.get(best, {})
         published = "; open what the thesis found in its data" if len(theirs) else ""
-        lines = "; lines are the control laws of least squares" if laws else ""
+        lines = f"; lines are the control laws of the fit {_spoken(best)}" if laws else ""
         draw = partial(trends_figure, table, laws, trends=self.along, labels=self.labels)
         return Captioned(draw, f"{CAPTION.format(_spoken(case))}{published}{lines}.")
 
@@ -315,20 +320,22 @@ class Outcome:
         return {name: each.unit(self.study.library, units) for name, each in quantities.items()}
 
     def in_short(self) -> Result:
-        """How many points oscillate, and the laws of their coefficients."""
+        """How many points oscillate, and the laws of the fit that predicts left-out points best."""
         n_fitted = sum(bool(result.fits) for result in self.results)
+        best = best_fit(self.study.fits, self.results, self.laws)
+        laws = {best: self.laws[best]} if best in self.laws else {}
         shown = [
             replace(
                 row["law"],
-                unit=self._units(row["fit"])[row["quantity"]],
-                mark=f" ({_spoken(row['fit'])})",
+                unit=self._units(best)[row["quantity"]],
+                mark=f" ({percent(2)(row['search_error'])} off where left out)",
                 on_screen=True,
             )
-            for row in control_laws_table(self.laws).to_dict("records")
-            if not row["fit"].endswith(REFINED)
+            for row in control_laws_table(laws).to_dict("records")
         ]
+        end = f"that oscillate, by the fit {_spoken(best)}" if shown else "that oscillate"
         return Result(
-            f"Found: {len(shown) or 'no'} laws over {n_fitted} operating points that oscillate",
+            f"Found: {len(shown) or 'no'} laws over {n_fitted} operating points {end}",
             shown[:MOST_LAWS],
             load='pandas.read_csv("{}/tables/laws.csv")',
             picture=next(iter(self.figures()), ""),
@@ -579,17 +586,6 @@ def shared_summary(joint: SharedResult | None) -> dict[str, Any] | None:
         "tied": joint.tied and joint.tied.law.numbers,
         "why_not_tied": joint.why_not_tied or None,
     }
-
-
-def law_errors(laws: Laws, fits: Mapping[str, Case]) -> dict[str, float]:
-    """Prediction error of the laws by fit and quantity; NaN for a law that was not found."""
-    errors = {}
-    for fit, case in fits.items():
-        for name in case.quantities:
-            law = laws.get(fit, {}).get(name)
-            errors[f"law/{fit}/{name}/loo_error"] = law.loo_error if law else float("nan")
-            errors[f"law/{fit}/{name}/search_error"] = law.search_error if law else float("nan")
-    return errors
 
 
 def live(result: PointResult) -> dict[str, float]:

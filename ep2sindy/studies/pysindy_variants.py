@@ -22,9 +22,11 @@ import pysindy
 from jaxtyping import Bool, Float
 from sklearn.exceptions import ConvergenceWarning
 
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Finding
 from ep2sindy.library.library import Library, polynomial
+from ep2sindy.regression.searches import BestSubset, Unproven
 
 TINY = float(np.finfo(np.float64).tiny)
 
@@ -87,7 +89,9 @@ class PySINDySmoothing:
     window: int = 25
     order: int = 3
 
-    def rows(self, runs: Sequence[Trajectory], library: Library) -> SINDyRows:
+    def rows(
+        self, runs: Sequence[Trajectory], library: Library, rng: np.random.Generator | None = None
+    ) -> SINDyRows:
         theta, x_dot = [], []
         for run in runs:
             differentiation = pysindy.SmoothedFiniteDifference(
@@ -181,13 +185,18 @@ class PySINDyWeakForm:
     def candidates(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> Candidates:
+        rows = self.rows(runs, library, rng)
+        masks = threshold_masks(rows, rows.thresholds(self.n_thresholds, self.smallest))
+        return rows.candidates(masks, library, runs[0].state_names)
+
+    def rows(
+        self, runs: Sequence[Trajectory], library: Library, rng: np.random.Generator
+    ) -> SINDyRows:
         parts = [self._rows(run, library, rng) for run in runs]
-        rows = SINDyRows(
+        return SINDyRows(
             np.concatenate([part.theta for part in parts]),
             np.concatenate([part.x_dot for part in parts]),
         )
-        masks = threshold_masks(rows, rows.thresholds(self.n_thresholds, self.smallest))
-        return rows.candidates(masks, library, runs[0].state_names)
 
     def _rows(self, run: Trajectory, library: Library, rng: np.random.Generator) -> SINDyRows:
         # The bias must come from the inner library: the outer one's is not integrated against phi.
@@ -206,6 +215,32 @@ class PySINDyWeakForm:
 
 
 @dataclass(frozen=True)
+class PySINDySubsets:
+    """The subsets of least residual on PySINDy's rows, one of each size up to `max_terms`.
+
+    They are what its mixed-integer search MIOSR solves for, which needs a solver with a licence;
+    the search is ours. A large library, whose proof would take too long, is searched by exchanges.
+    """
+
+    form: PySINDySmoothing | PySINDyWeakForm
+    max_terms: int = 10
+
+    def candidates(
+        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
+    ) -> Candidates:
+        rows = self.form.rows(runs, library, rng)
+        theta, x_dot = rows.triangle
+        theta = theta / zero_to_one(np.linalg.norm(theta, axis=0))
+        search, gram = BestSubset(self.max_terms), theta.T @ theta
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Unproven)  # an oracle needs candidates, no proof
+            found = [search.supports(gram, theta.T @ y, float(y @ y)) for y in x_dot.T]
+        # Every equation is offered those of the others, too, and keeps the best of each size.
+        masks = np.repeat(np.concatenate(found)[:, None], x_dot.shape[1], axis=1)
+        return rows.candidates(masks, library, runs[0].state_names)
+
+
+@dataclass(frozen=True)
 class PySINDyVariant:
     """A method of PySINDy in our benchmark; it gives candidates, and the user would have to choose.
 
@@ -214,7 +249,7 @@ class PySINDyVariant:
     sample; if False, nothing is selected.
     """
 
-    method: PySINDyStlsq | PySINDySsr | PySINDyEnsemble | PySINDyWeakForm
+    method: PySINDyStlsq | PySINDySsr | PySINDyEnsemble | PySINDyWeakForm | PySINDySubsets
     aicc: bool = False
 
     def find(

@@ -123,6 +123,10 @@ class Outcome:
         return self.tested.skill is not None
 
     @property
+    def words(self) -> str:
+        return self.run.words(seen=not self.is_held_out, misfit=self.found.misfit)
+
+    @property
     def searched(self) -> list[str]:
         return self.chosen.embedded.searched
 
@@ -180,14 +184,16 @@ class Outcome:
 
     def in_short(self) -> Result:
         where = "held-out record" if self.is_held_out else "whole record, too short to hold out"
-        misfit = self.found.misfit
+        caution = self.tested.free.caution
         return found_model(
             f"Found from {self.tested.signal.name}",
             self.run,
             file="trace",
             picture="free_run",
-            more=[Text(misfit, warning=True)] if misfit else [],
+            more=[Text(caution, warning=True)] if caution else [],
             where=f"the {where}",
+            seen=not self.is_held_out,
+            misfit=self.found.misfit,
         )
 
     def sections(self) -> list[Section]:
@@ -300,7 +306,8 @@ class Outcome:
 
 COMPARED = View.JSON | View.HEADLINE
 FREE_RUN: Metrics[Outcome] = [
-    Metric("verdict", lambda o: o.run.text, View.JSON | View.SCREEN),
+    Metric("verdict", lambda o: o.run.text, View.JSON),
+    Metric("verdict", lambda o: o.words, View.SCREEN),
     Metric("note", lambda o: o.found.note, View.JSON),
     Metric("held_out", lambda o: o.is_held_out, View.JSON),
     Metric("frequency of the data", lambda o: o.data_frequency, View.SCREEN),

@@ -220,20 +220,35 @@ def best_run(runs: Mapping[str, FreeRun]) -> str:
     return min(runs, key=rank)
 
 
+def worst_run(runs: Sequence[FreeRun]) -> FreeRun:
+    """The first run of the worst verdict."""
+    return max(runs, key=lambda run: list(Verdict).index(run.verdict))
+
+
 def found_model(
-    found: str, run: FreeRun, *, file: str, picture: str, more: Sequence[Block] = (), where: str
+    found: str,
+    run: FreeRun,
+    *,
+    file: str,
+    picture: str,
+    more: Sequence[Block] = (),
+    where: str,
+    seen: bool = False,
+    misfit: str = "",
 ) -> Result:
     """A model as what was found: its equations, and how it runs.
 
     found: how it was found, such as `Found from I_d`. file: its name among the run's models. where:
-    what it was run over, in words, such as `held-out time`.
+    what it was run over, in words, such as `held-out time`. seen: whether it was fitted to that.
+    misfit: why it does not explain the data, a warning; may be empty.
     """
     clock, model = run.rollout.clock, run.model
     return Result(
-        f"{found}: a model that {_fate(run)}",
+        f"{found}: a model that {_fate(run, seen=seen, misfit=misfit)}",
         [
             *(display_equation(model, state, clock) for state in model.states),
             Text(f"run freely from one sample over {where}: {run_words(run)}"),
+            *([Text(misfit, warning=True)] if misfit else []),
             *more,
         ],
         load=f'ep.SparseModel.load("{{}}/models/{file}.json")',
@@ -241,11 +256,11 @@ def found_model(
     )
 
 
-def _fate(run: FreeRun) -> str:
+def _fate(run: FreeRun, *, seen: bool, misfit: str) -> str:
     """`lives`, `has the wrong cycle`, `diverges after 12 us`."""
     words = {Verdict.WRONG_CYCLE: "has the wrong cycle", Verdict.UNLIKE: "is unlike the data"}
-    words |= {Verdict.ALIKE: "is like the data"}
-    return words.get(run.verdict, run.text)
+    words |= {} if seen or misfit else {Verdict.ALIKE: "is like the data"}
+    return words.get(run.verdict, run.words(seen=seen, misfit=misfit))
 
 
 def run_words(run: FreeRun) -> str:

@@ -323,6 +323,7 @@ class Outcome:
             picture="trajectories",
             more=more,
             where="the record",
+            seen=True,
         )
 
     def sections(self) -> list[Section]:
