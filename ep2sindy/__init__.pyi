@@ -24,7 +24,6 @@ from ep2sindy.signals.delay import Delay as Delay
 # Discover
 from ep2sindy.discovery.discover import discover as discover
 from ep2sindy.discovery.result import Discovery as Discovery
-from ep2sindy.discovery.recipe import Recipe as Recipe  # for configs
 from ep2sindy.operating.shared_support import discover_shared as discover_shared
 from ep2sindy.operating.shared_support import SharedDiscovery as SharedDiscovery
 from ep2sindy.discovery.pointwise import pointwise as pointwise

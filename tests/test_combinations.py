@@ -1,13 +1,20 @@
 """Combinations of candidates: the most promising first, within bounded memory."""
 
+from dataclasses import replace
 from itertools import islice, product
 
 import numpy as np
 import pytest
 
+from ep2sindy.data.coerce import Task
+from ep2sindy.discovery.method import Regression
+from ep2sindy.library.library import polynomial
 from ep2sindy.library.relations import relations_of
 from ep2sindy.regression.front import Candidate, ParetoFront
-from ep2sindy.selection.rule import best_first, combinations, left_out
+from ep2sindy.regression.searches import BestSubset
+from ep2sindy.regression.weak import Weak, WeightedWeak
+from ep2sindy.selection.rule import best_first, combinations, left_out, support_of
+from ep2sindy.systems.systems import lorenz
 
 
 def front(state: str, deviances: list[float]) -> ParetoFront:
@@ -56,6 +63,37 @@ def test_below_the_cap_every_combination_is_there_in_order() -> None:
 def test_a_cap_keeps_the_best_by_deviance() -> None:
     fronts = [front("x", [3.0, 0.0]), front("y", [5.0, 1.0, 2.0])]
     assert combinations(fronts, 3).tolist() == [[0, 1], [1, 1], [1, 2]]
+
+
+@pytest.mark.parametrize("formulation", [WeightedWeak(), Weak()], ids=["all fitted", "held out"])
+def test_a_cap_keeps_the_true_terms_after_a_regression(formulation: Weak | WeightedWeak) -> None:
+    """R2 would rank the largest supports first if no rows are held out, and NaN the smallest."""
+    system = lorenz()
+    run = system.trajectory(noise=0.02, rng=0).window(0, 1000)
+    search = BestSubset(max_terms=5, n_best=3)
+    method = Regression(formulation, search, depth=3)
+    task = Task([run], polynomial(run.state_names, degree=2))
+    fronts = [each.front for each in method.search_equations(task, rng=0)]
+    assert all(front.held_out == isinstance(formulation, Weak) for front in fronts)
+    (first,) = combinations(fronts, 1)
+    found = support_of(fronts, first)
+    assert found == {state: tuple(system.model.terms(state)) for state in run.state_names}
+
+
+def test_without_rows_the_best_by_r2_come_first() -> None:
+    fronts = [front("x", [0.0] * 3), front("y", [0.0] * 3)]
+    scores = [(0.1, np.nan), (0.8, np.nan), (0.9, 0.2)]
+    ranked = [
+        ParetoFront(
+            each.equation,
+            [
+                replace(c, deviance=None, r2_train=train, r2_test=test)
+                for c, (train, test) in zip(each.candidates, scores, strict=True)
+            ],
+        )
+        for each in fronts
+    ]
+    assert combinations(ranked, 1).tolist() == [[1, 1]]
 
 
 def test_relations_hold_in_every_combination_that_a_cap_leaves() -> None:

@@ -14,7 +14,6 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.estimation import LORENZ, SHORT
 from benchmarks.known_systems import noisy
-from ep2sindy._stubs import dotted_names
 from ep2sindy.data.sensor import Bounds
 from ep2sindy.discovery.recipe import method_of
 from ep2sindy.estimation import cost, explanation, kernels, likelihood
@@ -558,16 +557,6 @@ def test_the_search_is_the_same_in_other_units() -> None:
     [
         (ep.TrajectorySearch, {"selection": ep.EBIC()}, r"selection must be Evidence\(\)"),
         (ep.TrajectorySearch, {"max_terms": 0}, "max_terms must be a whole number, one or more: 0"),
-        (
-            ep.Recipe,
-            {"search": ep.TrajectorySearch(), "bootstraps": ep.Bootstraps(n=2)},
-            r"draws no bootstraps: .*bootstraps=none",
-        ),
-        (
-            ep.Recipe,
-            {"search": ep.TrajectorySearch(), "formulation": ep.Weak()},
-            r"makes no rows: Weak\(.*; leave the formulation out, or",
-        ),
     ],
 )
 def test_settings_that_do_not_go_with_trajectories_are_refused(
@@ -578,40 +567,6 @@ def test_settings_that_do_not_go_with_trajectories_are_refused(
 
 
 RULE = ep.FreeRunScore(n_folds=2)
-PUBLIC = {
-    last: entry.load()
-    for name, entry in dotted_names().items()
-    if (last := name.rpartition(".")[2])[0].isupper()
-}
-
-
-@pytest.mark.parametrize(
-    ("asked", "method"),
-    [
-        ({}, ep.TrajectorySearch()),
-        ({"selection": ep.Evidence()}, ep.TrajectorySearch()),
-        ({"formulation": ep.WeightedWeak()}, ep.Regression()),
-        (
-            {"search": ep.TrajectorySearch(max_terms=4), "selection": RULE, "depth": 2},
-            ep.TrajectorySearch(max_terms=4, selection=RULE, depth=2),
-        ),
-        ({"formulation": ep.Differential()}, ep.Regression(ep.Differential())),
-        ({"bootstraps": ep.Bootstraps(n=2)}, ep.Regression(bootstraps=ep.Bootstraps(n=2))),
-        ({"selection": ep.EBIC()}, ep.Regression()),
-        ({"search": ep.BestSubset(max_terms=2)}, ep.Regression(search=ep.BestSubset(max_terms=2))),
-        ({"selection": RULE}, ep.Regression(selection=RULE)),
-        ({"search": ep.TrajectorySearch(depth=3)}, ep.TrajectorySearch(depth=3)),
-        ({"search": ep.BestSubset(), "depth": 3}, ep.Regression(depth=3)),
-    ],
-)
-def test_a_recipe_is_the_method_that_it_stands_for_and_warns(asked: dict, method: object) -> None:
-    with pytest.warns(FutureWarning, match="goes with the next version: write ep") as told:
-        recipe = ep.Recipe(**asked)
-    assert recipe == method
-    written = str(told[0].message).partition("write ep.")[2].partition(", and pass it")[0]
-    assert eval(written, PUBLIC) == method
-
-
 NO_ROWS = (ep.WeightedWeak(), ep.Bootstraps(n=0))
 RULED = ep.TrajectorySearch(selection=RULE, depth=2)
 

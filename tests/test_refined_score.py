@@ -13,8 +13,9 @@ from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_bat
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.selection import refined as refined_score
+from ep2sindy.selection.criteria import FLOOR
 from ep2sindy.selection.refined import RefinedScore, _refined
-from ep2sindy.selection.rule import FLOOR, MAX_ERROR
+from ep2sindy.selection.rule import MAX_ERROR
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra
 from tests.models import plain_rows

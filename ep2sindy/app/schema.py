@@ -20,7 +20,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from ep2sindy._stubs import place_of
 from ep2sindy.app.targets import target_of
 from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.discovery.recipe import Recipe, method_of
+from ep2sindy.discovery.recipe import method_of
 from ep2sindy.runtime.screen import joined, near_words
 from ep2sindy.studies.source import Source, Step
 from ep2sindy.studies.study import Check, Deferred
@@ -28,10 +28,7 @@ from ep2sindy.studies.study import Check, Deferred
 # Keys of conf/config.yaml that every run has.
 COMMON = ("experiment", "study", "seed", "output", "figures", "verbose")
 # Fields of these types are made of the top-level groups listed with them: a method is five groups.
-# Recipe is the old name of AnyMethod, for one version more.
-GATHERED: Mapping[Any, Callable[..., Any]] = {
-    AnyMethod: method_of, Recipe: method_of, Source: Source,
-}  # fmt: skip
+GATHERED: Mapping[Any, Callable[..., Any]] = {AnyMethod: method_of, Source: Source}
 # Groups of conf/config.yaml that a study may leave aside.
 GROUPS = (
     "data", "prepare", "trajectory", "formulation", "search", "bootstraps", "selection", "depth",

@@ -25,7 +25,7 @@ from ep2sindy.estimation.solver import (
     enough_samples,
 )
 from ep2sindy.estimation.supports import penalise, supports_by_size
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
@@ -240,13 +240,23 @@ def _try(
     """Answer a task by one way in which its hidden states may enter."""
     check_runs(known)
     measured = task.runs[0].state_names
-    problem = scale_problem(
-        known.runs, known.library, known.relations, known.terms, measured=measured,
-        exclude=known.exclude, watch=watch,
-    )  # fmt: skip
+
+    def problem_of(library: Library) -> EstimationProblem:
+        return scale_problem(
+            known.runs, library, known.relations, known.terms, measured=measured,
+            exclude=known.exclude, watch=watch,
+        )  # fmt: skip
+
+    problem = replace(
+        problem_of(known.library), widen=lambda: problem_of(_with_degree_more(known.library))
+    )
     found = explain(problem, max_terms=max_terms, align=align)
     said = (*_lonely_words(known.runs, problem), *(way.words for way in ways), *found.said)
     return replace(found, said=said), known.runs
+
+
+def _with_degree_more(library: Library) -> Library:
+    return library + polynomial(library.variables, degree=int(library.degrees.max()) + 1)
 
 
 def _lonely_words(runs: Sequence[Trajectory], problem: EstimationProblem) -> tuple[str, ...]:

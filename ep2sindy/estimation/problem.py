@@ -15,7 +15,7 @@ from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import Watch
 from ep2sindy.estimation.flow import Flow, RightHandSides, Steps
-from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, constraint
 
 MIN_SAMPLES = 5  # of a record: a smoother accepts no fewer
@@ -404,18 +404,7 @@ def scale_problem(
         inputs=tuple(inputs),
         watch=watch or Watch(),
     )
-
-    def widen() -> EstimationProblem:
-        wider = _with_degree_more(library)
-        return scale_problem(
-            runs, wider, relations, terms, measured=measured, exclude=exclude, watch=watch
-        )
-
-    return replace(problem.of(runs), widen=widen)
-
-
-def _with_degree_more(library: Library) -> Library:
-    return library + polynomial(library.variables, degree=int(library.degrees.max()) + 1)
+    return problem.of(runs)
 
 
 def _asked(

@@ -31,7 +31,7 @@ from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.values import read_only
-from ep2sindy.selection.rule import FLOOR
+from ep2sindy.selection.criteria import FLOOR
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,7 +13,10 @@ from jaxtyping import Bool, Float
 from ep2sindy.library.library import Library
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.whitening import whitened_rows
-from ep2sindy.selection.rule import FLOOR
+
+# Least residual squares, as a share of the target's squares: below this value a criterion would
+# select terms that fit the discretisation error of noise-free data.
+FLOOR = 1e-6
 
 # Rounds of weighting the rows by the covariance under the leading candidate.
 MAX_ROUNDS = 5

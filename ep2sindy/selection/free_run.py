@@ -29,13 +29,9 @@ from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
+from ep2sindy.selection.criteria import FLOOR
 from ep2sindy.selection.refined import RefinedScore
-from ep2sindy.selection.rule import (
-    FLOOR,
-    MAX_ERROR,
-    Decision,
-    combination_scores,
-)
+from ep2sindy.selection.rule import MAX_ERROR, Decision, combination_scores
 from ep2sindy.selection.systems import (
     Fold,
     Records,

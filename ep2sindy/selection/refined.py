@@ -20,8 +20,8 @@ from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, d
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.runtime.values import set_counts
+from ep2sindy.selection.criteria import FLOOR
 from ep2sindy.selection.rule import (
-    FLOOR,
     MAX_ERROR,
     Decision,
     combination_scores,

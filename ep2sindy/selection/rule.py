@@ -18,10 +18,7 @@ from ep2sindy.library.relations import Constraint, Relation, binding
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress
-
-# Least residual squares, as a share of the target's squares: below this value a criterion would
-# select terms that fit the discretisation error of noise-free data.
-FLOOR = 1e-6
+from ep2sindy.selection.criteria import EBIC
 
 # Upper bound on the error of a system, also used if it dies, diverges or cannot be refined. The
 # unit is the variance of the data (a constant at the mean has error 1), or the bound of a free run.
@@ -105,11 +102,11 @@ def combinations(
 
     If there are more than `most`, these are the most promising ones: those with the least sum of
     ranks, a candidate's rank being its place in its own front by deviance or, after a regression,
-    by R2 on the test rows. They are returned in the order of their indices.
+    by EBIC. They are returned in the order of their indices.
     Memory grows with `most` alone, and at most TRIED times as many are looked at.
     Raises ValueError if none of these has the terms that the relations name.
     """
-    order = [np.argsort(_misfit(front), kind="stable") for front in fronts]
+    order = [_rank_candidates(front) for front in fronts]
     ranks = best_first([np.arange(len(places), dtype=np.float64) for places in order])
     kept = []
     for choice in islice(ranks, TRIED * most):
@@ -127,12 +124,16 @@ def combinations(
     return found[np.lexsort(found.T[::-1])]
 
 
-def _misfit(front: ParetoFront) -> Float[np.ndarray, " _candidates"]:
-    """Values by which the candidates of one front are ranked, the best least."""
-    deviance = [c.deviance for c in front.candidates]
-    if None in deviance:
-        return np.array([-c.r2_test for c in front.candidates])
-    return np.array(deviance, dtype=np.float64)
+def _rank_candidates(front: ParetoFront) -> Int[np.ndarray, " _candidates"]:
+    """Places of the candidates of one front, the most promising first; by R2 if no rows were kept.
+
+    Where rows are kept they are not ranked by R2: of rows that were fitted it rises with every
+    term, so that the largest supports would come first.
+    """
+    costs = np.array([c.deviance for c in front.candidates], dtype=np.float64)
+    if np.isnan(costs).any():  # of None: only a search of trajectories knows a deviance
+        costs = front.errors if front.problem is None else EBIC().scores([front])[0]
+    return np.argsort(costs, kind="stable")
 
 
 def best_first(costs: Sequence[Float[np.ndarray, " _"]]) -> Iterator[tuple[int, ...]]:

@@ -46,7 +46,7 @@ from ep2sindy.studies.library_result import (
     frequencies,
     refit,
     run_refitted,
-)
+)  # fmt: skip
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import Sampling, Source, balances_of, data_summary, zone_sizes_of
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
@@ -475,7 +475,7 @@ class Outcome:
                 found.append(forecast_section(result.skill, f"forecast_{name}", title=title))
         note = FROM_DERIVATIVES if self.living else ""
         rows = self.comparison.screen("model", by_state=True)
-        compared = [Table(rows, title=INTEGRATED, note=note), *pictures(FIGURES)]
+        compared: list[Block] = [Table(rows, title=INTEGRATED, note=note), *pictures(FIGURES)]
         found.append(Section("Run freely from the first sample", compared))
         if len(self.files) > 1:
             found.append(Section("Every record", [Table(self.records.screen(), EVERY_RECORD)]))
