@@ -1,4 +1,4 @@
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pytest
@@ -38,6 +38,50 @@ def test_lasso_path_matches_an_independent_implementation(seed: int) -> None:
     # The support between two knots is ours; at the knot itself a leaving term is zero already.
     assert at_knots <= found
     assert len(found) == len({tuple(c != 0) for c in (path[:, 1:] + path[:, :-1]).T}) + 1
+
+
+def penalties(xx: np.ndarray, xy: np.ndarray, chosen: list[int]) -> np.ndarray:
+    """Width of the range of penalties at which a support is optimal, per draw; negative for none.
+
+    The conditions of Karush, Kuhn and Tucker, for every choice of signs: the coefficients have
+    them, and the other correlations are below the penalty. Both sides are linear in the penalty.
+    """
+    rest = [j for j in range(xy.shape[1]) if j not in chosen]
+    signs = np.array(list(product((1.0, -1.0), repeat=len(chosen)))).T
+    own, cross = xx[:, chosen][:, :, chosen], xx[:, rest][:, :, chosen]
+    coef = np.linalg.solve(own, xy[:, chosen, None])
+    slope = np.linalg.solve(own, np.broadcast_to(signs, (len(xx), *signs.shape)))
+    left, drift = xy[:, rest, None] - cross @ coef, cross @ slope
+    at_zero = np.concatenate([signs * coef, -left + 0.0 * drift, left + 0.0 * drift], axis=1)
+    fall = np.concatenate([signs * slope, drift - 1.0, -drift - 1.0], axis=1)
+    high = np.where(fall > 0.0, at_zero / fall, np.inf).min(axis=1)
+    low = np.where(fall < 0.0, at_zero / fall, 0.0).max(axis=1)
+    return (high - np.maximum(low, 0.0)).max(axis=1) / np.abs(xy).max(axis=1)
+
+
+def test_lasso_paths_hold_the_optimal_supports_and_no_others_if_terms_are_nearly_dependent() -> (
+    None
+):
+    rng, n_draws, n_terms, n_false, n_missing = np.random.default_rng(0), 200, 6, 0, 0
+    theta = rng.normal(size=(n_draws, 40, 2)) @ rng.normal(size=(n_draws, 2, n_terms))
+    theta += 0.01 * rng.normal(size=theta.shape)
+    target = theta @ rng.normal(size=(n_draws, n_terms, 1)) + 0.3 * rng.normal(size=(200, 40, 1))
+    scaled = theta * np.abs(np.linalg.solve(theta.mT @ theta, theta.mT @ target)).mT
+    xx, xy = scaled.mT @ scaled, (scaled.mT @ target)[:, :, 0]
+    assert np.median(np.linalg.cond(xx)) > 1e5
+    size = np.abs(xy).max(axis=1)
+    xx, xy = xx / size[:, None, None], xy / size[:, None]
+    supports = [list(c) for k in range(1, n_terms + 1) for c in combinations(range(n_terms), k)]
+    widths = np.array([penalties(xx, xy, chosen) for chosen in supports]).T
+    scratch = np.empty((n_terms, n_terms)), np.empty((5, n_terms))
+    places, masks = np.empty((2, n_terms), dtype=np.int64), np.empty((99, n_terms), dtype=bool)
+    for gram, product_with, width in zip(xx, xy, widths, strict=True):
+        n_masks = lasso_path(gram, product_with, n_terms, *scratch, places, masks, 0)
+        found = {tuple(np.flatnonzero(m).tolist()) for m in masks[:n_masks]}
+        there = np.array([tuple(chosen) in found for chosen in supports])
+        n_false += int((there & (width < -1e-10)).sum())
+        n_missing += int((~there & (width > 1e-10)).sum())
+    assert (n_false, n_missing) == (0, 0)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -23,6 +23,10 @@ BITS = 62  # terms in one number of a key
 PATH_PER_TERM = 8  # supports on a lasso path, per term, at which it ends; they may come and go
 
 
+# Why a term cannot join a lasso path: it is active, or it has just left with that sign.
+ACTIVE, LEFT_POSITIVE, LEFT_NEGATIVE = 1, 2, 3
+
+
 @compiled(**WITHIN)
 def _next_event(coef, slope, correlation, drift, level, active, n_active, closed):
     """Next knot of the lasso path below the penalty `level`: step, term, and whether it joins."""
@@ -32,14 +36,14 @@ def _next_event(coef, slope, correlation, drift, level, active, n_active, closed
         if coef[j] * slope[i] < 0.0 and -coef[j] / slope[i] < step:
             step, term, joins = -coef[j] / slope[i], j, False
     for j in range(len(coef)):
-        if closed[j]:
+        if closed[j] == ACTIVE:
             continue
         # The correlation meets plus the level, or minus the level.
-        if 1.0 - drift[j] > 1e-12:
+        if closed[j] != LEFT_POSITIVE and 1.0 - drift[j] > 1e-12:
             distance = max((level - correlation[j]) / (1.0 - drift[j]), 0.0)
             if distance < step:
                 step, term, joins = distance, j, True
-        if 1.0 + drift[j] > 1e-12:
+        if closed[j] != LEFT_NEGATIVE and 1.0 + drift[j] > 1e-12:
             distance = max((level + correlation[j]) / (1.0 + drift[j]), 0.0)
             if distance < step:
                 step, term, joins = distance, j, True
@@ -60,7 +64,7 @@ def lasso_path(xx, xy, max_terms, lower, vectors, places, masks, n_masks):
     n_terms = len(xy)
     coef, correlation, drift = vectors[0], vectors[1], vectors[2]
     slope, signs, active = vectors[3], vectors[4], places[0]
-    closed = places[1]  # terms that cannot join, for they are active, or barred
+    closed = places[1]  # 0 for terms that can join
     n_active = np.int64(0)  # as a bare 0 it would have callees compiled twice
     end, left, level = n_masks + PATH_PER_TERM * (n_terms + 1), -1, 0.0
     for j in range(n_terms):
@@ -70,8 +74,8 @@ def lasso_path(xx, xy, max_terms, lower, vectors, places, masks, n_masks):
     n_masks = _write_support(active, n_active, masks, n_masks)
     while level > floor and n_masks < end:
         _fill_drift(xx, slope, active, n_active, drift)
-        if left >= 0:
-            closed[left] = 1  # it would rejoin at this same knot
+        if left >= 0:  # with the sign it had, it would rejoin at this same knot
+            closed[left] = LEFT_POSITIVE if correlation[left] > 0.0 else LEFT_NEGATIVE
         step, term, joins = _next_event(
             coef, slope, correlation, drift, level, active, n_active, closed
         )
@@ -82,7 +86,7 @@ def lasso_path(xx, xy, max_terms, lower, vectors, places, masks, n_masks):
         if term < 0:
             break
         if joins:
-            closed[term] = 1
+            closed[term] = ACTIVE
             if not append_term(xx, active, n_active, term, lower):
                 # It depends on the active terms; the path continues without it.
                 substitute(lower, signs, active, n_active, slope)
