@@ -75,7 +75,15 @@ class Differential:
         target: Float[np.ndarray, "samples n_states"],
     ) -> None:
         """Write the library's variables and the derivatives of one trajectory at its samples."""
-        target[:] = self.smoother.derivative(run.t, run.states)
+        n_columns = 1 if run.n_samples > MOST_ROWS else len(run.names)  # at once: each is copied
         values[:] = run.columns(library.variables)
-        if self.smooth_library:
-            values[:] = keep_inside(library, self.smoother.smooth(run.t, values), values)
+        for k in range(0, target.shape[1], n_columns):
+            some = slice(k, k + n_columns)
+            target[:, some] = self.smoother.derivative(run.t, run.states[:, some])
+        if not self.smooth_library:
+            return
+        for k in range(0, values.shape[1], n_columns):
+            some = slice(k, k + n_columns)
+            values[:, some] = self.smoother.smooth(run.t, values[:, some])
+        if library.functions:
+            values[:] = keep_inside(library, values, run.columns(library.variables))
