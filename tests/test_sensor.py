@@ -3,6 +3,8 @@ as assumed, states and samples that come twice."""
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
@@ -21,6 +23,16 @@ LIMITS = [(-np.inf, 0.3), (0.3, np.inf), (-1.0, 0.5), (2.0, 2.5), (-9.0, -8.0), 
 
 
 # Limits
+
+
+def test_a_record_that_repeats_no_value_is_not_copied() -> None:
+    values = np.random.default_rng(0).normal(size=(20_000, 6))
+    tracemalloc.start()
+    try:
+        assert bounds_of(values, list("abcdef")) is None
+        assert tracemalloc.get_traced_memory()[1] < 0.5 * values.nbytes
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(("lower", "upper"), LIMITS)

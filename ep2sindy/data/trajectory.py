@@ -23,7 +23,7 @@ from ep2sindy.library.names import check_state
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
-from ep2sindy.runtime.values import check_list, read_only
+from ep2sindy.runtime.values import check_list, locked, read_only
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -84,7 +84,7 @@ class Trajectory:
         for name, value in {
             "t": read_only(seconds(self.t)),
             "states": self._filled(real_numbers(self.states, "states")),
-            "inputs": read_only(real_numbers(inputs, "inputs")),
+            "inputs": locked(real_numbers(inputs, "inputs")),
             "state_names": tuple(self.state_names),
             "input_names": tuple(self.input_names),
             "units": MappingProxyType({n: self.units.get(n, "1") for n in self.names}),
@@ -101,7 +101,7 @@ class Trajectory:
     def _filled(self, states: np.ndarray) -> Float[np.ndarray, "_ n_states"]:
         """The states, interpolated where they are missing."""
         if self.missing is None:
-            return read_only(states)
+            return locked(states)
         missing = np.asarray(self.missing)
         if missing.shape != states.shape or missing.dtype != np.bool_:
             raise ValueError(

@@ -76,8 +76,16 @@ class Differential:
         target: Float[np.ndarray, "samples n_states"],
     ) -> None:
         """Write the library's variables and the derivatives of one trajectory at its samples."""
-        target[:] = self.smoother.derivative(run.t, run.states)
+        n_columns = 1 if run.n_samples > MOST_ROWS else len(run.names)  # at once: each is copied
         values[:] = run.columns(library.variables)
-        if self.smooth_library:
-            smooth = self.smoother.smooth(run.t, values)
-            values[:] = keep_inside(library, smooth, noise_inside(library, values))
+        for k in range(0, target.shape[1], n_columns):
+            some = slice(k, k + n_columns)
+            target[:, some] = self.smoother.derivative(run.t, run.states[:, some])
+        if not self.smooth_library:
+            return
+        for k in range(0, values.shape[1], n_columns):
+            some = slice(k, k + n_columns)
+            values[:, some] = self.smoother.smooth(run.t, values[:, some])
+        if library.functions:
+            raw = noise_inside(library, run.columns(library.variables))
+            values[:] = keep_inside(library, values, raw)

@@ -40,10 +40,10 @@ from ep2sindy.studies.forecasts import (
     why_none,
 )
 from ep2sindy.studies.library_result import (
-    NOISE,
     RECORDS,
     LibraryResult,
     frequencies,
+    left_over_of_all,
     refit,
     run_refitted,
 )  # fmt: skip
@@ -448,17 +448,8 @@ class Outcome:
     def _cautions(self, best: str) -> list[Block]:
         """A neutral cycle of the living model, and what fits of derivatives leave beyond noise."""
         tests = [result.discovery.noise_test for result in self.results.values()]
-        found: list[Block] = [Text(c, warning=True) for c in [self.living[best].free.caution] if c]
-        if not any(test.misfit for test in tests):
-            return found
-        left = [each for test in tests for each in test.left.values() if not each.leaves_noise]
-        ratios = sorted(each.chi_squared for each in left)
-        size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {NOISE}" if left else "more than noise"
-        text = (
-            f"The equations fitted to derivatives leave {size}: a state or a term is missing "
-            "there, so they have no intervals; the free run above is what judges."
-        )
-        return [*found, Text(text)]
+        caution = self.living[best].free.caution
+        return [*([Text(caution, warning=True)] if caution else []), *left_over_of_all(tests)]
 
     def sections(self) -> list[Section]:
         found = [self._of_all()]

@@ -285,6 +285,20 @@ def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Secti
 NOISE = "the noise of the samples (of a simulation: its numerical noise)"
 
 
+def left_over_of_all(tests: Sequence[NoiseTest]) -> list[Text]:
+    """What fits of derivatives leave beyond noise; nothing if they leave no more."""
+    if not any(test.misfit for test in tests):
+        return []
+    left = [each for test in tests for each in test.left.values() if not each.leaves_noise]
+    ratios = sorted(each.chi_squared for each in left)
+    size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {NOISE}" if left else "more than noise"
+    text = (
+        f"The equations fitted to derivatives leave {size}: a state or a term is missing there, so "
+        "they have no intervals; the free run above is what judges."
+    )
+    return [Text(text)]
+
+
 def left_over(state: str, test: NoiseTest) -> list[str]:
     """A line on the residuals of the selected terms, if the noise of the rows is known."""
     if (left := test.left.get(state)) is None:
