@@ -18,7 +18,12 @@ from ep2sindy.estimation.explanation import Explanation, explain
 from ep2sindy.estimation.hidden import Entrance, with_guesses
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
-from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem, scale_problem
+from ep2sindy.estimation.problem import (
+    MIN_SAMPLES,
+    EstimationProblem,
+    as_fitted,
+    scale_problem,
+)
 from ep2sindy.estimation.solver import (
     SAMPLES_PER_TERM,
     Solution,
@@ -283,23 +288,7 @@ def _by_run(
                 *((record.times, record.samples, path) for record, path in own), strict=True
             )
         )
-        yield _as_fitted(problem, times, samples, path, run), path * problem.scale
-
-
-def _as_fitted(
-    problem: EstimationProblem,
-    times: np.ndarray,
-    samples: np.ndarray,
-    path: np.ndarray,
-    run: Trajectory,
-) -> Trajectory:
-    """The samples of a run that were fitted, the estimated path of hidden states among them."""
-    if len(times) == run.n_samples and problem.measured.all():
-        return run
-    states = np.where(problem.measured, samples, path) * problem.scale
-    kept = np.isin((run.t - run.t[0]) / problem.step_s, times)
-    missing = None if run.missing is None else run.missing[kept]
-    return replace(run, t=run.t[kept], states=states, inputs=run.inputs[kept], missing=missing)
+        yield as_fitted(problem, times, samples, path, run), path * problem.scale
 
 
 def _report(

@@ -407,6 +407,22 @@ def scale_problem(
     return problem.of(runs)
 
 
+def as_fitted(
+    problem: EstimationProblem,
+    times: np.ndarray,
+    samples: np.ndarray,
+    path: np.ndarray,
+    run: Trajectory,
+) -> Trajectory:
+    """The samples of a run that were fitted, the estimated path of hidden states among them."""
+    if len(times) == run.n_samples and problem.measured.all():
+        return run
+    states = np.where(problem.measured, samples, path) * problem.scale
+    kept = np.isin((run.t - run.t[0]) / problem.step_s, times)
+    missing = None if run.missing is None else run.missing[kept]
+    return replace(run, t=run.t[kept], states=states, inputs=run.inputs[kept], missing=missing)
+
+
 def _asked(
     library: Library,
     states: Sequence[str],
