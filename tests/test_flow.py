@@ -11,6 +11,7 @@ from ep2sindy.estimation.flow import RightHandSides, Steps
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, parting
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
+from ep2sindy.model.flow_kernels import _advance
 from ep2sindy.systems.draws import realization
 
 N = 37  # no multiple of the lanes
@@ -100,3 +101,12 @@ def test_supports_that_exchanges_between_exact_flows_do_not_reach(
     found = ep.estimate(runs, system.model.library)
     assert np.array_equal(found.model.coef != 0.0, system.model.coef != 0.0)
     assert not found.misfit
+
+
+def test_the_flow_is_compiled_once_for_search_and_refinement() -> None:
+    """An array that is strided in one of them would be another type, which costs seconds."""
+    before = len(_advance.signatures)
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    model = ep.discover(run).model
+    ep.refine(model, run, n_windows=3, window=30)
+    assert len(_advance.signatures) == max(before, 1)

@@ -12,6 +12,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.baselines import Autoregression, Harmonics, Persistence
 from ep2sindy.forecasting.tracking import track
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
+from tests.models import model_of
 
 LINEAR = ep.polynomial(["x", "v"], degree=1)
 SPRING = ep.SparseModel(LINEAR, ["x", "v"], ep.coef_matrix(LINEAR, [{"v": 1.0}, {"x": -1.0}]))
@@ -279,3 +280,22 @@ def test_rounded_samples_are_compared_as_they_are() -> None:
     assert tracker.linear(record, path)[2] == pytest.approx(-0.1)
     skill = ep.forecast_skill(SPRING, rounded, n_fitted=900, starts=10)
     assert np.mean(skill.nrmse["model"]) < 0.1
+
+
+def test_a_history_whose_end_is_at_rest_is_forecast() -> None:
+    t = np.arange(0.0, 60.0, 0.05)
+    states = np.stack([np.exp(-t) * np.cos(t), -np.exp(-t) * (np.cos(t) + np.sin(t))], axis=1)
+    states[400:] = 0.0
+    damped = model_of({"x": {"v": 1.0}, "v": {"x": -2.0, "v": -2.0}})
+    run = Trajectory(t, states, ["x", "v"])
+    ahead = ep.forecast(damped, run, 1.0, fitted_to=run.window(0, 400))
+    assert np.abs(ahead.states).max() < 1e-2
+
+
+def test_the_noise_of_three_samples_is_not_told() -> None:
+    few = spring(0.05).window(0, 3)
+    with pytest.raises(
+        ValueError, match="5 samples or more to tell its noise: got 3; pass the rec"
+    ):
+        ep.forecast(SPRING, few, 1.0)
+    assert np.isfinite(ep.forecast(SPRING, few, 1.0, fitted_to=spring(0.05)).states).all()

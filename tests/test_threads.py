@@ -59,6 +59,16 @@ def test_on_one_thread_and_then_on_as_many_as_before() -> None:
     assert threads() == (2, 2)
 
 
+def test_the_last_to_leave_gives_the_threads_back() -> None:
+    first, second = one_thread(), one_thread()
+    first.__enter__()
+    second.__enter__()  # sees one thread, and must not take it for what was there before
+    first.__exit__(None, None, None)
+    assert threads()[0] == 1
+    second.__exit__(None, None, None)
+    assert threads() == (2, 2)
+
+
 def test_an_error_gives_the_threads_back() -> None:
     with pytest.raises(ValueError, match="no"), one_thread():
         raise ValueError("no")

@@ -16,9 +16,9 @@ from ep2sindy.library.units import calendar_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-# Below this size a product of three variables, squared in a Gram matrix, underflows to zero.
-# Terms that overflow raise their own error.
-LEAST = 1e-50
+# Beyond these sizes a product of three variables, squared in a Gram matrix, underflows to zero or
+# overflows.
+LEAST, MOST = 1e-50, 1e50
 
 
 def real_numbers(values: object, what: str) -> np.ndarray:
@@ -93,12 +93,12 @@ def rounding_s(t: Float[np.ndarray, " samples"]) -> float:
 
 
 def check_magnitude(values: Float[np.ndarray, "samples variables"], names: tuple[str, ...]) -> None:
-    """Raise ValueError for a variable so small that its products underflow in float64."""
+    """Raise ValueError for a variable whose products underflow or overflow in float64."""
     levels = np.abs(values).max(axis=0, initial=0.0)
     for name, level in zip(names, levels, strict=True):
-        if level and level < LEAST:
+        if level and not LEAST <= level <= MOST:
             raise ValueError(
-                f"a variable must be of a size whose products are numbers, {LEAST:g} or more: "
+                f"a variable must be of a size whose products are numbers, {LEAST:g} to {MOST:g}: "
                 f"{name!r} reaches {level:.3g}; count it in another unit"
             )
 

@@ -92,9 +92,10 @@ class ScaledRecord:
         inside = [(a <= places) & (places < b) for a, b in long]
         return [self.kept(each, self.samples[each]) for each in inside]
 
-    def since_gap(self) -> ScaledRecord:
-        """The samples since the last gap, and all if there is none."""
-        kept = np.arange(len(self.times)) >= between_gaps(self.times)[-1][0]
+    def end(self, most: int) -> ScaledRecord:
+        """The last samples, at most so many, and none from before the last gap."""
+        n = len(self.times)
+        kept = np.arange(n) >= max(n - most, between_gaps(self.times)[-1][0])
         return self.kept(kept, self.samples[kept])
 
     def kept(

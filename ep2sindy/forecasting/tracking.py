@@ -19,7 +19,12 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import with_guess_by
 from ep2sindy.estimation.kernels import departures, filtered
 from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, enough_substeps
-from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord, scale_problem
+from ep2sindy.estimation.problem import (
+    MIN_SAMPLES,
+    EstimationProblem,
+    ScaledRecord,
+    scale_problem,
+)
 from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, error_variances, likely_errors
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.threads import one_thread
@@ -88,8 +93,7 @@ class Tracker:
 
         history: has the measured states of the model; others that it has only start the fit.
         """
-        last = history.window(max(0, history.n_samples - self.memory), history.n_samples)
-        record = self.problem.record(_of_model(self.model, last)).since_gap()
+        record = self.problem.record(_of_model(self.model, history)).end(self.memory)
         samples, process = self.scaled_noise()
         path = self.approach(record, record.samples.copy(), samples, process)
         variances = error_variances(len(path), samples, process)
@@ -188,12 +192,18 @@ def track(
     others that the run has were made from them. None means all that it has. Every state may be
     pushed, also one whose equation is known to hold, such as x' = v: the others' errors come in
     through it.
-    Raises ValueError for a run without an input, or measured states that the model lacks.
+    Raises ValueError for a run without an input or of under five samples, or measured states that
+    the model lacks.
     """
     names = measured_states(model, run) if measured is None else list(measured)
     if not names or not set(names) <= set(model.states):
         raise ValueError(
             f"measured must name some of the states {list(model.states)}: {names} came"
+        )
+    if run.n_samples < MIN_SAMPLES:
+        raise ValueError(
+            f"a record must have {MIN_SAMPLES} samples or more to tell its noise: got "
+            f"{run.n_samples}; pass the record that the model was fitted to, fitted_to=..."
         )
     own = _of_model(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
     terms = {state: list(model.terms(state)) for state in model.states}

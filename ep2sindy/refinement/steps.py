@@ -160,6 +160,8 @@ def _order_of_sums(shape: tuple[int, int, int], there: bytes) -> tuple[np.ndarra
     target[by_scaling] = n + len(pairs) + source
     row, factor = pairs // width, pairs % width - 1
     reach = reach_of(n, row, factor)
+    # Columns of `nonzero` are strided, and the kernel would be compiled once more for them.
+    product = np.ascontiguousarray(product)
     return product, target, row, factor, sources // width, sources % width - 1 - n, reach
 
 

@@ -10,7 +10,10 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import lru_cache
+from threading import Lock
+from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
@@ -27,18 +30,50 @@ def start_on_one_thread() -> None:
 def one_thread() -> Iterator[None]:
     """Compute on one thread within this context, also in PyTorch if it is loaded.
 
-    The previous number of threads is restored afterwards. Also works as a decorator.
+    The previous number of threads is restored by the last to leave, since threads of Python that
+    compute at once share the pools. Also works as a decorator.
     """
     torch = sys.modules.get("torch")  # not imported here, since the import is slow
     n_threads = torch.get_num_threads() if torch else 1
-    with _pools(len(sys.modules)).limit(limits=1):
-        try:
-            if torch:
-                torch.set_num_threads(1)
-            yield
-        finally:
-            if torch:
-                torch.set_num_threads(n_threads)
+    _inside().enter(n_threads)
+    try:
+        if torch:
+            torch.set_num_threads(1)
+        yield
+    finally:
+        n_before = _inside().leave()
+        if torch:
+            torch.set_num_threads(max(n_threads, n_before))
+
+
+@dataclass
+class _Inside:
+    """Who computes on one thread now; the limits of the pools, and PyTorch's threads before."""
+
+    lock: Lock = field(default_factory=Lock)
+    count: int = 0
+    limits: Any = None
+    n_before: int = 1
+
+    def enter(self, n_threads: int) -> None:
+        with self.lock:
+            if not self.count:
+                self.limits, self.n_before = _pools(len(sys.modules)).limit(limits=1), n_threads
+            self.count += 1
+
+    def leave(self) -> int:
+        """PyTorch's threads before, if nobody is inside any more; else one."""
+        with self.lock:
+            self.count -= 1
+            if self.count:
+                return 1
+            self.limits.restore_original_limits()
+            return self.n_before
+
+
+@lru_cache(maxsize=1)
+def _inside() -> _Inside:
+    return _Inside()
 
 
 @lru_cache(maxsize=1)
