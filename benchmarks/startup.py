@@ -2,8 +2,11 @@
 
     python -m benchmarks.startup [--against OTHER_CHECKOUT] [--only NAME ...]
 
-Silences are those of a terminal: a pseudo-terminal notes when output comes. With another checkout,
-both run in turn, and ratios are printed. Wall time of an idle machine; ratios are what travels.
+Silences are those of a terminal: a pseudo-terminal notes when output comes, and every experiment
+runs on it. The words before and after the longest silence are printed below the numbers. Where
+others share the machine, waiting for a processor is not counted: a wait is its wall time or the
+CPU time spent in it, whichever is less. With another checkout, both run in turn, and ratios are
+printed, which is what travels.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import argparse
 import fcntl
 import os
 import pty
+import re
 import resource
 import struct
 import subprocess
@@ -42,10 +46,13 @@ CSV = [
 ]  # fmt: skip
 PYTHON, PROGRAM = [sys.executable], [sys.executable, "-m", "ep2sindy.app.main"]
 # Experiments that take minutes at full size run at that of `same_results`.
+AT_FULL_SIZE = ("breathing", "trace", "zones", "ils")
 AT_TOY_SIZE = (
-    "benchmark", "weak", "weak_windows", "frontier", "constrained", "ils", "parametric", "predict",
+    "benchmark", "weak", "weak_windows", "frontier", "constrained", "parametric", "predict",
     "pointwise", "simulate",
 )  # fmt: skip
+# What a terminal does not show as text: colours, and movements of the cursor.
+CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 @dataclass(frozen=True)
@@ -58,12 +65,35 @@ class Case:
 
 
 @dataclass(frozen=True)
+class Output:
+    """What came on a terminal at once. wall_s, cpu_s: since the command began."""
+
+    wall_s: float
+    cpu_s: float
+    text: str = ""
+
+    @property
+    def words(self) -> list[str]:
+        """The lines that can be read; a bar that is written again is a line of its own."""
+        lines = re.split(r"[\r\n]+", CONTROL.sub("", self.text))
+        return [line.strip() for line in lines if line.strip()]
+
+    def after(self, before: Output) -> float:
+        """Time since an earlier output without that spent waiting for a processor, in s."""
+        return min(self.wall_s - before.wall_s, self.cpu_s - before.cpu_s)
+
+
+@dataclass(frozen=True)
 class Waited:
-    """What one run took. first_s, silence_s: until the first output, and without any after it."""
+    """What one run took. first_s, silence_s: until the first output, and without any after it.
+
+    between: the words before and after that silence.
+    """
 
     cpu_s: float
     first_s: float = float("nan")
     silence_s: float = float("nan")
+    between: str = ""
 
 
 def cases(data: dict[str, Path]) -> dict[str, Case]:
@@ -74,9 +104,9 @@ def cases(data: dict[str, Path]) -> dict[str, Case]:
         "the same, with nothing compiled": Case([*PYTHON, "-c", FIRST_USE], cold=True),
         "ep2sindy --help": Case([*PROGRAM, "--help"]),
         "+exp=discover on a CSV": Case([*PROGRAM, *CSV], watched=True),
-        "+exp=breathing": Case([*PROGRAM, "+exp=breathing"], watched=True),
-        "+exp=trace": Case([*PROGRAM, "+exp=trace"], watched=True),
     }
+    for name in AT_FULL_SIZE:
+        found[f"+exp={name}"] = Case([*PROGRAM, f"+exp={name}"], watched=True)
     places = {**data, "cache": data["folder"] / "cache"}
     for name in AT_TOY_SIZE:
         overrides = [text.format(**places) for text in TOYS[name]]
@@ -92,54 +122,77 @@ def run(case: Case, checkout: Path, folder: Path) -> Waited:
         if case.cold:
             environment["NUMBA_CACHE_DIR"] = cache
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        times = (watched if case.watched else silent)(case.command, folder, environment)
+        outputs = (watched if case.watched else silent)(case.command, folder, environment)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     if not case.watched:
         return Waited(cpu_s)
-    return Waited(cpu_s, times[1] - times[0], longest_gap(times[1:]))
+    begin, *rest = outputs
+    last, then = longest_silence(rest)
+    between = (
+        f"{last.words[-1:]} and {then.words[:1]}, {then.wall_s - last.wall_s:.1f} s by a clock"
+    )
+    return Waited(cpu_s, rest[0].after(begin), then.after(last), between)
 
 
-def silent(command: Sequence[str], folder: Path, environment: dict[str, str]) -> list[float]:
+def silent(command: Sequence[str], folder: Path, environment: dict[str, str]) -> list[Output]:
     subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
     return []
 
 
-def watched(command: Sequence[str], folder: Path, environment: dict[str, str]) -> list[float]:
-    """When it began, when output came on its terminal, and when it ended, in s."""
+def watched(command: Sequence[str], folder: Path, environment: dict[str, str]) -> list[Output]:
+    """Its begin, all that can be read on its terminal, and its end."""
     reader, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 120, 0, 0))
-    times = [time.perf_counter()]
+    begin = time.perf_counter()
     process = subprocess.Popen(
-        command, cwd=folder, env=environment, stdin=terminal, stdout=terminal, stderr=terminal
-    )
+        command, cwd=folder, env=environment, stdin=terminal, stdout=terminal, stderr=terminal,
+        start_new_session=True,
+    )  # fmt: skip
     os.close(terminal)
+    outputs = [Output(0.0, 0.0)]
     try:
-        while os.read(reader, 65536):
-            times.append(time.perf_counter())
+        while data := os.read(reader, 65536):
+            wall_s, cpu_s = time.perf_counter() - begin, session_cpu_s(process.pid)
+            came = Output(wall_s, cpu_s, data.decode("utf-8", "replace"))
+            outputs += [came] if came.words else []
     except OSError:  # the terminal of a process that has ended
         pass
     finally:
         os.close(reader)
+    cpu_s = session_cpu_s(process.pid)
     if process.wait():
-        raise RuntimeError(f"{command} ended with status {process.returncode}")
-    return [*times, time.perf_counter()]
+        raise RuntimeError(f"{command} ended with status {process.returncode}: {outputs[-1].text}")
+    return [*outputs, Output(time.perf_counter() - begin, cpu_s)]
 
 
-def longest_gap(times: Sequence[float]) -> float:
-    """The longest time between two moments that follow each other; zero where there is one."""
-    return max((later - sooner for sooner, later in pairwise(times)), default=0.0)
+def session_cpu_s(session: int) -> float:
+    """CPU time of all processes of a session, and of those of their children that have ended."""
+    ticks = 0
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            numbers = path.read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended in the meantime
+            continue
+        if int(numbers[3]) == session:
+            ticks += sum(map(int, numbers[11:15]))
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def longest_silence(outputs: Sequence[Output]) -> tuple[Output, Output]:
+    """The two outputs that follow each other with the longest wait between them."""
+    return max(pairwise(outputs), key=lambda pair: pair[1].after(pair[0]))
 
 
 def measured(case: Case, checkouts: Sequence[Path], folder: Path, n_runs: int) -> list[Waited]:
-    """The median of some runs of each checkout, in turn."""
+    """The run of median CPU time, of some runs of each checkout in turn."""
     for checkout in checkouts:
         if not case.cold:
             run(case, checkout, folder)  # warm: files read, kernels compiled, simulations kept
     turns = 1 if case.cold else n_runs
     runs = [[run(case, checkout, folder) for checkout in checkouts] for _ in range(turns)]
     return [
-        Waited(*np.median([(w.cpu_s, w.first_s, w.silence_s) for w in of_one], axis=0).tolist())
+        sorted(of_one, key=lambda each: each.cpu_s)[len(of_one) // 2]
         for of_one in zip(*runs, strict=True)
     ]
 
@@ -166,6 +219,8 @@ def main() -> None:
             for theirs in other:
                 line += f" {theirs.cpu_s:8.2f} {ours.cpu_s / theirs.cpu_s:6.2f}"
             print(line.replace("nan", "  -"), flush=True)
+            if ours.between:
+                print(f"    {ours.between}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,16 @@
 """Stages of long work: who is told of them, how bars look, and that results know nothing of it."""
 
+import fcntl
 import inspect
 import io
+import os
+import struct
 import sys
+import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +26,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import SILENT, Bars, Told, as_progress, count_pieces
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.selection.refined import RefinedScore
+from ep2sindy.studies.forecasts import skill_of
 from tests import programs
 
 LIBRARY = ep.polynomial(["x", "y"], degree=2)
@@ -181,6 +187,34 @@ def test_a_simulator_tells_warm_up_and_record(simulator: str) -> None:
     watch.check()
 
 
+def test_a_simulation_that_is_kept_tells_that_it_is_written(tmp_path: Path) -> None:
+    run = partial(
+        ep.thruster.simulate, ep.thruster.Thruster(), ep.thruster.OperatingPoint(300.0, 5.0),
+        duration_s=3e-5, warm_up_s=0.0, n_cells=24, cache=tmp_path,
+    )  # fmt: skip
+    written, read = Recorder(), Recorder()
+    run(progress=written)
+    run(progress=read)
+    assert written.labels[1:] == ["keeping the simulation"]
+    assert read.labels == []
+    written.check()
+
+
+def test_forecasts_tell_their_errors_their_bands_and_every_start(prey: ep.Trajectory) -> None:
+    """What comes before the first start takes longest, so it has stages of its own."""
+    watch, model = Recorder(), ep.lotka_volterra().model
+    told = skill_of(model, prey, n_fitted=450, starts=3, progress=watch)
+    assert watch.labels == [
+        "errors of the model, for forecasts", "width of the forecasts' bands", "forecasts",
+    ]  # fmt: skip
+    assert watch.stages[-1].total == 3
+    watch.check()
+    alone = ep.forecast_skill(model, prey, n_fitted=450, starts=3)
+    assert told is not None
+    for name, errors in alone.nrmse.items():
+        np.testing.assert_array_equal(told.nrmse[name], errors)
+
+
 def test_points_are_told_whoever_computes_them() -> None:
     field = grid_field()
     search = ep.discovery.PointSearch(
@@ -255,6 +289,21 @@ def test_a_terminal_sees_label_count_and_unit_and_then_nothing(
         advance(3)
     assert terminal.getvalue().endswith("\r")
     assert not terminal.getvalue().split("\r")[-2].strip()
+
+
+@pytest.mark.parametrize("columns", [0, 100])
+def test_a_terminal_that_does_not_know_its_size_sees_bars(
+    columns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as one of a container, which reports no rows."""
+    reader, terminal = os.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 0, columns, 0, 0))
+    with os.fdopen(reader, "rb", buffering=0) as shown, os.fdopen(terminal, "w") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        with Bars().stage(3, "system", "refined"):
+            stream.write("end\n")  # there is something to read in any case
+            stream.flush()
+        assert b"| 0/3 system [" in shown.read(4096)
 
 
 def test_a_stage_that_cannot_be_counted_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -426,8 +426,7 @@ def from_one_signal(
     found = prepare_signal(trajectory_of(run), signal, decimate=decimate, detrend=detrend)
     n_fitted = count_fitted(found, held_out)
     attempts = search.attempts(found.window(0, n_fitted), found, seed=seed, progress=watch)
-    with watch.stage(None, "", "forecasts, free run and limit cycle"):
-        return evaluate(found, n_fitted, attempts)
+    return evaluate(found, n_fitted, attempts, progress=watch)
 
 
 def method_by_runs() -> Regression:
@@ -440,7 +439,9 @@ def method_by_runs() -> Regression:
     return Regression(WeightedWeak(), search, rule, Bootstraps(n=0), depth=8)
 
 
-def evaluate(signal: Trace, n_fitted: int, attempts: Sequence[Attempt]) -> SignalDiscovery:
+def evaluate(
+    signal: Trace, n_fitted: int, attempts: Sequence[Attempt], *, progress: Progress = SILENT
+) -> SignalDiscovery:
     """Run the model freely over the held-out part, and forecast it again and again.
 
     The start is fitted to the samples before the held-out part. Without such a part, the whole
@@ -452,23 +453,23 @@ def evaluate(signal: Trace, n_fitted: int, attempts: Sequence[Attempt]) -> Signa
         chosen, embedded=chosen.embedding.embed(signal)
     ))  # fmt: skip
     own = [signal.name]
-    if n_fitted == len(signal.t):
-        begin = int(np.searchsorted(signal.t, chosen.embedded.run.t[0]))
-        measured = whole.window(begin, whole.n_samples)
-        run = free_run(model, measured, initial=chosen.embedded.run.states[0], judged=own)
-        return SignalDiscovery(signal, best, attempts, whole, measured, FreeCycle.of(run), None)
-    past = with_all_states(signal.window(0, n_fitted), chosen)
-    before = partial(states_before, signal, chosen.embedding)
-    tracker = calibrate(best.tracker, past, states_of=before)
-    start = tracker.end_of(before(past)).mean
-    measured = whole.window(n_fitted - 1, whole.n_samples)
-    run = free_run(model, measured, initial=start, judged=own)
-    skill = forecast_skill(
-        model,
-        whole,
-        n_fitted=n_fitted,
-        measured=own,
-        states_of=before,
-        tracker=tracker,
-    )
-    return SignalDiscovery(signal, best, attempts, whole, measured, FreeCycle.of(run), skill)
+    is_whole, before = n_fitted == len(signal.t), partial(states_before, signal, chosen.embedding)
+    if is_whole:
+        first, tracker = int(np.searchsorted(signal.t, chosen.embedded.run.t[0])), best.tracker
+        start = chosen.embedded.run.states[0]
+    else:
+        first, past = n_fitted - 1, with_all_states(signal.window(0, n_fitted), chosen)
+        with progress.stage(None, "", "width of the forecasts' bands"):
+            tracker = calibrate(best.tracker, past, states_of=before)
+        start = tracker.end_of(before(past)).mean
+    measured = whole.window(first, whole.n_samples)
+    with progress.stage(None, "", "free run and limit cycle"):
+        cycle = FreeCycle.of(free_run(model, measured, initial=start, judged=own))
+    if is_whole:
+        return SignalDiscovery(signal, best, attempts, whole, measured, cycle, None)
+    with progress.stage(None, "start", "forecasts") as advance:
+        skill = forecast_skill(
+            model, whole, n_fitted=n_fitted, measured=own, states_of=before, tracker=tracker,
+            advance=advance,
+        )  # fmt: skip
+    return SignalDiscovery(signal, best, attempts, whole, measured, cycle, skill)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Collection, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -68,8 +69,20 @@ class Bars:
             leave=False,
             disable=False,
             miniters=1,  # update for every piece, also for slow pieces after fast ones
+            **_usual_size(),
         ) as bar:
             yield lambda n_more: bar.update(n_more) and None
+
+
+def _usual_size() -> dict[str, int]:
+    """Size of a bar for tqdm where the terminal does not know its own; else empty.
+
+    Such a terminal, as of a container or a remote shell, reports no rows, and tqdm shows nothing.
+    """
+    with suppress(OSError):
+        if not all(os.get_terminal_size(sys.stderr.fileno())):
+            return {"ncols": 79, "nrows": 24}
+    return {}
 
 
 def _layout(total: int | None, unit: str, label: str) -> str:

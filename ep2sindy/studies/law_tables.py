@@ -22,7 +22,7 @@ from ep2sindy.operating.quantity_law import ControlLaw
 from ep2sindy.operating.records import OperatingRecord, point_label
 from ep2sindy.report.document import Equation, places
 from ep2sindy.report.results import Metric, ResultTable, View, percent
-from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.forecasts import skill_of
@@ -168,13 +168,12 @@ def skills_left_out(
 ) -> list[ForecastSkill | None]:
     """At points left out, each by the law of the others over the second half of its record."""
     skills = []
-    with progress.stage(len(left_out), "point", "forecasts") as advance:
-        for each in left_out:
-            record = each.record.run
-            skills.append(
-                skill_of(each.run.model, record, n_fitted=record.n_samples // 2, starts=starts)
-            )
-            advance(1)
+    for each in count_pieces(progress, left_out, "point", "forecasts at points left out"):
+        record = each.record.run
+        half = record.n_samples // 2
+        skills.append(
+            skill_of(each.run.model, record, n_fitted=half, starts=starts, progress=progress)
+        )
     return skills
 
 

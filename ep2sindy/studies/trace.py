@@ -111,8 +111,7 @@ class Study:
         best = choose_attempt(attempts)
         if isinstance(best.chosen.embedding, Rate | Delays) and (hint := lost_mean(signal)):
             run.warn(hint)
-        with run.progress(None, "", "forecasts, free run and limit cycle"):
-            return Outcome(evaluate(signal, n_fitted, attempts))
+        return Outcome(evaluate(signal, n_fitted, attempts, progress=run.watch))
 
     def _signal(self, data: Trajectory) -> Trace:
         return prepare_signal(data, decimate=self.decimate, detrend=self.detrend)

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from ep2sindy.data.fields import write_netcdf
 from ep2sindy.runtime.files import fingerprint, sweep, writing
+from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import in_line, on_screen
 from ep2sindy.signals import oscillation, spectrum
 from ep2sindy.thruster.axial.settings import to_json
@@ -23,26 +24,24 @@ SOURCES = [Path(__file__).parent, *(Path(str(each.__file__)) for each in (oscill
 
 
 def read_or_run(
-    cache: str | Path | None, name: str, parameters: dict[str, Any], run: Callable[[], xr.Dataset]
-) -> xr.Dataset:
-    """The result of `run`, read from or kept in the folder `cache` if one is given; see `keep`."""
-    return run() if cache is None else keep(Path(cache) / name, to_json(parameters), run)
+    cache: str | Path | None, name: str, parameters: dict[str, Any],
+    run: Callable[[], xr.Dataset], progress: Progress | bool,
+) -> xr.Dataset:  # fmt: skip
+    """The result of `run`, read from a file in the folder `cache`, or run and kept there.
 
-
-def keep(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Dataset:
-    """The result of `run`, read from a file named by a stem and a hash, or run and kept there.
-
-    The hash covers all parameters and the source text of SOURCES, so that a changed formula never
-    returns an old result. Both ways return the same values. The file states its parameters and
-    holds a checksum. A file that does not match, or cannot be read, is reported, recomputed and
-    replaced. Results appear under their final name only once complete. Raises OSError if the folder
-    cannot be written, before anything runs.
+    Without a folder, nothing is kept. The hash in the file's name covers all parameters and the
+    source text of SOURCES, so that a changed formula never returns an old result. Both ways return
+    the same values. The file states its parameters and holds a checksum. A file that does not
+    match, or cannot be read, is reported, recomputed and replaced. Results appear under their final
+    name only once complete. Raises OSError if the folder cannot be written, before anything runs.
     """
-    key = fingerprint(parameters, sources=SOURCES)
-    path = stem.with_name(f"{stem.name}_{key}.nc")
+    if cache is None:
+        return run()
+    text = to_json(parameters)
+    path = Path(cache, f"{name}_{fingerprint(text, sources=SOURCES)}.nc")
     if path.exists():
         try:
-            return verified(read(path), parameters)
+            return verified(read(path), text)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             with on_screen(sys.stdout):
                 tqdm.write(in_line(f"{path} cannot be read ({error}); simulating it again"))
@@ -52,7 +51,8 @@ def keep(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Datas
         with TemporaryFile(dir=path.parent):
             pass
     field = run()
-    write(with_checksum(field, parameters), path)
+    with as_progress(progress).stage(None, "", "keeping the simulation"):
+        write(with_checksum(field, text), path)
     return field
 
 

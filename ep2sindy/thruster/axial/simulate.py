@@ -106,9 +106,9 @@ def simulate(
     run = duration_s, warm_up_s, sample_s, averaged
     settings = Settings(*run, n_cells, stretch, reconstruct, cfl, coldest_T_e_eV)
     start = as_start(initial)
-    simulation = partial(simulate_as, settings, thruster, operating_point, start, progress=progress)
+    compute = partial(simulate_as, settings, thruster, operating_point, start, progress=progress)
     parameters = _parameters(settings, thruster, operating_point) | {"initial": start.label}
-    return read_or_run(cache, f"thruster_{operating_point.label}", parameters, simulation)
+    return read_or_run(cache, f"thruster_{operating_point.label}", parameters, compute, progress)
 
 
 def _parameters(settings: Settings, thruster: Thruster, point: OperatingPoint) -> dict[str, Any]:

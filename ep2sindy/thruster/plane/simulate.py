@@ -99,7 +99,7 @@ def simulate_2d(
     }  # fmt: skip
     run = partial(simulate_as, settings, thruster, operating_point, progress=progress)
     parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
-    return read_or_run(cache, f"plane_{operating_point.label}", parameters, run)
+    return read_or_run(cache, f"plane_{operating_point.label}", parameters, run, progress)
 
 
 def simulate_as(
