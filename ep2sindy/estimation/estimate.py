@@ -128,6 +128,7 @@ def estimate(
     terms: Mapping[str, Sequence[str]] | None = None,
     hidden: Sequence[str] = (),
     exclude: Mapping[str, Sequence[str]] | None = None,
+    courses: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
     limit_s: float | None = None,
@@ -143,11 +144,14 @@ def estimate(
     relations: between coefficients, held in fit and search. terms: for each state whose equation is
     known but for its coefficients, all terms of that equation. hidden: states that nobody measured,
     which the library has; all ways in which they may enter are compared. exclude: for each state
-    that is named, terms of the library that its equation may not have. limit_s: wall time after
-    which the search ends with the best that it has, and says so. progress: True shows bars, see
-    `Progress`; an interruption (Ctrl-C) then ends the search in the same way.
+    that is named, terms of the library that its equation may not have. courses: input -> how it
+    goes from one sample to the next, "held", "linear" or "smooth"; of others the likeliest course
+    is taken. limit_s: wall time after which the search ends with the best that it has, and says so.
+    progress: True shows bars, see `Progress`; an interruption (Ctrl-C) then ends the search in the
+    same way.
     Raises ValueError for fewer than one term, a limit that is not positive, a library that needs
-    more samples than there are or more memory, or whatever a `Task` refuses.
+    more samples than there are or more memory, an unknown input or course, or whatever a `Task`
+    refuses.
     """
     known = trajectories_of(runs, partial=True)
     task = Task(
@@ -162,6 +166,7 @@ def estimate(
         task,
         max_terms=max_terms,
         align=align,
+        courses=courses,
         units=units,
         provenance=provenance,
         limit_s=limit_s,
@@ -174,6 +179,7 @@ def estimate_task(
     *,
     max_terms: int | None,
     align: bool,
+    courses: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
     limit_s: float | None = None,
@@ -189,7 +195,7 @@ def estimate_task(
     for group in with_guesses(task) if task.hidden else [[(task, ())]]:
         tried = []
         for known, ways in group:
-            tried.append(_try(task, known, ways, max_terms, align, watch))
+            tried.append(_try(task, known, ways, max_terms, align, courses, watch))
             if watch.ended:
                 break
         best.append(min(tried, key=lambda each: each[0].rank))
@@ -208,6 +214,7 @@ def _try(
     ways: Sequence[Entrance],
     max_terms: int | None,
     align: bool,
+    courses: Mapping[str, str] | None,
     watch: Watch,
 ) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task by one way in which its hidden states may enter."""
@@ -215,7 +222,7 @@ def _try(
     measured = task.runs[0].state_names
     problem = scale_problem(
         known.runs, known.library, known.relations, known.terms, measured=measured,
-        exclude=known.exclude, watch=watch,
+        exclude=known.exclude, courses=courses, watch=watch,
     )  # fmt: skip
     found = explain(problem, max_terms=max_terms, align=align)
     return replace(found, said=(*(way.words for way in ways), *found.said)), known.runs
@@ -311,7 +318,8 @@ def _model(
     known = found.fits and not answer.misfit
     free_cov = covariance(problem, fit, found.annealed.level) if known else None
     cov = None if free_cov is None else rows @ free_cov @ rows.T
-    return SparseModel(library, problem.states, coef, units, provenance, cov)
+    courses = dict(zip(problem.inputs, problem.courses, strict=True))
+    return SparseModel(library, problem.states, coef, units, provenance, cov, courses=courses)
 
 
 def _score_supports(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -16,6 +16,7 @@ from ep2sindy.estimation.cost import Watch
 from ep2sindy.estimation.flow import Flow, RightHandSides, Steps
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, constraint
+from ep2sindy.model.inputs import Curve, check_courses, curve_through, plausible_courses
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,15 +24,15 @@ class ScaledRecord:
     """One trajectory in scaled variables.
 
     times: (samples,), and steps: (samples - 1,), in units of the mean step. samples: (samples, d).
-    inputs: at the samples; between them they are interpolated by cubics, or linearly if switched.
-    limits: of samples that are clipped or rounded. missing: (samples, d), true where nothing was
-    measured, as for all of a hidden state; the samples there are nothing but a start. None if all
-    were measured.
+    inputs: at the samples, and their courses between them, see `model.inputs`. limits: of
+    samples that are clipped or rounded. missing: (samples, d), true where nothing was measured, as
+    for all of a hidden state; the samples there are nothing but a start. None if all were measured.
     """
 
     times: Float[np.ndarray, " samples"]
     samples: Float[np.ndarray, "samples d"]
     inputs: Float[np.ndarray, "samples n_inputs"]
+    courses: tuple[str, ...]
     limits: Bounds | None = None
     missing: Bool[np.ndarray, "samples d"] | None = None
 
@@ -68,26 +69,16 @@ class ScaledRecord:
     def steps(self) -> Float[np.ndarray, " steps"]:
         return np.diff(self.times)
 
-    def inputs_at(self, share: float) -> Float[np.ndarray, "steps n_inputs"]:
-        """Inputs at a given share of every step."""
-        if not self.inputs.shape[1]:
-            return np.empty((len(self.steps), 0))
-        return self._curve(self.times[:-1] + share * self.steps)
-
     def divided(self, n_substeps: int) -> Steps:
         """The steps, each divided into equal substeps."""
         shares = np.linspace(0.0, 1.0, 2 * n_substeps + 1)
-        inputs = np.array([self.inputs_at(share) for share in shares])
+        inputs = np.array([self.curve.at(share) for share in shares.tolist()])
         return Steps(self.steps / n_substeps, inputs)
 
     @cached_property
-    def _curve(self) -> Callable[[np.ndarray], np.ndarray]:
-        from scipy.interpolate import make_interp_spline  # imported only if there are inputs
-
-        # A switched input is constant over most steps, and cubics would overshoot at its jumps.
-        switched = (np.diff(self.inputs, axis=0) == 0.0).mean(axis=0) > 0.5
-        degree = 1 if switched.any() else min(3, len(self.inputs) - 1)
-        return make_interp_spline(self.times, self.inputs, k=degree)
+    def curve(self) -> Curve:
+        """The inputs between the samples."""
+        return curve_through(self.times, self.inputs, self.courses)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +95,7 @@ class EstimationProblem:
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
     measured: (d,), False for hidden states. watch: told of every step of a fit. whole: the
     problem with all terms, if this one has only those of a working set; places: (terms,), their
-    positions in its library.
+    positions in its library. allowed_courses: of each input, the most plausible first.
     """
 
     library: Library
@@ -123,6 +114,7 @@ class EstimationProblem:
     measured: Bool[np.ndarray, " d"]
     places: Int[np.ndarray, " terms"]
     inputs: tuple[str, ...] = ()
+    allowed_courses: tuple[tuple[str, ...], ...] = ()
     watch: Watch = field(default_factory=Watch)
     whole: EstimationProblem | None = None
 
@@ -172,9 +164,20 @@ class EstimationProblem:
             times=(run.t - run.t[0]) / self.step_s,
             samples=run.columns(self.states) / self.scale,
             inputs=run.columns(self.inputs) / self.input_scale,
+            courses=self.courses,
             limits=_limits(run, self.scale),
             missing=missing if missing.any() else None,
         )
+
+    @property
+    def courses(self) -> tuple[str, ...]:
+        """The most plausible course of every input that is allowed."""
+        return tuple(options[0] for options in self.allowed_courses)
+
+    def on_courses(self, courses: tuple[str, ...]) -> EstimationProblem:
+        """The same records, their inputs on these courses alone."""
+        records = tuple(replace(record, courses=courses) for record in self.records)
+        return replace(self, records=records, allowed_courses=tuple(zip(courses)))
 
     @property
     def n_samples(self) -> int:
@@ -298,6 +301,7 @@ def scale_problem(
     *,
     measured: Sequence[str] = (),
     exclude: Mapping[str, Sequence[str]] | None = None,
+    courses: Mapping[str, str] | None = None,
     watch: Watch | None = None,
 ) -> EstimationProblem:
     """Scale records and library, and collect the coefficients that may be in the model.
@@ -305,10 +309,14 @@ def scale_problem(
     relations: hold between coefficients. terms: for each state whose equation is known but for its
     coefficients, all terms of that equation. measured: names of states; empty means all. exclude:
     for each state that is named, terms that its equation may not have. Inputs that the library does
-    not have are left out; the others are taken by name, in the order of the first run.
+    not have are left out; the others are taken by name, in the order of the first run. courses: of
+    inputs between their samples; others have all courses that their samples allow.
+    Raises ValueError for an unknown input or course.
     """
     states = runs[0].state_names
     inputs = [name for name in runs[0].input_names if name in library.variables]
+    told = {name: (course,) for name, course in check_courses(courses or {}, inputs).items()}
+    allowed = {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | told
     names = [*states, *inputs]
     over = library.over(names)
     values = np.concatenate([run.columns(names) for run in runs])
@@ -337,6 +345,7 @@ def scale_problem(
         measured=np.isin(states, measured or states),
         places=np.arange(len(over)),
         inputs=tuple(inputs),
+        allowed_courses=tuple(allowed.values()),
         watch=watch or Watch(),
     )
     return replace(problem, records=tuple(problem.record(run) for run in runs))
