@@ -9,6 +9,7 @@
     python -m benchmarks.estimation chain [--sizes 20] [--n 3]            # coupled van der Pol's
     python -m benchmarks.estimation thruster            # the breathing mode, beside free runs
     python -m benchmarks.estimation collection [--n 3] [--noises ...]  # dysts: classes of failure
+    python -m benchmarks.estimation courses --n 3 --noises 0.05        # inputs between samples
     python -m benchmarks.estimation prices [--n 1] [--noises ...]      # dysts: price of a term
 
 `counts` prints per system and noise: selected exactly right, wrong ones that are called a misfit,
@@ -49,6 +50,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation import supports
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
+from ep2sindy.model.inputs import COURSES, curve_through
 from ep2sindy.studies.living import start_of
 from ep2sindy.systems.collection import collected_names
 from ep2sindy.systems.draws import DRAWS, realization
@@ -389,6 +391,52 @@ def prices(noises: Sequence[float], n: int) -> None:
         )
 
 
+def set_record(model: ep.SparseModel, course: str, hold: int, noise: float, number: int):
+    """A record of 1000 samples, its input drawn anew every `hold` samples and on a course."""
+    rng = np.random.default_rng([number, hold, list(COURSES).index(course)])
+    k, knots = np.arange(1000), np.arange(0, 1000 + hold, hold)
+    t = {"x": 0.05, "th": 0.03}[model.states[0]] * k
+    levels = curve_through(knots.astype(float), rng.uniform(-1.0, 1.0, (len(knots), 1)), [course])
+    u = np.array([levels(float(each)) for each in k])
+    start = [0.3, 0.0][: len(model.states)]
+    path = replace(model, courses={"u": course}).simulate(t, start, u, rtol=1e-10).states
+    rms = np.sqrt(np.square(path).mean(axis=0))
+    return ep.Trajectory(
+        t, path + noise * rms * rng.standard_normal(path.shape), model.states, u, ["u"]
+    )
+
+
+def courses(noise: float, n: int) -> None:
+    """A first-order lag and a pendulum, driven by inputs on every course."""
+    lag = model_of({"x": {"x": -2.0, "u": 2.0}}, inputs=["u"])
+    swing = {"sin(th)": -9.0, "w": -0.3, "u": 4.0}
+    pendulum = model_of({"th": {"w": 1.0}, "w": swing}, inputs=["u"])
+    swings = ep.polynomial(["th", "w", "u"], degree=2, functions=["sin(th)"])
+    libraries = {"lag": (lag, ep.polynomial(["x", "u"], degree=3)), "pendulum": (pendulum, swings)}
+    print("right laws, with all 95 % intervals right, all intervals, misfits, courses; CPU-s")
+    for (name, (model, library)), course, hold in product(libraries.items(), COURSES, (1, 20)):
+        rows, chosen = [], []
+        for number in range(n):
+            run, began = set_record(model, course, hold, noise, number), time.process_time()
+            found = ep.estimate([run], library)
+            cpu_s, held = time.process_time() - began, []
+            right = all(set(found.model.terms(s)) == set(model.terms(s)) for s in model.states)
+            if right and found.model.covariance is not None:
+                held = [
+                    low <= model.terms(s)[term] <= high
+                    for s in model.states
+                    for term, (low, high) in found.model.intervals(s).items()
+                ]
+            rows.append((right, bool(held) and all(held), sum(held), len(held), cpu_s))
+            chosen.append(found.model.courses["u"] + (", a misfit" if found.misfit else ""))
+        laws, within, inside, of, cpu = np.array(rows, dtype=float).T
+        print(
+            f"{name:9} {course:7} {hold:3} {laws.sum():.0f}/{n} {within.sum():.0f}/{n} "
+            f"{inside.sum():.0f}/{of.sum():.0f} {np.median(cpu):.2f} {chosen}",
+            flush=True,
+        )
+
+
 WHAT = [
     "counts",
     "misfit",
@@ -400,6 +448,7 @@ WHAT = [
     "prices",
     "waves",
     "chain",
+    "courses",
 ]
 
 
@@ -431,6 +480,8 @@ def main() -> None:
         prices(asked.noises, asked.n)
     elif asked.what == "short":
         short(asked.n)
+    elif asked.what == "courses":
+        courses(asked.noises[0] or 0.05, asked.n)
     elif asked.what == "samples":
         samples()
     else:

@@ -15,7 +15,7 @@ import numpy as np
 
 import ep2sindy as ep
 from benchmarks.timing import cpu_s
-from ep2sindy.model.inputs import spline, spline_pieces
+from ep2sindy.model.inputs import Curve, curve_through
 from ep2sindy.model.solve import Border, Products, Solved, solve_stages
 
 PERIODS, PER_PERIOD = 10, 60
@@ -33,18 +33,16 @@ def run(rates: Callable, t: np.ndarray, y: np.ndarray, rtol: float) -> Solved:
     return solve_stages(rates, free, t, y, blow_up=np.inf, bound="", rtol=rtol, limit_s=300.0)
 
 
-def equations(system: ep.systems.System, curves: tuple[np.ndarray, np.ndarray]) -> Products:
+def equations(system: ep.systems.System, drive: Curve) -> Products:
     """Of a system; a driven one is pushed by its first input in its first state."""
     model, n = system.model, len(system.model.states)
-    table, coef = (
-        model.library.columns_of([*model.states, "u"][: n + curves[1].shape[2]]),
-        model.coef,
-    )
-    if curves[1].shape[2]:
+    n_inputs = drive.pieces.shape[2]
+    table, coef = model.library.columns_of([*model.states, "u"][: n + n_inputs]), model.coef
+    if n_inputs:
         degree = table.shape[1]
         table = np.concatenate([table, [[n, *[n + 1] * (degree - 1)]]])
         coef = np.concatenate([coef, 0.1 * np.eye(1, n)])
-    return Products(table, coef, np.ones(n), *curves)
+    return Products(table, coef, np.ones(n), drive)
 
 
 def row(name: str, rates: Products, t: np.ndarray, y: np.ndarray) -> str:
@@ -70,13 +68,13 @@ def main() -> None:
     for name, (system, period) in SYSTEMS.items():
         t = np.linspace(0.0, PERIODS * period, PERIODS * PER_PERIOD + 1)
         y = np.array(system.initial, dtype=np.float64)
-        print(row(name, equations(system, spline_pieces(None, 0)), t, y))
+        nothing = curve_through(t, np.empty((len(t), 0)), [])
+        print(row(name, equations(system, nothing), t, y))
         if name == "Lotka-Volterra":
             continue  # which noise drives out of its domain
         noise = np.random.default_rng(0).standard_normal((len(t), 1))
-        curves = spline_pieces(spline(t, noise), 1)
-        assert curves is not None
-        print(row(f"{name}, driven by noise", equations(system, curves), t, y))
+        drive = curve_through(t, noise, ["smooth"])
+        print(row(f"{name}, driven by noise", equations(system, drive), t, y))
 
 
 if __name__ == "__main__":

@@ -7,14 +7,16 @@ from itertools import count
 
 import numpy as np
 import pytest
+from scipy.interpolate import make_interp_spline
 
 import ep2sindy as ep
 from ep2sindy.model import kernels
-from ep2sindy.model.inputs import spline, spline_pieces
+from ep2sindy.model.inputs import curve_through, driven
 from ep2sindy.model.many import DrivenWindows, Ensemble, rk4_step
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import _scaled_rhs
 from ep2sindy.model.solve import Border, Products, Solved, _first_step, scheme, solve_stages
+from tests.models import model_of
 
 NO_BORDER = Border((), lambda _, y: y)
 
@@ -25,7 +27,8 @@ def run(rates: Callable, t: np.ndarray, y: np.ndarray, **settings: object) -> So
 
 
 def products(model: SparseModel) -> Products:
-    rates = _scaled_rhs(model, None, np.ones(len(model.states)))
+    nothing, _ = driven([], None, np.array([0.0, 1.0]), {})
+    rates = _scaled_rhs(model, nothing, np.ones(len(model.states)))
     assert isinstance(rates, Products)
     return rates
 
@@ -94,17 +97,19 @@ def test_the_dense_output_is_of_seventh_order() -> None:
 
 def test_inputs_are_the_spline_through_their_samples() -> None:
     t = np.sort(np.random.default_rng(0).uniform(0.0, 1.0, 40))
-    drive = spline(t, np.column_stack([np.sin(9.0 * t), t**3]))
-    curves = spline_pieces(drive, 2)
-    assert curves is not None
+    samples = np.column_stack([np.sin(9.0 * t), t**3])
+    spline, drive = make_interp_spline(t, samples, k=3), curve_through(t, samples, [None, "smooth"])
     # x' = u, y' = v: the slope is the input.
-    rates = Products(np.array([[2], [3]]), np.eye(2), np.ones(2), *curves)
+    rates = Products(np.array([[2], [3]]), np.eye(2), np.ones(2), drive)
     for at in np.linspace(t[0], t[-1], 301).tolist():
+        np.testing.assert_allclose(drive(at), spline(at), rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(rates(at, np.zeros(2)), drive(at), rtol=1e-12, atol=1e-12)
 
 
 def test_functions_of_ones_own_stay_with_scipy() -> None:
-    assert spline_pieces(lambda t: np.array([t]), 1) is None
+    t, model = np.array([0.0, 1.0]), model_of({"x": {"u": 1.0}}, inputs=["u"])
+    drive, _ = driven(["u"], {"u": np.sin}, t, {})
+    assert not isinstance(_scaled_rhs(model, drive, np.ones(1)), Products)
 
 
 @pytest.mark.parametrize("compiled", [True, False])

@@ -100,7 +100,9 @@ class TrajectorySearch:
     or correlated over some samples. max_terms: of one equation; None allows seven, and more where
     an equation of a large library needs them. align: if True, channels found to be late are shifted
     forward; if False, late channels make the model a misfit, and their delays are reported.
-    limit_s: wall time after which the search ends with the best that it has, and says so.
+    limit_s: wall time after which the search ends with the best that it has, and says so. courses:
+    input -> how it goes from one sample to the next, "held", "linear" or "smooth"; of others the
+    likeliest course is taken.
     selection: Evidence, or a rule that runs models, such as FreeRunScore. depth: candidates kept
     per size, for such a rule to judge.
     Raises ValueError for fewer than one term, or a rule that does not go with the search.
@@ -111,6 +113,7 @@ class TrajectorySearch:
     limit_s: float | None = None
     selection: SystemSelection | Selection = field(default_factory=Evidence)
     depth: int = 1
+    courses: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         set_counts(self, {"depth": 1} | ({} if self.max_terms is None else {"max_terms": 1}))
@@ -152,6 +155,7 @@ class TrajectorySearch:
             task,
             max_terms=self.max_terms,
             align=self.align,
+            courses=self.courses,
             limit_s=self.limit_s,
             provenance=provenance,
             progress=progress,
@@ -161,10 +165,11 @@ class TrajectorySearch:
         """Candidates of every equation with their scores, and the model by the selection rule."""
         fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
         if isinstance(self.selection, SystemSelection):
-            return choose_by_runs(
+            choice = choose_by_runs(
                 fronts, self.selection, task.relations, library=task.library, runs=task.runs,
                 provenance=found.model.provenance, progress=progress,
             )  # fmt: skip
+            return replace(choice, model=replace(choice.model, courses=found.model.courses))
         scores = self.selection.scores(fronts)
         scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
         return Choice(scored, [front.best for front in scored], found.model, found.note)

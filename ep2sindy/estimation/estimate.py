@@ -5,7 +5,7 @@ Besides the model, the result holds remarks: sentences about the samples and the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from ep2sindy.estimation.noise import FLOOR, Noise
 from ep2sindy.estimation.problem import (
     MIN_SAMPLES,
     EstimationProblem,
-    as_fitted,
+    by_run,
     scale_problem,
 )
 from ep2sindy.estimation.solver import (
@@ -135,6 +135,7 @@ def estimate(
     terms: Mapping[str, Sequence[str]] | None = None,
     hidden: Sequence[str] = (),
     exclude: Mapping[str, Sequence[str]] | None = None,
+    courses: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
     limit_s: float | None = None,
@@ -150,12 +151,14 @@ def estimate(
     relations: between coefficients, held in fit and search. terms: for each state whose equation is
     known but for its coefficients, all terms of that equation. hidden: states that nobody measured,
     which the library has; all ways in which they may enter are compared. exclude: for each state
-    that is named, terms of the library that its equation may not have. limit_s: wall time after
-    which the search ends with the best that it has, and says so; of long records it takes
-    parts first. progress: True shows bars, see
-    `Progress`; an interruption (Ctrl-C) then ends the search in the same way.
+    that is named, terms of the library that its equation may not have. courses: input -> how it
+    goes from one sample to the next, "held", "linear" or "smooth"; of others the likeliest course
+    is taken. limit_s: wall time after which the search ends with the best that it has, and says so;
+    of long records it takes parts first. progress: True shows bars, see `Progress`; an interruption
+    (Ctrl-C) then ends the search in the same way.
     Raises ValueError for fewer than one term, a limit that is not positive, a library that needs
-    more samples than there are or more memory, or whatever a `Task` refuses.
+    more samples than there are or more memory, an unknown input or course, or whatever a `Task`
+    refuses.
     """
     known = trajectories_of(runs, partial=True)
     task = Task(
@@ -170,6 +173,7 @@ def estimate(
         task,
         max_terms=max_terms,
         align=align,
+        courses=courses,
         units=units,
         provenance=provenance,
         limit_s=limit_s,
@@ -182,6 +186,7 @@ def estimate_task(
     *,
     max_terms: int | None,
     align: bool,
+    courses: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
     limit_s: float | None = None,
@@ -195,7 +200,7 @@ def estimate_task(
     bytes_each = check_size(task.runs, task.library, task.terms, tied=tied, limit_s=limit_s)
     watch, found, part = Watch(progress, limit_s), None, task.runs
     for larger in growing_parts(task.runs, bytes_each, watch):
-        latest = _answer(replace(task, runs=larger), max_terms, align, watch)
+        latest = _answer(replace(task, runs=larger), max_terms, align, courses, watch)
         if found is None or not watch.ended:  # a larger part tells more, once it is done with
             found, part = latest, larger
     assert found is not None
@@ -207,14 +212,18 @@ def estimate_task(
 
 
 def _answer(
-    task: Task, max_terms: int | None, align: bool, watch: Watch
+    task: Task,
+    max_terms: int | None,
+    align: bool,
+    courses: Mapping[str, str] | None,
+    watch: Watch,
 ) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task from all of its runs."""
     best = []
     for group in with_guesses(task) if task.hidden else [[(task, ())]]:
         tried = []
         for known, ways in group:
-            tried.append(_try(task, known, ways, max_terms, align, watch))
+            tried.append(_try(task, known, ways, max_terms, align, courses, watch))
             if watch.ended:
                 break
         best.append(min(tried, key=lambda each: each[0].rank))
@@ -240,6 +249,7 @@ def _try(
     ways: Sequence[Entrance],
     max_terms: int | None,
     align: bool,
+    courses: Mapping[str, str] | None,
     watch: Watch,
 ) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task by one way in which its hidden states may enter."""
@@ -249,7 +259,7 @@ def _try(
     def problem_of(library: Library) -> EstimationProblem:
         return scale_problem(
             known.runs, library, known.relations, known.terms, measured=measured,
-            exclude=known.exclude, watch=watch,
+            exclude=known.exclude, courses=courses, watch=watch,
         )  # fmt: skip
 
     problem = replace(
@@ -274,23 +284,6 @@ def _lonely_words(runs: Sequence[Trajectory], problem: EstimationProblem) -> tup
     )
 
 
-def _by_run(
-    answer: Explanation, runs: Sequence[Trajectory]
-) -> Iterator[tuple[Trajectory, Float[np.ndarray, "samples d"]]]:
-    """Each run as it was fitted, and its path in SI: the stretches of a run with gaps together."""
-    problem = answer.problem
-    pairs = list(zip(problem.records, answer.solution.annealed.fit.paths, strict=True))
-    for number, run in enumerate(runs):
-        own = [(record, path) for record, path in pairs if record.run == number]
-        times, samples, path = (
-            np.concatenate(parts)
-            for parts in zip(
-                *((record.times, record.samples, path) for record, path in own), strict=True
-            )
-        )
-        yield as_fitted(problem, times, samples, path, run), path * problem.scale
-
-
 def _report(
     answer: Explanation,
     model: SparseModel,
@@ -307,7 +300,7 @@ def _report(
             watch, list(enumerate(problem.states)), "equation", "rivals"
         )
     }
-    fitted, paths = zip(*_by_run(answer, runs), strict=True)
+    fitted, paths = zip(*by_run(problem, fit.paths, runs), strict=True)
     return Estimate(
         model=model,
         paths=paths,
@@ -372,7 +365,8 @@ def _model(
     known = found.fits and not answer.misfit
     free_cov = covariance(problem, fit, found.annealed.level) if known else None
     cov = None if free_cov is None else rows @ free_cov @ rows.T
-    return SparseModel(library, problem.states, coef, units, provenance, cov)
+    courses = dict(zip(problem.inputs, problem.courses, strict=True))
+    return SparseModel(library, problem.states, coef, units, provenance, cov, courses=courses)
 
 
 def _score_supports(

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.estimation.cost import OutOfTimeError
+from ep2sindy.estimation.courses import on_likeliest_courses
 from ep2sindy.estimation.lateness import (
     PAYS,
     SURE,
@@ -143,6 +144,7 @@ def _unfinished(
 
 def _explain(problem: EstimationProblem, max_terms: int | None, align: bool) -> Explanation:
     """`explain` without a limit to its time."""
+    problem = on_likeliest_courses(problem, max_terms=max_terms or FIRST_MAX_TERMS)
     problem, first, max_terms = _search_by_size(problem, max_terms)
     few_terms = max_terms_for(problem, max_terms)
     best, late, pushed = _solve(problem, first, few_terms)

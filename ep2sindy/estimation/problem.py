@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -17,6 +17,7 @@ from ep2sindy.estimation.cost import Watch
 from ep2sindy.estimation.flow import Flow, RightHandSides, Steps
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, constraint
+from ep2sindy.model.inputs import Curve, check_courses, curve_through, plausible_courses
 
 MIN_SAMPLES = 5  # of a record: a smoother accepts no fewer
 
@@ -26,16 +27,17 @@ class ScaledRecord:
     """A trajectory, or a stretch of it between gaps, in scaled variables.
 
     times: (samples,), and steps: (samples - 1,), in units of the mean step. samples: (samples, d).
-    inputs: at the samples; between them they are interpolated by cubics, or linearly if switched.
-    limits: of samples that are clipped or rounded. missing: (samples, d), true where nothing was
-    measured, as for all of a hidden state; the samples there are nothing but a start. None if all
-    were measured. run: number of the run that it is a stretch of. parts: the records of which this
-    one is made, one after the other; none for most.
+    inputs: at the samples, and their courses between them, see `model.inputs`. limits: of samples
+    that are clipped or rounded. missing: (samples, d), true where nothing was measured, as for all
+    of a hidden state; the samples there are nothing but a start. None if all were measured. run:
+    number of the run that it is a stretch of. parts: the records of which this one is made, one
+    after the other; none for most.
     """
 
     times: Float[np.ndarray, " samples"]
     samples: Float[np.ndarray, "samples d"]
     inputs: Float[np.ndarray, "samples n_inputs"]
+    courses: tuple[str, ...]
     limits: Bounds | None = None
     missing: Bool[np.ndarray, "samples d"] | None = None
     run: int = 0
@@ -58,7 +60,8 @@ class ScaledRecord:
             for name in ("times", "samples", "inputs")
         )
         missing = None if at_hand.all() else ~at_hand
-        return ScaledRecord(times, samples, inputs, limits, missing, parts=tuple(records))
+        courses = records[0].courses
+        return ScaledRecord(times, samples, inputs, courses, limits, missing, parts=tuple(records))
 
     @cached_property
     def breaks(self) -> Int[np.ndarray, " breaks"]:
@@ -122,27 +125,21 @@ class ScaledRecord:
 
     def inputs_at(self, share: float) -> Float[np.ndarray, "steps n_inputs"]:
         """Inputs at a given share of every step."""
-        if not self.inputs.shape[1]:
-            return np.empty((len(self.steps), 0))
         if self.parts:
             rows = [(part.inputs_at(share), part.inputs[-1:]) for part in self.parts]
             return np.concatenate([each for pair in rows for each in pair])[:-1]
-        return self._curve(self.times[:-1] + share * self.steps)
+        return self.curve.at(share)
 
     def divided(self, n_substeps: int) -> Steps:
         """The steps, each divided into equal substeps."""
         shares = np.linspace(0.0, 1.0, 2 * n_substeps + 1)
-        inputs = np.array([self.inputs_at(share) for share in shares])
+        inputs = np.array([self.inputs_at(share) for share in shares.tolist()])
         return Steps(self.steps / n_substeps, inputs)
 
     @cached_property
-    def _curve(self) -> Callable[[np.ndarray], np.ndarray]:
-        from scipy.interpolate import make_interp_spline  # imported only if there are inputs
-
-        # A switched input is constant over most steps, and cubics would overshoot at its jumps.
-        switched = (np.diff(self.inputs, axis=0) == 0.0).mean(axis=0) > 0.5
-        degree = 1 if switched.any() else min(3, len(self.inputs) - 1)
-        return make_interp_spline(self.times, self.inputs, k=degree)
+    def curve(self) -> Curve:
+        """The inputs between the samples."""
+        return curve_through(self.times, self.inputs, self.courses)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +156,8 @@ class EstimationProblem:
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
     measured: (d,), False for hidden states. watch: told of every step of a fit. whole: the
     problem with all terms, if this one has only those of a working set; places: (terms,), their
-    positions in its library. widen: makes the problem with all products of one degree more.
+    positions in its library. allowed_courses: of each input, the most plausible first. widen: makes
+    the problem with all products of one degree more.
     """
 
     library: Library
@@ -178,6 +176,7 @@ class EstimationProblem:
     measured: Bool[np.ndarray, " d"]
     places: Int[np.ndarray, " terms"]
     inputs: tuple[str, ...] = ()
+    allowed_courses: tuple[tuple[str, ...], ...] = ()
     watch: Watch = field(default_factory=Watch)
     whole: EstimationProblem | None = None
     widen: Callable[[], EstimationProblem] | None = None
@@ -228,6 +227,7 @@ class EstimationProblem:
             times=(run.t - run.t[0]) / self.step_s,
             samples=run.columns(self.states) / self.scale,
             inputs=run.columns(self.inputs) / self.input_scale,
+            courses=self.courses,
             limits=_limits(run, self.scale),
             missing=missing if missing.any() else None,
             run=number,
@@ -242,6 +242,16 @@ class EstimationProblem:
     def all_records(self) -> ScaledRecord:
         """All records as one."""
         return ScaledRecord.joined(self.records)
+
+    @property
+    def courses(self) -> tuple[str, ...]:
+        """The most plausible course of every input that is allowed."""
+        return tuple(options[0] for options in self.allowed_courses)
+
+    def on_courses(self, courses: tuple[str, ...]) -> EstimationProblem:
+        """The same records, their inputs on these courses alone."""
+        records = tuple(replace(record, courses=courses) for record in self.records)
+        return replace(self, records=records, allowed_courses=tuple(zip(courses)))
 
     @property
     def n_samples(self) -> int:
@@ -364,6 +374,7 @@ def scale_problem(
     *,
     measured: Sequence[str] = (),
     exclude: Mapping[str, Sequence[str]] | None = None,
+    courses: Mapping[str, str] | None = None,
     watch: Watch | None = None,
 ) -> EstimationProblem:
     """Scale records and library, and collect the coefficients that may be in the model.
@@ -371,10 +382,14 @@ def scale_problem(
     relations: hold between coefficients. terms: for each state whose equation is known but for its
     coefficients, all terms of that equation. measured: names of states; empty means all. exclude:
     for each state that is named, terms that its equation may not have. Inputs that the library does
-    not have are left out; the others are taken by name, in the order of the first run.
+    not have are left out; the others are taken by name, in the order of the first run. courses: of
+    inputs between their samples; others have all courses that their samples allow.
+    Raises ValueError for an unknown input or course.
     """
     states = runs[0].state_names
     inputs = [name for name in runs[0].input_names if name in library.variables]
+    told = {name: (course,) for name, course in check_courses(courses or {}, inputs).items()}
+    allowed = {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | told
     names = [*states, *inputs]
     over = library.over(names)
     values = np.concatenate([run.columns(names) for run in runs])
@@ -403,12 +418,29 @@ def scale_problem(
         measured=np.isin(states, measured or states),
         places=np.arange(len(over)),
         inputs=tuple(inputs),
+        allowed_courses=tuple(allowed.values()),
         watch=watch or Watch(),
     )
     return problem.of(runs)
 
 
-def as_fitted(
+def by_run(
+    problem: EstimationProblem, paths: Sequence[np.ndarray], runs: Sequence[Trajectory]
+) -> Iterator[tuple[Trajectory, Float[np.ndarray, "samples d"]]]:
+    """Each run as it was fitted, and its path in SI: the stretches of a run with gaps together."""
+    pairs = list(zip(problem.records, paths, strict=True))
+    for number, run in enumerate(runs):
+        own = [(record, path) for record, path in pairs if record.run == number]
+        times, samples, path = (
+            np.concatenate(parts)
+            for parts in zip(
+                *((record.times, record.samples, path) for record, path in own), strict=True
+            )
+        )
+        yield _as_fitted(problem, times, samples, path, run), path * problem.scale
+
+
+def _as_fitted(
     problem: EstimationProblem,
     times: np.ndarray,
     samples: np.ndarray,

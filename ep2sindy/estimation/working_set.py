@@ -166,8 +166,11 @@ def _integrals(
     """
     record, path = problem.all_records, joined(paths)
     with np.errstate(over="ignore", invalid="ignore"):
-        values = problem.library.evaluate(np.concatenate([path, record.inputs], axis=1))
-        integrals = 0.5 * record.steps[:, None] * (values[1:] + values[:-1])
+        ends = [
+            problem.library.evaluate(np.concatenate([states, record.inputs_at(share)], axis=1))
+            for states, share in ((path[:-1], 0.0), (path[1:], 1.0))
+        ]
+        integrals = 0.5 * record.steps[:, None] * (ends[0] + ends[1])
     return np.where(np.isfinite(integrals).all(axis=0), integrals, 0.0)
 
 

@@ -99,7 +99,7 @@ def forecasts(
     starts = np.concatenate([draw_normal(end.mean, end.covariance, n_draws, rng) for end in ends])
     coef = draw_coef(model, model.covariance, len(starts), rng)
     grid = np.append(begins[0], times[0])
-    drive, _ = driven(model.inputs, inputs, grid)
+    drive, _ = driven(model.inputs, inputs, grid, model.courses)
     runs = draw_runs(
         model,
         grid,

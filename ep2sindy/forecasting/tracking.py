@@ -207,7 +207,9 @@ def track(
         )
     own = _of_model(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
     terms = {state: list(model.terms(state)) for state in model.states}
-    problem = scale_problem([own], model.library, terms=terms, measured=names)
+    problem = scale_problem(
+        [own], model.library, terms=terms, measured=names, courses=model.courses
+    )
     paths, free = [record.samples.copy() for record in problem.records], _free_of(model, problem)
     # Differences remove what is smooth; those of white noise have a variance of 20.
     differences = np.concatenate([np.diff(path, n=3, axis=0) for path in paths])

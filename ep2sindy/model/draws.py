@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.model.inputs import Drive
+from ep2sindy.model.inputs import Curve
+from ep2sindy.model.many import rk4_step
 from ep2sindy.model.rollout import Equations, terms_in_use
 
 # Substeps between two samples: the fewest whose central run differs from that of twice as many by
@@ -60,7 +62,7 @@ def draw_runs(
     starts: Float[np.ndarray, "draws n_states"],
     coef: Float[np.ndarray, "draws terms n_states"],
     *,
-    drive: Drive | None = None,
+    drive: Curve | None = None,
     push_std: Float[np.ndarray, " n_states"] | None = None,
     push_step_s: float = 1.0,
     reach: Float[np.ndarray, " n_states"],
@@ -68,9 +70,9 @@ def draw_runs(
 ) -> Float[np.ndarray, "draws samples n_states"]:
     """Integrate a model once for every draw, by classical Runge-Kutta steps between the samples.
 
-    drive: inputs at a time in s. push_std: standard deviation of the random push that every state
-    receives in push_step_s; None for none. reach: largest states expected, in SI. A run that goes a
-    hundred times farther has diverged, and is NaN from there on.
+    drive: the inputs between these samples. push_std: standard deviation of the random push that
+    every state receives in push_step_s; None for none. reach: largest states expected, in SI. A run
+    that goes a hundred times farther has diverged, and is NaN from there on.
     """
     if len(t) < 2:  # of a run that ended at its start
         return starts[:, None][:, : len(t)]
@@ -79,7 +81,7 @@ def draw_runs(
     coef = np.ascontiguousarray(coef[:, rows])
     gather = [[*model.states, *model.inputs].index(name) for name in library.variables]
 
-    def rates(time: float, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+    def rates(x: np.ndarray, time: float, c: np.ndarray) -> np.ndarray:
         values = x if drive is None else np.column_stack([x, np.tile(drive(time), (len(x), 1))])
         return np.einsum("nt,nts->ns", library.evaluate(values[:, gather]), c)
 
@@ -109,7 +111,7 @@ def _enough_substeps(
         steps = [
             np.concatenate(
                 [
-                    _step(rates, t[k], t[k + 1] - t[k], finer[:, k], coef, m) - finer[:, k]
+                    _step(rates, t[k], t[k + 1], finer[:, k], coef, m) - finer[:, k]
                     for k in np.linspace(0, len(t) - 2, min(len(t) - 1, 40)).astype(int)
                 ]
             )
@@ -138,7 +140,7 @@ def _integrate(
     runs = np.full((len(x), len(t), x.shape[1]), np.nan)
     runs[:, 0] = x
     for k in range(len(t) - 1):
-        x = _step(rates, t[k], t[k + 1] - t[k], x, coef, n_substeps)
+        x = _step(rates, t[k], t[k + 1], x, coef, n_substeps)
         if pushes is not None and rng is not None:
             x = x + pushes[k] * rng.standard_normal(x.shape)
         x = np.where((np.abs(x) <= bound).all(axis=1)[:, None], x, np.nan)
@@ -149,20 +151,17 @@ def _integrate(
 def _step(
     rates: Callable[..., np.ndarray],
     t: float,
-    duration: float,
+    end_t: float,
     x: np.ndarray,
     coef: np.ndarray,
     n_substeps: int,
 ) -> np.ndarray:
-    """Classical Runge-Kutta steps over a duration (Hairer, Norsett & Wanner 1993, II.1)."""
-    h = duration / n_substeps
+    """Classical Runge-Kutta steps up to a time."""
+    h, before_end = (end_t - t) / n_substeps, np.nextafter(end_t, -np.inf)
     for k in range(n_substeps):
         now = t + k * h
-        one = rates(now, x, coef)
-        two = rates(now + 0.5 * h, x + 0.5 * h * one, coef)
-        three = rates(now + 0.5 * h, x + 0.5 * h * two, coef)
-        four = rates(now + h, x + h * three, coef)
-        x = x + h / 6.0 * (one + 2.0 * two + 2.0 * three + four)
+        nodes = now, now + 0.5 * h, min(now + h, before_end)  # inputs may jump at the end
+        x = rk4_step(partial(rates, c=coef), x, nodes, h)
     return x
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from math import factorial
 from typing import Any
 
@@ -10,7 +11,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-Drive = Callable[[float], np.ndarray]
+from ep2sindy.data.trajectory import read_only_mapping
+
+# How an input goes from one sample to the next, and the degree of the spline that does: it holds
+# the value of the last sample, or follows a straight line, or a smooth curve.
+COURSES = {"held": 0, "linear": 1, "smooth": 3}
 
 
 def inputs_at_samples(
@@ -37,62 +42,97 @@ def inputs_at_samples(
     return values
 
 
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Inputs between samples: in each step a polynomial of the share of it that has passed.
+
+    t: (samples,). pieces: (powers, steps, n_inputs), the highest power first. stops: times at
+    which an input jumps or bends, where a scheme of high order must start anew. functions: of time
+    in s, by column, which take the place of the polynomials.
+    """
+
+    t: Float[np.ndarray, " samples"]
+    pieces: Float[np.ndarray, "powers steps n_inputs"]
+    stops: Float[np.ndarray, " _"]
+    functions: Mapping[int, Callable[[float], float]] = field(default_factory=dict)
+
+    def __call__(self, now: float) -> Float[np.ndarray, " n_inputs"]:
+        """The inputs at one time; at a sample they have jumped already."""
+        place = min(max(int(self.t.searchsorted(now, "right")) - 1, 0), len(self.t) - 2)
+        share = (now - self.t[place]) / (self.t[place + 1] - self.t[place])
+        values = np.polyval(self.pieces[:, place], share)
+        for column, function in self.functions.items():
+            values[column] = function(now)
+        return values
+
+    def at(self, share: float) -> Float[np.ndarray, "steps n_inputs"]:
+        """The inputs at a given share of every step; at its end they have not jumped yet."""
+        return np.polyval(self.pieces, share)
+
+
+def curve_through(
+    t: Float[np.ndarray, " samples"],
+    samples: Float[np.ndarray, "samples n_inputs"],
+    courses: Sequence[str | None],
+) -> Curve:
+    """Inputs through their samples, each on its course; None takes the most plausible one."""
+    n_steps, n_inputs = len(t) - 1, len(courses)
+    pieces = np.zeros((1 + max(COURSES.values()), n_steps, n_inputs))
+    rough = np.zeros(n_steps - 1, dtype=np.bool_)
+    if n_inputs:
+        from scipy.interpolate import make_interp_spline  # imported only for models with inputs
+    for j, column in enumerate(samples.T):
+        degree = COURSES[courses[j] or plausible_courses([column])[0]]
+        curve = make_interp_spline(t, column, k=min(degree, n_steps))
+        for power in range(curve.k + 1):
+            slope = curve.derivative(power)(t[:-1])
+            pieces[-1 - power, :, j] = slope * np.diff(t) ** power / factorial(power)
+        if degree < COURSES["smooth"]:
+            rough |= (np.diff(pieces[..., j]) != 0.0).any(axis=0)
+    return Curve(t, pieces, t[1:-1][rough])
+
+
+def plausible_courses(samples: Sequence[np.ndarray]) -> tuple[str, ...]:
+    """Courses that the samples of one input allow, over some records, the most plausible first.
+
+    What rests over most steps is set, and a cubic would overshoot at its jumps. A record whose
+    noise exceeds half its resolution repeats its last value less often.
+    """
+    resting = np.concatenate([np.diff(each, axis=0) == 0.0 for each in samples])
+    if resting.all():
+        return ("held",)
+    return ("held", "linear") if resting.mean() > 0.5 else ("smooth", "linear", "held")
+
+
+def check_courses(courses: Mapping[str, str], inputs: Sequence[str]) -> Mapping[str, str]:
+    """Return a read-only copy. Raises ValueError for an unknown input, or an unknown course."""
+    for name, course in courses.items():
+        if name not in inputs or course not in COURSES:
+            raise ValueError(
+                f"courses must give one of {list(COURSES)} for some of the inputs {list(inputs)}: "
+                f"got {name!r}: {course!r}"
+            )
+    return read_only_mapping(dict(courses))
+
+
 def driven(
     names: Sequence[str],
     inputs: ArrayLike | Mapping[str, Any] | None,
     t: Float[np.ndarray, " samples"],
-) -> tuple[Drive | None, Float[np.ndarray, "samples n_inputs"]]:
-    """Inputs as one function of time, or None without inputs, and their samples at t.
+    courses: Mapping[str, str],
+) -> tuple[Curve, Float[np.ndarray, "samples n_inputs"]]:
+    """Inputs between the samples, each on its course, and their samples at t.
 
     Functions given by name are called at every time that the solver needs, with t in s.
-    Samples are interpolated by cubic splines.
     """
     given = dict(inputs) if isinstance(inputs, Mapping) else {}
     functions = {name: value for name, value in given.items() if callable(value)}
     at_samples = {n: np.array([f(now) for now in t.tolist()]) for n, f in functions.items()}
     samples = inputs_at_samples(names, {**given, **at_samples} if given else inputs, (len(t),))
-    if not names:
-        return None, samples
-    smooth = spline(t, samples)
-    if not functions:
-        return smooth, samples
-
-    def drive(now: float) -> np.ndarray:
-        values = smooth(now)
-        for name, function in functions.items():
-            values[list(names).index(name)] = function(now)
-        return values
-
-    return drive, samples
-
-
-def spline(
-    t: Float[np.ndarray, " samples"], inputs: Float[np.ndarray, "samples n_inputs"]
-) -> Drive:
-    """Cubic spline through the samples of the inputs."""
-    from scipy.interpolate import make_interp_spline  # imported only for models with inputs
-
-    return make_interp_spline(t, inputs, k=min(3, len(inputs) - 1))
-
-
-def spline_pieces(
-    drive: Drive | None, n_inputs: int
-) -> tuple[Float[np.ndarray, " breaks"], Float[np.ndarray, "order spans n_inputs"]] | None:
-    """Breaks of a spline of inputs, and its polynomial coefficients, the highest power first.
-
-    The polynomials are in the time since the last break. Both arrays are empty for a model
-    without inputs. Returns None for inputs that are user functions.
-    """
-    if drive is None:
-        return np.zeros(0), np.zeros((0, 0, n_inputs))
-    from scipy.interpolate import BSpline
-
-    if not isinstance(drive, BSpline):
-        return None
-    breaks = np.unique(drive.t[drive.k : len(drive.t) - drive.k])
-    powers = range(drive.k, -1, -1)
-    pieces = [drive.derivative(m)(breaks[:-1]) / factorial(m) for m in powers]
-    return breaks, np.ascontiguousarray(pieces)
+    # A function is called, and its own bends are not known: nothing stops there.
+    known = ["smooth" if name in functions else courses.get(name) for name in names]
+    by_column = {list(names).index(name): function for name, function in functions.items()}
+    return replace(curve_through(t, samples, known), functions=by_column), samples
 
 
 def _check_names(names: Sequence[str], given: Mapping[str, Any]) -> None:

@@ -3,8 +3,7 @@
 The equations are sums of products, given as a tuple (table, coef, scale, breaks, pieces). The
 columns are the states, the inputs and a one; row k of `table` lists the columns whose product is
 term k. coef: (terms, n), already divided by the scale of the state. scale: (n,), factors from the
-solver's states to SI. breaks: (m + 1,), pieces: (order, m, inputs): the inputs as cubics in the
-time since the last break; without inputs, pieces has shape (0, 0, 0).
+solver's states to SI. breaks: (m + 1,), pieces: (powers, m, inputs): see `inputs.Curve`.
 
 The scheme is a tuple of its coefficients (a, b, c, e3, e5, a_dense, c_dense, dense), as published:
 Hairer, Norsett & Wanner 1993, Solving Ordinary Differential Equations I, II.5, II.6 and II.10;
@@ -50,11 +49,11 @@ def rates(equations, t, y, columns, slope):
                 place = middle
             else:
                 above = middle
-        since = t - breaks[place]
+        share = (t - breaks[place]) / (breaks[place + 1] - breaks[place])
         for j in range(n_inputs):
             value = 0.0
             for power in range(len(pieces)):
-                value = value * since + pieces[power, place, j]
+                value = value * share + pieces[power, place, j]
             columns[n + j] = value
     _add_terms(table, coef, columns, slope)
 
@@ -128,6 +127,7 @@ def _room(y, blow_up):
 def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
     """One step within the tolerance, from y to `at`; the slope at `at` is row 12 of `slopes`.
 
+    Inputs that jump at its end have not jumped yet.
     Returns the time reached, the length of the step, the length to try next and the number of
     evaluations. If the step became too small, the time returned is the start of the step.
     """
@@ -137,14 +137,16 @@ def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
     while h >= least:
         ahead = min(t + h, end_t)
         h = ahead - t
+        before_end = np.nextafter(ahead, -np.inf)
         for s in range(1, 12):
-            _stage(equations, t + c[s] * h, y, h, a[s], s, slopes, at, columns)
+            now = min(t + c[s] * h, before_end)
+            _stage(equations, now, y, h, a[s], s, slopes, at, columns)
         for i in range(len(y)):
             value = 0.0
             for s in range(12):
                 value += slopes[s, i] * b[s]
             at[i] = y[i] + h * value
-        rates(equations, ahead, at, columns, slopes[12])
+        rates(equations, before_end, at, columns, slopes[12])
         calls += 12
         error = _error(e3, e5, slopes, h, y, at, rtol)
         if error < 1.0:
@@ -162,13 +164,16 @@ def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
 
 
 @compiled(error_model="numpy")
-def advance(equations, scheme, times, out, y, slope, t, h, place, calls, limit, blow_up, rtol):
+def advance(
+    equations, scheme, times, stops, out, y, slope, t, h, place, calls, limit, blow_up, rtol
+):
     """Integrate to the last of `times`, filling rows of `out` from `place` on.
 
-    y and slope are updated in place. h: the step to try. Returns the reason for stopping, the
-    time, the step to try next, the next place and the number of evaluations. Reasons: FINISHED;
-    LOOK: `limit` evaluations have been exceeded; CROSSED: the largest state crossed `blow_up` in
-    the last step, and samples are filled up to the crossing; FAILED: the step became too small.
+    stops: times at which inputs jump or bend, then the last time: no step goes beyond. y and slope
+    are updated in place. h: the step to try. Returns the reason for stopping, the time, the step to
+    try next, the next place and the number of evaluations. Reasons: FINISHED; LOOK: `limit`
+    evaluations have been exceeded; CROSSED: the largest state crossed `blow_up` in the last step,
+    and samples are filled up to the crossing; FAILED: the step became too small.
     """
     n = len(y)
     slopes, shape = np.empty((16, n)), np.empty((7, n))
@@ -176,9 +181,10 @@ def advance(equations, scheme, times, out, y, slope, t, h, place, calls, limit, 
     for i in range(n):  # array expressions take seconds longer to compile
         slopes[0, i] = slope[i]
     inside = _room(y, blow_up) >= 0.0
+    stop = np.searchsorted(stops, t, "right")
     while t < times[-1]:
         ahead, length, h, n_calls = _step(
-            equations, scheme, t, h, times[-1], y, at, slopes, columns, rtol
+            equations, scheme, t, h, stops[stop], y, at, slopes, columns, rtol
         )
         calls += n_calls
         if ahead == t:
@@ -193,11 +199,15 @@ def advance(equations, scheme, times, out, y, slope, t, h, place, calls, limit, 
                 if crossed and (_room(out[place], blow_up) >= 0.0) != inside:
                     break
                 place += 1
+        t = ahead
+        if t == stops[stop]:
+            stop += 1
+            rates(equations, t, at, columns, slopes[12])
+            calls += 1
         for i in range(n):
             y[i] = at[i]
             slopes[0, i] = slopes[12, i]
             slope[i] = slopes[12, i]
-        t = ahead
         if crossed:
             return CROSSED, t, h, place, calls
         if over:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,7 +13,7 @@ from jaxtyping import Float, Int
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.model import kernels
-from ep2sindy.model.inputs import spline
+from ep2sindy.model.inputs import curve_through
 
 # Integration steps per sample. One step suffices for the true model of every noise-free system of
 # `systems`: its error stays below 1e-9 variances. The second step is for sparser samples.
@@ -45,11 +46,10 @@ class DrivenWindows:
         samples = starts + np.arange(n_steps + 1)[:, None]
         t = run.t[samples]
         steps_s = np.repeat(np.diff(t, axis=0) / N_SUBSTEPS, N_SUBSTEPS, axis=0)
-        begins = t[0] + np.cumsum(steps_s, axis=0) - steps_s
-        nodes = begins[:, None] + np.array([0.0, 0.5, 1.0])[:, None] * steps_s[:, None]
-        drive = np.empty((0, *nodes.shape))
-        if inputs:
-            drive = np.moveaxis(np.asarray(spline(run.t, run.columns(inputs))(nodes)), -1, 0)
+        curve = curve_through(run.t, run.columns(inputs), [None] * len(inputs))
+        shares = (np.arange(N_SUBSTEPS)[:, None] + [0.0, 0.5, 1.0]) / N_SUBSTEPS
+        nodes = [[curve.at(share)[samples[:-1]] for share in row] for row in shares.tolist()]
+        drive = np.array(nodes).transpose(4, 2, 0, 1, 3).reshape(-1, len(steps_s), 3, len(starts))
         return DrivenWindows(steps_s, drive, smoothed[starts].T)
 
     @staticmethod
@@ -161,15 +161,15 @@ class Ensemble:
 
 
 def rk4_step(
-    slope: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    slope: Callable[[np.ndarray, Any], np.ndarray],
     x: np.ndarray,
-    inputs: tuple[np.ndarray, np.ndarray, np.ndarray],
+    inputs: tuple[Any, Any, Any],
     step_s: float | np.ndarray,
 ) -> np.ndarray:
     """One fourth-order Runge-Kutta step of x' = slope(x, inputs).
 
-    inputs: at the start, middle and end of the step. step_s: one number, or an array that
-    broadcasts.
+    inputs: at the start, middle and end of the step, or the times of these. step_s: one number, or
+    an array that broadcasts.
     Source: Hairer, Norsett & Wanner 1993, Solving Ordinary Differential Equations I, II.1.
     """
     start, middle, end = inputs

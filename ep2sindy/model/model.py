@@ -20,7 +20,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.draws import draw_coef, draw_runs
-from ep2sindy.model.inputs import driven, inputs_at_samples
+from ep2sindy.model.inputs import check_courses, driven, inputs_at_samples
 from ep2sindy.model.rollout import Rollout, check_start, rates, rollout, simulate
 from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
@@ -41,7 +41,9 @@ class SparseModel:
     units: of the states and of the library's variables. provenance: origin of the model.
     covariance: (coefs, coefs) of the nonzero coefficients, in SI, ordered by equation and within
     each equation in the order of the library; None if it is not known. clock: unit of time in which
-    the equations are shown; coefficients stay in SI.
+    the equations are shown; coefficients stay in SI. courses: input -> how it goes from one sample
+    to the next, "held" (at the value of the last one), "linear" or "smooth" (a cubic spline). An
+    input without one is held if its samples rest over most steps, and else smooth.
 
     >>> library = ep.polynomial(["x", "v"], degree=1)
     >>> spring = ep.coef_matrix(library, [{"v": 1.0}, {"x": -4.0}])
@@ -57,6 +59,7 @@ class SparseModel:
     provenance: Mapping[str, str] = field(default_factory=dict)
     covariance: Float[np.ndarray, "_ _"] | None = None
     clock: Clock = SECONDS
+    courses: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "states", tuple(self.states))
@@ -65,6 +68,7 @@ class SparseModel:
         units = {name: self.units.get(name, "1") for name in names}
         object.__setattr__(self, "units", MappingProxyType(units))
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
+        object.__setattr__(self, "courses", check_courses(self.courses, self.inputs))
         if len(set(self.states)) < len(self.states):
             raise ValueError(f"states must be unique: {list(self.states)} came")
         if self.coef.shape != (len(self.library), len(self.states)):
@@ -91,7 +95,8 @@ class SparseModel:
         if not isinstance(other, SparseModel):
             return NotImplemented
         mine, theirs = (
-            (m.states, m.library.variables, m.library.names, m.units) for m in (self, other)
+            (m.states, m.library.variables, m.library.names, m.units, m.courses)
+            for m in (self, other)
         )
         if mine != theirs or not np.array_equal(self.coef, other.coef):
             return False
@@ -155,7 +160,7 @@ class SparseModel:
         rtol: float = 1e-8,
         limit_s: float = 300.0,
     ) -> Rollout:
-        """Integrate from one sample of a trajectory, driven by its inputs (cubic splines).
+        """Integrate from one sample of a trajectory, driven by its inputs (see `courses`).
 
         trajectory: a Trajectory, a table or arrays (t, x), as `discover` takes them.
         initial: the state at that sample, in SI; None takes the data's.
@@ -191,8 +196,8 @@ class SparseModel:
         """Integrate freely from the state x0 at t[0]; returns the states at the times t.
 
         t: (samples,) in s, increasing. x0: (n_states,), in SI, or a mapping by name. inputs:
-        (samples, n_inputs) at t, interpolated by cubic splines; or a mapping from name to samples,
-        a number, or a function of t in s.
+        (samples, n_inputs) at t, between which they follow the model's `courses`; or a mapping from
+        name to samples, a number, or a function of t in s.
         Returns a `Rollout`, whose `trajectory()` is the run as data. A run that diverges also
         returns one, marked `diverged` and with a message. It ends when a state exceeds `blow_up`
         times its scale, or when the solver gives up (see `rollout`). The scale of a state is its
@@ -214,7 +219,8 @@ class SparseModel:
             )
         coef = draw_coef(self, self.covariance, draws, np.random.default_rng(seed))
         starts = np.tile(check_start(self.states, x0), (draws, 1))
-        drive, _ = driven(self.inputs, inputs, np.asarray(t, dtype=np.float64))
+        times = np.asarray(t, dtype=np.float64)
+        drive, _ = driven(self.inputs, inputs, times, self.courses)
         reached = np.abs(run.states).max(axis=0, initial=0.0)
         return replace(run, draws=draw_runs(self, run.t, starts, coef, drive=drive, reach=reached))
 
@@ -331,6 +337,7 @@ class SparseModel:
             provenance=self.provenance,
             covariance=self.covariance,
             clock=self.clock,
+            courses=self.courses,
         )
 
     @staticmethod

@@ -15,7 +15,7 @@ from ep2sindy.data.numbers import band_of, zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.model.inputs import Drive, driven, spline, spline_pieces
+from ep2sindy.model.inputs import Curve, curve_through, driven
 from ep2sindy.model.solve import Border, Products, Rates, edges_of, solve_stages
 from ep2sindy.runtime.screen import one_screen, text_table
 
@@ -45,6 +45,9 @@ class Equations(Protocol):
 
     @property
     def units(self) -> Mapping[str, str]: ...
+
+    @property
+    def courses(self) -> Mapping[str, str]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +156,7 @@ def rollout(
         model,
         window.t,
         data[0] if initial is None else initial,
-        drive=spline(window.t, inputs) if model.inputs else None,
+        drive=curve_through(window.t, inputs, list(map(model.courses.get, model.inputs))),
         samples=inputs,
         scale=np.abs(data).max(axis=0),
         blow_up=blow_up,
@@ -183,7 +186,7 @@ def simulate(
     times = np.asarray(t, dtype=np.float64)
     start = check_start(model.states, x0, hint="; the order is simulate(t, x0)")
     check_time(times)
-    drive, samples = driven(model.inputs, inputs, times)
+    drive, samples = driven(model.inputs, inputs, times, model.courses)
     # An input may begin at zero as well: its largest sample tells what it does to a state.
     driving = np.take_along_axis(samples, np.abs(samples).argmax(axis=0, keepdims=True), axis=0)
     sizes = start_scale(model, start, driving[0], float(times[-1] - times[0]))
@@ -256,7 +259,7 @@ def _integrate(
     t: np.ndarray,
     x0: np.ndarray,
     *,
-    drive: Drive | None,
+    drive: Curve,
     samples: np.ndarray,
     scale: np.ndarray,
     blow_up: float,
@@ -274,6 +277,7 @@ def _integrate(
         border,
         t,
         x0 / scale,
+        stops=drive.stops,
         blow_up=blow_up,
         bound=bound,
         rtol=rtol,
@@ -313,30 +317,30 @@ def _rollout_of(
     )
 
 
-def _border(model: Equations, start: np.ndarray, drive: Drive | None, scale: np.ndarray) -> Border:
+def _border(model: Equations, start: np.ndarray, drive: Curve, scale: np.ndarray) -> Border:
     """Border of the domain of the functions that the model uses."""
 
     def values(t: float, y: np.ndarray) -> np.ndarray:
-        return y * scale if drive is None else np.append(y * scale, drive(t))
+        return np.append(y * scale, drive(t)) if model.inputs else y * scale
 
     library, _ = terms_in_use(model.library, model.coef)
     return Border(edges_of(library.functions, [*model.states, *model.inputs], start), values)
 
 
-def _scaled_rhs(model: Equations, drive: Drive | None, scale: np.ndarray) -> Rates:
+def _scaled_rhs(model: Equations, drive: Curve, scale: np.ndarray) -> Rates:
     """Right-hand side for scaled states, without the terms whose coefficients are all zero."""
     present = np.flatnonzero(model.coef.any(axis=1))
     coef, known = model.coef[present] / scale, [*model.states, *model.inputs]
-    curves = spline_pieces(drive, len(model.inputs))
     uses_functions = model.library.exponents[present, len(model.library.variables) :].any()
-    if curves is not None and not uses_functions:
-        return Products(model.library.columns_of(known, present), coef, scale, *curves)
+    if not (drive.functions or uses_functions):
+        table = model.library.columns_of(known, present)
+        return Products(table, coef, scale, drive)
     values, terms = model.library.at_points(known, present)
     n = len(model.states)
 
     def rhs(t: float, y: np.ndarray) -> np.ndarray:
         values[:n] = y * scale
-        if drive is not None:
+        if model.inputs:
             values[n:] = drive(t)
         return terms() @ coef
 

@@ -8,14 +8,16 @@ which `Border` finds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import pairwise
 from time import monotonic
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.library.functions import Function, Interval
+from ep2sindy.model.inputs import Curve
 
 # Largest number of evaluations of the right-hand side in a run: a hundred times what an oscillation
 # needs that its samples resolve. A model that blows up in ever smaller steps stops there.
@@ -38,20 +40,18 @@ class Products:
     """Right-hand side made of products of states and inputs, which compiled code can evaluate.
 
     table: indices of the columns that each term multiplies; columns are the states, the inputs
-    and a one. coef: in units of the scale. breaks, pieces: the inputs as cubics in the time since
-    the last break.
+    and a one. coef: in units of the scale. drive: the inputs in time.
     """
 
     table: Int[np.ndarray, "terms degree"]
     coef: Float[np.ndarray, "terms n_states"]
     scale: Float[np.ndarray, " n_states"]
-    breaks: Float[np.ndarray, " _"]
-    pieces: Float[np.ndarray, "order spans n_inputs"]
+    drive: Curve
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         from ep2sindy.model import kernels
 
-        slope, columns = np.empty(len(y)), np.ones(len(y) + self.pieces.shape[2] + 1)
+        slope, columns = np.empty(len(y)), np.ones(len(y) + self.drive.pieces.shape[2] + 1)
         # Copied: kernels would be compiled again for a strided or read-only array.
         kernels.rates(self.parts, float(t), np.array(y), columns, slope)
         return slope
@@ -59,7 +59,7 @@ class Products:
     @cached_property
     def parts(self) -> tuple[np.ndarray, ...]:
         """Arguments of the compiled functions; see `model.kernels`."""
-        parts = self.table, self.coef, self.scale, self.breaks, self.pieces
+        parts = self.table, self.coef, self.scale, self.drive.t, self.drive.pieces
         return tuple(np.array(part, order="C") for part in parts)
 
 
@@ -98,6 +98,7 @@ class Counted:
     budget: int
     clock: Clock
     deadline: float
+    stops: Float[np.ndarray, " _"]
     began_s: float = np.inf
     calls: int = 0
     look_at: int = FIRST_LOOK
@@ -155,6 +156,7 @@ def solve_stages(
     t: Float[np.ndarray, " samples"],
     y: Float[np.ndarray, " n_states"],
     *,
+    stops: Sequence[float] | Float[np.ndarray, " _"] = (),
     blow_up: float,
     bound: str,
     rtol: float,
@@ -166,16 +168,17 @@ def solve_stages(
     The run ends early if a state exceeds `blow_up`, leaves the domain or exhausts the budget.
     `Products` are integrated by compiled functions. If stability limits the steps, an implicit
     method continues the run, with the same number of evaluations again.
+    stops: times among t at which the inputs jump or bend; every method starts anew there.
     bound: the quantity that `blow_up` is a multiple of, in words. clock: measures `limit_s`.
     """
     began = clock()
     budget = CALLS + CALLS_PER_SAMPLE * len(t)
-    rhs = Counted(rates, border, budget, clock, began + limit_s, float(t[0]))
+    rhs = Counted(rates, border, budget, clock, began + limit_s, np.asarray(stops), float(t[0]))
     with np.errstate(over="ignore", invalid="ignore"):  # on the way to a blow-up
         if not np.isfinite(rhs(t[0], y)).all():
             text = f"the first step overflows: a rate at t = {t[0]:.6g} s is not finite"
             return Solved(t[:1], y[None], True, text)
-        explicit = _compiled_stage if isinstance(rates, Products) else _explicit_stage
+        explicit = _compiled_stage if isinstance(rates, Products) else _scipy_stage
         found = explicit(rhs, t, y, blow_up, rtol)
         if rhs.stiff:
             return _implicit(found, rhs, t, blow_up, bound, rtol)
@@ -189,9 +192,9 @@ def _implicit(
     began, at, state = rhs.clock(), before.last_s, before.last
     assert state is not None, "a run that is found to be stiff has been stopped there"
     # began_s is left at infinity, so that this part is never taken for stiff.
-    rest = Counted(rhs.rates, rhs.border, rhs.budget, rhs.clock, rhs.deadline)
+    rest = Counted(rhs.rates, rhs.border, rhs.budget, rhs.clock, rhs.deadline, rhs.stops)
     try:
-        found = _scipy_stage(rest, IMPLICIT, np.append(at, t[t > at]), state, blow_up, rtol)
+        found = _scipy_stage(rest, np.append(at, t[t > at]), state, blow_up, rtol, IMPLICIT)
     except (ValueError, np.linalg.LinAlgError):  # raised for slopes that are not finite
         text = f"the equations are stiff, and overflow, at t = {at:.6g} s"
         return Solved(before.t, before.y, True, text)
@@ -202,17 +205,31 @@ def _implicit(
     return Solved(times, states, ended.ended_early, text, ended.edge)
 
 
-def _explicit_stage(
-    rhs: Counted, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float
-) -> Stage:
-    return _scipy_stage(rhs, EXPLICIT, t, y, blow_up, rtol)
-
-
 def _scipy_stage(
+    rhs: Counted, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float, method: str = EXPLICIT
+) -> Stage:
+    """Integrate by one method of SciPy, from each stop of the inputs to the next."""
+    places = [0, *(np.flatnonzero(np.isin(t[1:-1], rhs.stops)) + 1).tolist(), len(t) - 1]
+    times, states = [t[:1]], [y[None]]
+    for first, last in pairwise(places):
+        part = _smooth_stage(rhs, method, t[first : last + 1], states[-1][-1], blow_up, rtol)
+        times.append(part.t[1:])
+        states.append(part.y[1:])
+        if part.status:
+            break
+    return replace(part, t=np.concatenate(times), y=np.concatenate(states))
+
+
+def _smooth_stage(
     rhs: Counted, method: str, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float
 ) -> Stage:
-    """Integrate by one method of SciPy; the first event is a blow-up or the end of the budget."""
+    """Integrate between two stops; the first event is a blow-up or the end of the budget."""
     from scipy.integrate import solve_ivp
+
+    before_end = np.nextafter(t[-1], -np.inf)  # at a stop itself the inputs have jumped already
+
+    def rates(now: float, y: np.ndarray) -> np.ndarray:
+        return rhs(min(now, before_end), y)
 
     def ends(t: float, y: np.ndarray) -> float:
         return min(blow_up - float(np.abs(y).max()), rhs.left_s(t, y))
@@ -220,7 +237,7 @@ def _scipy_stage(
     ends.terminal = True  # type: ignore[attr-defined]
     events = [ends, rhs.border] if rhs.border.edges else [ends]
     found = solve_ivp(
-        rhs, (t[0], t[-1]), y, method=method, t_eval=t, events=events, rtol=rtol, atol=rtol
+        rates, (t[0], t[-1]), y, method=method, t_eval=t, events=events, rtol=rtol, atol=rtol
     )
     # A solver that failed in its first step gives an empty list.
     states = np.asarray(found.y, dtype=np.float64).reshape(len(y), -1).T
@@ -240,7 +257,7 @@ def _compiled_stage(
     from ep2sindy.model import kernels
 
     assert isinstance(rhs.rates, Products)
-    equations, times = rhs.rates.parts, np.array(t)
+    equations, times, stops = rhs.rates.parts, np.array(t), np.append(rhs.stops, t[-1])
     now, state, out = float(t[0]), np.array(y), np.empty((len(t), len(y)))
     slope = rhs.rates(now, state)
     h = _first_step(rhs.rates, now, float(t[-1]) - now, state, slope, rtol)
@@ -249,7 +266,7 @@ def _compiled_stage(
     while status == kernels.LOOK and rhs.left_s(now, state) > 0.0:
         limit = min(rhs.look_at, rhs.budget, rhs.calls + CALLS_PER_LOOK)
         status, now, h, place, rhs.calls = kernels.advance(
-            equations, scheme(), times, out, state, slope, now, h, place, rhs.calls, limit,
+            equations, scheme(), times, stops, out, state, slope, now, h, place, rhs.calls, limit,
             blow_up, rtol,
         )  # fmt: skip
     if status == kernels.FINISHED:

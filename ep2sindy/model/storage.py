@@ -31,6 +31,7 @@ def model_text(
     provenance: Mapping[str, str],
     covariance: Float[np.ndarray, "_ _"] | None,
     clock: Clock,
+    courses: Mapping[str, str],
 ) -> str:
     """JSON text of the whole model; floats in their shortest exact form."""
     content = {
@@ -45,14 +46,17 @@ def model_text(
     }
     if clock != SECONDS:
         content["clock"] = {"unit": clock.unit, "seconds": clock.seconds}
+    if courses:
+        content["courses"] = dict(courses)
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
 def read_model(text: str, make: Callable[..., Model]) -> Model:
     """Read the text of `model_text` and build the model by `make`.
 
-    `make` is called as make(library, equations, units=, provenance=, covariance=, clock=). Terms
-    are read by name: no code from the file runs, and user functions must be registered beforehand.
+    `make` is called as make(library, equations, units=, provenance=, covariance=, clock=,
+    courses=). Terms are read by name: no code from the file runs, and user functions must be
+    registered beforehand.
     Raises ValueError for any other text, also if `make` rejects the content.
     """
     try:
@@ -70,6 +74,7 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
             provenance=texts_in(content["provenance"], "provenance"),
             covariance=None if covariance is None else covariance_in(covariance),
             clock=_clock_in(content["clock"]) if "clock" in content else SECONDS,
+            courses=texts_in(content.get("courses", {}), "courses"),
         )
     except UnknownFunctionError:
         raise  # the file is sound: a function must be registered before it is read

@@ -113,6 +113,7 @@ class RefinementSettings:
                 n_windows=self.n_windows,
                 window=window,
                 rng=rng,
+                courses=model.courses,
             )
             for model, runs in zip(models, trajectories, strict=True)
         ]

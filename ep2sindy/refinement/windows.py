@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.interpolate import CubicSpline
 
 from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.model.inputs import curve_through
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum, steps_in
 
 PERIODS = 1.5  # default length of a window, in periods of the dominant frequency
@@ -80,10 +80,12 @@ def cut_windows(
     n_windows: int,
     window: int,
     rng: np.random.Generator | int,
+    courses: Mapping[str, str] | None = None,
 ) -> WindowBatch:
     """Cut `n_windows` windows of `window` samples; fewer if there are not that many positions.
 
     No window crosses a gap (a step of over ten median steps), unless every position does.
+    courses: of the inputs, as in a SparseModel.
     Raises ValueError for no trajectory, a window longer than every trajectory or of under five
     samples, or a missing variable.
     """
@@ -101,8 +103,10 @@ def cut_windows(
     lengths = (stretches[:, 2] - stretches[:, 1]).tolist()
     piece, start = _places(lengths, n_windows, window, rng)
     index, start = stretches[piece, 0], start + stretches[piece, 1]
+    known = [(courses or {}).get(name) for name in inputs]
     cubics = [
-        _cubics(each.t, v[:, n:] / scale[n:]) for each, v in zip(trajectories, values, strict=True)
+        curve_through(each.t, v[:, n:] / scale[n:], known).pieces.transpose(1, 0, 2)
+        for each, v in zip(trajectories, values, strict=True)
     ]
     places = list(zip(index, start, strict=True))
     cut = slice(0, window - 1)
@@ -198,12 +202,3 @@ def _spread(room: int, count: int, window: int, rng: np.random.Generator) -> np.
     if count and slack >= 0:
         return np.sort(rng.integers(slack + 1, size=count)) + window * np.arange(count)
     return np.round(np.linspace(0, room - 1, count)).astype(np.int64)
-
-
-def _cubics(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Cubic spline in the elapsed fraction of each step, (segments, 4, columns)."""
-    if not values.shape[1]:
-        return np.zeros((len(t) - 1, 4, 0))
-    powers = np.diff(t)[:, None, None] ** np.arange(3, -1, -1)[:, None]
-    kind = "not-a-knot" if len(t) > 3 else "natural"
-    return CubicSpline(t, values, bc_type=kind).c.transpose(1, 0, 2) * powers

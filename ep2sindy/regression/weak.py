@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.data.coerce import check_domain, keep_inside, noise_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
+from ep2sindy.model.inputs import plausible_courses
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.splits import RandomSplit, Split
@@ -267,10 +268,6 @@ class WeightedWeak:
 # Noise below this share of an input's standard deviation is negligible beside that of any state.
 NEGLIGIBLE = 1e-3
 
-# Share of steps without change above which an input counts as held. A record whose noise exceeds
-# half its resolution repeats its last value less often.
-HELD = 0.5
-
 MAX_LEVELS = 8  # levels of a switched input at most; a noisy record has more, however coarse
 
 
@@ -304,5 +301,4 @@ def exact_columns(
 
 def is_switched(samples: Float[np.ndarray, " samples"]) -> bool:
     """Return true if a signal holds its value over most steps, or jumps between a few levels."""
-    held = np.mean(np.diff(samples) == 0.0)
-    return bool(held >= HELD) or len(np.unique(samples)) <= MAX_LEVELS
+    return plausible_courses([samples])[0] == "held" or len(np.unique(samples)) <= MAX_LEVELS
