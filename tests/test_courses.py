@@ -37,8 +37,9 @@ def test_every_run_of_a_model_is_the_exact_one(course: str, hold: int) -> None:
     run = lag(course, hold=hold, seed=0)
     model, x, u = replace(LAG, courses={"u": course}), run.states, run.inputs[:, 0]
     found = model.simulate(run.t, x[0], {"u": u})
-    np.testing.assert_allclose(found.states, x, atol=1e-10)
-    np.testing.assert_allclose(model.rollout(run).states, x, atol=1e-10)
+    # Tolerances of 1e-8 in each step add up; a step over a jump would be off by a thousandth.
+    np.testing.assert_allclose(found.states, x, atol=1e-7)
+    np.testing.assert_allclose(model.rollout(run).states, x, atol=1e-7)
     sure = replace(model, covariance=np.zeros((2, 2)))
     (drawn,) = sure.simulate(run.t, x[0], {"u": u}, draws=1).draws
     # Runge-Kutta steps, accurate to 1e-4; one that sees a jump early is off by h/6 of it, 2e-2.
