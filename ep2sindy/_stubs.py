@@ -107,8 +107,8 @@ def attach(module: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
 
             return version(PACKAGE)
         if entry is None:
-            message = f"module {module!r} has no attribute {name!r}; {_near(f'{module}.{name}')}"
-            raise AttributeError(message)
+            near = _near(f"{module}.{name}")
+            raise AttributeError(f"module {module!r} has no attribute {name!r}; {near}")
         if entry.module == module:
             return import_module(f"{module}.{name}")  # a room
         value = entry.load()

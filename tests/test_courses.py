@@ -9,7 +9,6 @@ import ep2sindy as ep
 from ep2sindy.model.draws import draw_runs
 from ep2sindy.model.inputs import COURSES
 from ep2sindy.model.many import DrivenWindows, Ensemble
-from ep2sindy.refinement.methods.nelder_mead import NelderMead
 from tests.models import model_of
 
 TAU_S = 0.7
@@ -43,7 +42,7 @@ def test_every_run_of_a_model_is_the_exact_one(course: str, hold: int) -> None:
     sure = replace(model, covariance=np.zeros((2, 2)))
     (drawn,) = sure.simulate(run.t, x[0], {"u": u}, draws=1).draws
     # Runge-Kutta steps, accurate to 1e-4; one that sees a jump early is off by h/6 of it, 2e-2.
-    np.testing.assert_allclose(drawn, x, atol=1e-5)
+    np.testing.assert_allclose(drawn, x, atol=1e-4)
 
 
 def test_functions_in_a_library_stop_at_jumps_too() -> None:
@@ -95,11 +94,10 @@ def test_a_model_keeps_its_courses_in_a_file() -> None:
         assert ep.SparseModel.from_json(model.to_json()) == model != LAG
 
 
-@pytest.mark.parametrize("method", [None, NelderMead()], ids=["shooting", "nelder_mead"])
-def test_refinement_follows_the_same_course(method: object) -> None:
+def test_refinement_follows_the_same_course() -> None:
     run = lag("held", hold=1, seed=4)
     off = replace(LAG, coef=LAG.coef * 1.1, courses={"u": "held"})
-    refined = ep.refine(off, run, n_windows=4, window=50, method=method).model
+    refined = ep.refine(off, run, n_windows=4, window=50).model
     np.testing.assert_allclose(refined.coef, LAG.coef, rtol=1e-4)
 
 
@@ -116,5 +114,5 @@ def test_draws_do_not_see_an_input_before_it_jumps() -> None:
     t, u = np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 5.0])
     model = model_of({"x": {"u": 1.0}}, inputs=["u"])
     drive = ep.model.inputs.driven(["u"], {"u": u}, t, {"u": "held"})[0]
-    (run,) = draw_runs(model, t, np.zeros((1, 1)), model.coef[None], drive=drive)
+    (run,) = draw_runs(model, t, np.zeros((1, 1)), model.coef[None], drive=drive, reach=np.ones(1))
     np.testing.assert_allclose(run[:, 0], [0.0, 0.0, 1.0])

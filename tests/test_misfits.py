@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -105,7 +106,10 @@ def test_a_library_of_too_low_a_degree_is_no_late_sensor(duration_s: float, alig
 @pytest.mark.parametrize(("draw", "lacks"), [("brusselator", True), ("late", False)])
 def test_a_delay_competes_with_products_of_one_degree_more(draw: str, lacks: bool) -> None:
     run = chemical(0) if lacks else spoilt("lotka_volterra", "lag 2", 0, 0.02)[1]
-    problem = scale_problem([run], ep.polynomial(["x", "y"], degree=2))
+    problem, wider = (
+        scale_problem([run], ep.polynomial(["x", "y"], degree=degree)) for degree in (2, 3)
+    )
+    problem = replace(problem, widen=lambda: wider)
     found = from_smooth(problem, None, max_terms=7)
     late = explanation._align(problem, found, 7)
     if lacks:  # whatever delay its false equations may have

@@ -56,7 +56,7 @@ def test_masked_values_are_missing() -> None:
         trajectories_of((np.arange(3.0), masked))
 
 
-@pytest.mark.parametrize("level", [1e-300, 1e-60, 1e60, 1e160])
+@pytest.mark.parametrize("level", [1e-300, 1e-60, 1e160])
 def test_sizes_whose_products_leave_the_number_format_are_refused(level: float) -> None:
     with pytest.raises(ValueError, match=r"'x' reaches .*; count it in another unit"):
         check_magnitude(level * X[:, None], ("x",))

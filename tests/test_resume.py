@@ -258,7 +258,7 @@ def test_a_trace_that_ends_in_its_tests_searches_once(
     def config(keep: str) -> DictConfig:
         return composed(*glance(path, folder, f"keep={keep}"))
 
-    def ends(*_: object) -> None:
+    def ends(*_: object, **settings: object) -> None:
         raise KeyboardInterrupt
 
     whole = computed(config("whole"))

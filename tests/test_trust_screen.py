@@ -126,7 +126,7 @@ def test_labels_of_bars_and_files_that_are_read_stay_in_their_line(
     monkeypatch.setattr(cache, "read", lambda path: field)
     monkeypatch.setattr(cache, "fingerprint", lambda *given, **settings: "0")
     path.rename(tmp_path / "a\x1b\n_0.nc")
-    cache.keep(tmp_path / "a\x1b\n", "{}", lambda: field)
+    cache.read_or_run(tmp_path, "a\x1b\n", {}, lambda: field, False)
     (line,) = capsys.readouterr().out.splitlines()
     assert r"a\x1b\n_0.nc cannot be read" in line
 

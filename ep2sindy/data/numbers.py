@@ -16,9 +16,9 @@ from ep2sindy.library.units import calendar_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-# Beyond these sizes a product of three variables, squared in a Gram matrix, underflows to zero or
-# overflows.
-LEAST, MOST = 1e-50, 1e50
+# Below the first size a product of three variables, squared in a Gram matrix, underflows to zero;
+# above the second a square overflows. Terms that overflow raise their own error.
+LEAST, MOST = 1e-50, 1e150
 
 
 def real_numbers(values: object, what: str) -> np.ndarray:

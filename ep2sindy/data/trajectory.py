@@ -55,8 +55,8 @@ class Trajectory:
     rate; its samples there may be NaN and are interpolated. None if all were measured.
     clock: unit in which times are displayed; t stays in s.
     Raises ValueError for time that does not increase, unequal lengths, values that are masked, not
-    finite or not real numbers, a variable of a magnitude below 1e-50 or above 1e50, repeated names,
-    names that are not words of letters, digits and _ (or averages such as `<n_i*n_n>`), fewer than
+    finite or not real numbers, a variable of a magnitude below 1e-50 or above 1e150, repeated
+    names, names that are not words of letters, digits and _ (or averages such as `<n_i*n_n>`), fewer than
     two samples, or a state that never changes.
 
     >>> t = np.linspace(0.0, 1e-3, 101)

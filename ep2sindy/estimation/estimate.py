@@ -162,12 +162,7 @@ def estimate(
     """
     known = trajectories_of(runs, partial=True)
     task = Task(
-        known,
-        library,
-        relations_of(relations),
-        {} if terms is None else terms,
-        hidden=hidden,
-        exclude={} if exclude is None else exclude,
+        known, library, relations_of(relations), terms or {}, hidden=hidden, exclude=exclude or {}
     )
     return estimate_task(
         task,

@@ -388,12 +388,10 @@ def scale_problem(
     """
     states = runs[0].state_names
     inputs = [name for name in runs[0].input_names if name in library.variables]
-    told = {name: (course,) for name, course in check_courses(courses or {}, inputs).items()}
-    allowed = {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | told
+    allowed = _allowed_courses(runs, inputs, courses or {})
     names = [*states, *inputs]
     over = library.over(names)
-    values = np.concatenate([run.columns(names) for run in runs])
-    size = zero_to_one(np.sqrt(np.square(values).mean(axis=0)))
+    size = _rms(runs, names)
     step_s = mean_step(*(run.t for run in runs))
     scaled, numbers = over.scaled(size)
     asked = _asked(over, states, terms or {}, exclude or {})
@@ -422,6 +420,19 @@ def scale_problem(
         watch=watch or Watch(),
     )
     return problem.of(runs)
+
+
+def _rms(runs: Sequence[Trajectory], names: Sequence[str]) -> Float[np.ndarray, " names"]:
+    values = np.concatenate([run.columns(names) for run in runs])
+    return zero_to_one(np.sqrt(np.square(values).mean(axis=0)))
+
+
+def _allowed_courses(
+    runs: Sequence[Trajectory], inputs: Sequence[str], courses: Mapping[str, str]
+) -> dict[str, tuple[str, ...]]:
+    """Courses of every input: the one that was told, or those that its samples allow."""
+    told = {name: (course,) for name, course in check_courses(courses, inputs).items()}
+    return {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | told
 
 
 def by_run(

@@ -174,6 +174,7 @@ def _integrals(
     return np.where(np.isfinite(integrals).all(axis=0), integrals, 0.0)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a term that overflows is not chosen
 def _own_squares(
     problem: EstimationProblem,
     paths: tuple[np.ndarray, ...],
@@ -197,7 +198,9 @@ def _own_squares(
         np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(level.process[:, one]),
         FREE_START,
     )  # fmt: skip
-    return quadratic, linear, float(offset)
+    tells = np.isfinite(np.diag(quadratic)) & np.isfinite(linear)
+    pairs = np.isfinite(quadratic) & tells & tells[:, None]
+    return np.where(pairs, quadratic, 0.0), np.where(tells, linear, 0.0), float(offset)
 
 
 def _would_pay(

@@ -78,7 +78,7 @@ def curve_through(
     """Inputs through their samples, each on its course; None takes the most plausible one."""
     n_steps, n_inputs = len(t) - 1, len(courses)
     pieces = np.zeros((1 + max(COURSES.values()), n_steps, n_inputs))
-    rough = np.zeros(n_steps - 1, dtype=np.bool_)
+    rough = np.zeros(max(n_steps - 1, 0), dtype=np.bool_)
     if n_inputs:
         from scipy.interpolate import make_interp_spline  # imported only for models with inputs
     for j, column in enumerate(samples.T):

@@ -181,7 +181,6 @@ def _result(
         law_map.to_law @ covariance @ law_map.to_law.T if finite else None
         for covariance in (verdict.covariance, verdict.covariance_naive)
     )
-    robust = robust if verdict.explains.all() else None
     refined = []
     for model, own, row in zip(models, relations, basis.values, strict=True):
         at_point, order = with_coef(model, own, own.coef(law @ row))

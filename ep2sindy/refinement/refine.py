@@ -46,9 +46,8 @@ SETTINGS = RefinementSettings()
 class Refinement:
     """A model fitted to trajectories, with its uncertainty and status.
 
-    model: with the covariance of its coefficients, if what it leaves of every state is noise; else
-    it explains the data no better than its residuals say, and has no intervals.
-    covariance: a sandwich with windows as clusters, for models that explain the data and others.
+    model: with the covariance of its coefficients; `message` says if it leaves more than noise.
+    covariance: a sandwich with windows as clusters.
     covariance_naive: the same for white, independent residuals.
     window_loss: mean square of (trajectory - data) / std in each window, integrated again from
     the fitted starts. loss: its mean; a constant has a loss of one.
@@ -275,7 +274,7 @@ def _result(
             by_scaling @ covariance @ by_scaling.T
             for covariance in (verdict.covariance, verdict.covariance_naive)
         )
-        refined = replace(refined, covariance=robust if verdict.explains.all() else None)
+        refined = replace(refined, covariance=robust)
     with np.errstate(over="ignore"):  # a fit that blew up overflows
         trajectories = fit.nodes[point] * batch.scale[: fit.nodes.shape[-1]]
     return Refinement(
@@ -288,13 +287,17 @@ def _result(
         history=tuple(entry for entry in history if entry.point == point),
         batch=batch,
         trajectories=trajectories,
-        message=failure(problem, fit, point, verdict) or _withheld(model, verdict),
+        message=failure(problem, fit, point, verdict) or _doubt(model, verdict),
     )
 
 
-def _withheld(model: SparseModel, verdict: RefinementVerdict) -> str:
+def _doubt(model: SparseModel, verdict: RefinementVerdict) -> str:
     more = [s for s, known in zip(model.states, verdict.explains, strict=True) if not known]
-    return f"no intervals: the model leaves more than noise of {', '.join(more)}" if more else ""
+    return (
+        f"intervals say too little: the model leaves more than noise of {', '.join(more)}"
+        if more
+        else ""
+    )
 
 
 def with_coef(
