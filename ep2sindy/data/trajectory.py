@@ -56,8 +56,8 @@ class Trajectory:
     clock: unit in which times are displayed; t stays in s.
     Raises ValueError for time that does not increase, unequal lengths, values that are masked, not
     finite or not real numbers, a variable of a magnitude below 1e-50 or above 1e150, repeated
-    names, names that are not words of letters, digits and _ (or averages such as `<n_i*n_n>`), fewer than
-    two samples, or a state that never changes.
+    names, names that are not words of letters, digits and _ (or averages such as `<n_i*n_n>`),
+    fewer than two samples, or a state that never changes.
 
     >>> t = np.linspace(0.0, 1e-3, 101)
     >>> run = ep.Trajectory(t, np.sin(6e4 * t)[:, None], ["I_d"], units={"I_d": "A"})

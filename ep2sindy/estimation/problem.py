@@ -367,16 +367,11 @@ class EstimationProblem:
 
 
 def scale_problem(
-    runs: Sequence[Trajectory],
-    library: Library,
-    relations: Sequence[Relation] = (),
-    terms: Mapping[str, Sequence[str]] | None = None,
-    *,
-    measured: Sequence[str] = (),
-    exclude: Mapping[str, Sequence[str]] | None = None,
-    courses: Mapping[str, str] | None = None,
+    runs: Sequence[Trajectory], library: Library, relations: Sequence[Relation] = (),
+    terms: Mapping[str, Sequence[str]] | None = None, *, measured: Sequence[str] = (),
+    exclude: Mapping[str, Sequence[str]] | None = None, courses: Mapping[str, str] | None = None,
     watch: Watch | None = None,
-) -> EstimationProblem:
+) -> EstimationProblem:  # fmt: skip
     """Scale records and library, and collect the coefficients that may be in the model.
 
     relations: hold between coefficients. terms: for each state whose equation is known but for its
