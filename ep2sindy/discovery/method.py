@@ -113,7 +113,7 @@ class TrajectorySearch:
     limit_s: float | None = None
     selection: SystemSelection | Selection = field(default_factory=Evidence)
     depth: int = 1
-    courses: Mapping[str, str] = field(default_factory=dict, hash=False)
+    courses: Mapping[str, str] | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
         set_counts(self, {"depth": 1} | ({} if self.max_terms is None else {"max_terms": 1}))
