@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
         (["+exp=discover", "serch=joint"], "unknown key 'serch'; near it is search; there are"),
         (["+exp=discover", "~serch"], "unknown key 'serch'; near it is search; there are"),
         (["+exp=discover", "+serch=joint"], "unknown keys ['serch']; near it is search; there"),
-        (["+exp=discover", "search.alphaa=3"], "unknown key 'search.alphaa'; search has align, d"),
+        (["+exp=discover", "search.alphaa=3"], "unknown key 'search.alphaa'; search has align, c"),
         (
             ["+exp=weak", "search.max_trms=3"],
             "near it is search.max_terms; search has gamma, max",
