@@ -154,8 +154,9 @@ def _last_as_noise(
     # Slow residuals of a signal's size tell that the model ignores the signal.
     spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
     ignored = (memory > SLOW) & (std > LARGE * spread)
-    shown = _shown_by_samples(samples, off, std, memory, problem.n_samples)
-    return _forgets(unit, memory, problem.n_samples) & shown & ~ignored
+    n = float(problem.n_samples)
+    shown = _shown_by_samples(samples, off, std, memory, n)
+    return _forgets(unit, memory, n) & shown & ~ignored
 
 
 def are_noise(
