@@ -529,7 +529,7 @@ def test_a_model_that_leaves_more_than_noise_says_so(wrong: bool) -> None:
     run = replace(clean, states=clean.states + noise)
     given = replace(truth, coef=np.where(truth.coef == -0.2, 0.0, truth.coef)) if wrong else truth
     found = ep.refine(given, run, n_windows=4, window=100)
-    assert found.covariance is not None
+    assert found.model.covariance is not None
     assert (
         "intervals say too little: the model leaves more than noise of x" in found.message
     ) == wrong

@@ -18,12 +18,7 @@ from ep2sindy.estimation.explanation import Explanation, explain
 from ep2sindy.estimation.hidden import Entrance, with_guesses
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
-from ep2sindy.estimation.problem import (
-    MIN_SAMPLES,
-    EstimationProblem,
-    by_run,
-    scale_problem,
-)
+from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem, by_run, scale_problem
 from ep2sindy.estimation.solver import (
     SAMPLES_PER_TERM,
     Solution,
@@ -73,9 +68,9 @@ class Rival:
 class Estimate:
     """Result of estimating states and coefficients together.
 
-    model: carries the covariance of its coefficients, unless it is a misfit. runs:
-    as they were fitted, hidden states as estimated. paths: for each of these runs, the estimated
-    states, (samples, d), in SI.
+    model: carries the covariance of its coefficients, unless it is a misfit. runs: as they were
+    fitted, hidden states as estimated. paths: for each of these runs, the estimated states,
+    (samples, d), in SI.
     noise_std: (d,), standard deviation of the samples' noise, in SI; NaN for hidden states. memory:
     (d,), correlation of this noise from one sample to the next, 0 for white noise.
     flow_error: size of the deviation of the states from the model over one sampling step, as a

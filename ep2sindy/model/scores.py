@@ -44,17 +44,13 @@ def derivative_r2(
     check_domain([run], library, smooth=x_dot is None)
     values, data = run.columns(model.library.variables), run.columns(model.states)
     if x_dot is None:
-        pieces = [
-            (e.t, e.columns(model.library.variables), e.columns(model.states))
-            for e in run.stretches()
-        ]
-        values = np.concatenate(
-            [
-                keep_inside(library, smoother.smooth(t, x), noise_inside(library, x))
-                for t, x, _ in pieces
-            ]
-        )
-        truth = np.concatenate([smoother.derivative(t, x) for t, _, x in pieces])
+        smooth, sides = [], []
+        for each in run.stretches():
+            samples = each.columns(model.library.variables)
+            inside = noise_inside(library, samples)
+            smooth.append(keep_inside(library, smoother.smooth(each.t, samples), inside))
+            sides.append(smoother.derivative(each.t, each.columns(model.states)))
+        values, truth = np.concatenate(smooth), np.concatenate(sides)
     else:
         truth = np.asarray(x_dot, dtype=np.float64)
         if truth.shape != data.shape:

@@ -118,8 +118,7 @@ def eliminate(
             dropped.append(gone)
             scores.append(_score(found, len(constraint.free)))
             advance(1)
-            model = replace(found.model, covariance=found.covariance)  # also of a misfit
-            shorter = _without_weakest(model, constraint, min_free=min_free)
+            shorter = _without_weakest(found.model, constraint, min_free=min_free)
     runs = () if run_over is None else (free_run(each.model, run_over) for each in path)
     verdicts = tuple(run.verdict for run in runs)
     rank = [list(Verdict).index(verdict) for verdict in verdicts] or [0] * len(path)

@@ -40,10 +40,10 @@ class LawRefinement:
     law @ basis at this point, in SI.
     covariance: covariance of law.ravel(), a sandwich with the windows of all points as clusters.
     It states how far other windows would change the law, not how far a law of this form is from
-    the truth; None if the law leaves more than noise. covariance_naive: the same for white,
-    independent residuals. Both are None if the fit is not finite.
-    models: by point, with the covariance that follows from the law, if any. loss: by point, mean
-    square of (trajectory - data) / std, integrated again from the fitted starts.
+    the truth. covariance_naive: the same for white, independent residuals. Both are None if the
+    fit is not finite.
+    models: by point, with the covariance that follows from the law. loss: by point, mean square
+    of (trajectory - data) / std, integrated again from the fitted starts.
     status: converged; max_iter; coarse_step; unidentifiable: the interval of a coefficient
     reaches zero at every point; flat: no better than constants; non_finite: the start is returned.
     """

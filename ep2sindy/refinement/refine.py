@@ -46,8 +46,8 @@ SETTINGS = RefinementSettings()
 class Refinement:
     """A model fitted to trajectories, with its uncertainty and status.
 
-    model: with the covariance of its coefficients; `message` says if it leaves more than noise.
-    covariance: a sandwich with windows as clusters.
+    model: with the covariance of its coefficients, a sandwich with windows as clusters; `message`
+    says if it leaves more than noise, so that this covariance says too little.
     covariance_naive: the same for white, independent residuals.
     window_loss: mean square of (trajectory - data) / std in each window, integrated again from
     the fitted starts. loss: its mean; a constant has a loss of one.
@@ -60,7 +60,6 @@ class Refinement:
     """
 
     model: SparseModel
-    covariance: Float[np.ndarray, "_ _"] | None
     covariance_naive: Float[np.ndarray, "_ _"] | None
     loss: float
     window_loss: Float[np.ndarray, " windows"]
@@ -263,7 +262,7 @@ def _result(
     batch, ode = problem.batches[point], problem.odes[point]
     relations = unconstrained(model) if constraint is None else constraint
     finite = verdict.status is not RefinementStatus.NON_FINITE
-    refined, robust, naive = replace(model, covariance=None), None, None
+    refined, naive = replace(model, covariance=None), None
     if finite:
         with torch.no_grad():
             ode.scaling.copy_(torch.tensor(fit.scaling[point, : len(ode.free0)]))
@@ -279,7 +278,6 @@ def _result(
         trajectories = fit.nodes[point] * batch.scale[: fit.nodes.shape[-1]]
     return Refinement(
         model=refined,
-        covariance=robust,
         covariance_naive=naive,
         loss=float(verdict.window_loss.mean()) if finite else float("inf"),
         window_loss=verdict.window_loss,

@@ -61,11 +61,10 @@ MOST_LAWS = 3  # on the screen
 
 INTERVALS = (
     "±: half the 95 % interval; of least squares by a moving-block bootstrap over time, of "
-    "refinements from their covariance, if they leave no more than noise. It says how far another "
-    "stretch of the same record would move a value, not how far the model is from the discharge: "
-    "compare R2, and the fits. Nor does it hold the bias that smoothing and differencing leave in "
-    "least squares, even without noise, which may be many times as large; refinements "
-    "differentiate nothing. Refined models follow "
+    "refinements from their covariance. It says how far another stretch of the same record would "
+    "move a value, not how far the model is from the discharge: compare R2, and the fits. Nor does "
+    "it hold the bias that smoothing and differencing leave in least squares, even without noise, "
+    "which may be many times as large; refinements differentiate nothing. Refined models follow "
     "trajectories: R2 is that of the derivative, and may be negative where pulses are sharp."
 )
 TIED = "R2 at every point, with coefficients of its own, and with those of one law for all points."
