@@ -2,8 +2,8 @@
 
 Equations that conserve what ions and neutrals of the whole channel exchange, as `+exp=breathing`
 finds them: over operating points, splits of the record and seeds, on the default source and on the
-former one; beside free terms, in other zones, in several at once (`several`, `three`), with delayed
-terms, in noise, and from the (z, r) simulator. Every model called living is run again by another
+former one; beside free terms, in other zones, in several at once (`several`, `three`), in
+noise, and from the (z, r) simulator. Every model called living is run again by another
 solver, ten times as long; its processes are compared with the balance of the zone. Prints the
 tables of docs/living.md; name some to print those alone.
 """
@@ -28,13 +28,9 @@ import ep2sindy as ep
 from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.free_run import cycle_of
-from ep2sindy.studies.balance import (
-    ComparedProcess,
-    compared_processes,
-    inflows_of,
-    zone_processes,
-)
+from ep2sindy.studies.balance import ComparedProcess, compared_processes, zone_processes
 from ep2sindy.studies.living import start_of
+from ep2sindy.studies.told import told_roles
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 CHANNEL, DOWNSTREAM = "channel", "downstream"
@@ -57,6 +53,14 @@ FORMER = ep.thruster.Thruster(
     series_resistance=1.0,
 )
 FORMER_SPEED = {"300V_2mgs": 190.0}  # m/s; 280 at the other points
+MASS_ACTION = ep.Roles(
+    exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "known or free"}, nonnegative=True
+)
+TOLD = replace(
+    MASS_ACTION,
+    exchange=[("n_n", "n_i"), ("n_i", "n_n", "known")],
+    outflow={"n_i": "free", "n_n": "known"},
+)
 SETS = {"default": ep.thruster.Thruster(), "former": FORMER}
 
 
@@ -64,13 +68,12 @@ SETS = {"default": ep.thruster.Thruster(), "former": FORMER}
 class Record:
     """Averages over zones, the balance of each, and their lengths if there are several.
 
-    balances: by zone; a single one is called "". delays: of the neutrals, if they are followed.
+    balances: by zone; a single one is called "".
     """
 
     run: ep.Trajectory
     balances: dict[str, xr.Dataset]
     sizes: dict[str, float] = field_of(default_factory=dict)
-    delays: Sequence[ep.Delay] = ()
 
     def processes(self, model: ep.SparseModel, held: Constraint | None) -> list[ComparedProcess]:
         """What zones exchange, in the record and by a model."""
@@ -144,47 +147,40 @@ def zones_record(label: str, n_zones: int) -> Record:
     )
 
 
-def with_delays(whole: Record, delay_s: float, n_stages: int) -> Record:
-    """A record in which the neutrals of every zone are followed with a delay."""
-    run, neutrals = whole.run, [name for name in whole.run.state_names if name.startswith("n_n")]
-    delays = [ep.Delay(name, delay_s, n_stages) for name in neutrals]
-    for delay in delays:
-        run = delay.along(run)
-    kept = {name: b.sel(time=slice(run.t[0], None)) for name, b in whole.balances.items()}
-    return Record(run, kept, whole.sizes, delays)
-
-
 def conserving(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
     """Under the roles of `+exp=breathing`: up to six free coefficients of degree 3."""
-    roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow=inflows_of(whole.balances))
+    return under(MASS_ACTION, fitted, whole, seed=seed)
+
+
+def told(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
+    """The same where what the record tells is known: `living=told`."""
+    return under(TOLD, fitted, whole, seed=seed)
+
+
+def under(roles: ep.Roles, fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
+    """A search over the whole channel under roles, whose known parts are those of the record."""
     method = ep.Regression(
         ep.Differential(),
-        ep.BestSubset(max_terms=6, n_best=200),
+        ep.BestSubset(max_terms=6, n_best=2000),
         ep.FreeRunScore(seed=seed, window_periods=4.0, n_confirmed=16),
         depth=16,
     )
-    library = ep.polynomial(STATES, degree=3)
-    if whole.delays:
-        powers = {s: [s, f"{s}^2", f"{s}^3"] for s in STATES}
-        both = [n for n in library.names if n != "1"]
-        roles = replace(roles, exchange=[("n_n", "n_i", both)], outflow=powers, forward=True)
-        roles = move_on_later(roles, whole.delays)
-        names = [*STATES, whole.delays[0].last]
-        library = library.over(names) + ep.polynomial(names, degree=1)
-    return ep.discover([fitted], library, method, roles=roles, seed=seed)
+    roles = roles.with_known(known_of(fitted, whole))
+    return ep.discover([fitted], ep.polynomial(STATES, degree=3), method, roles=roles, seed=seed)
+
+
+def known_of(fitted: ep.Trajectory, whole: Record) -> dict[str, dict[str, float]]:
+    """What the record tells of the roles of a zone, by least squares over what is fitted."""
+    found = told_roles(whole.balances, fitted)
+    return {name: dict(role.terms) for name, role in found.items()}
 
 
 def by_neighbourhood(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
     """Several zones under the roles of `+exp=zones`: up to 14 free coefficients, 20 for three."""
     two = len(whole.sizes) == 2
     roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "known"})
-    roles = roles.in_zones(whole.sizes).with_known(inflows_of(whole.balances))
-    names = [name for name in fitted.state_names if "lag" not in name]
-    library = ep.polynomial(names, degree=3)
-    if whole.delays:
-        roles = move_on_later(roles, whole.delays)
-        last = [delay.last for delay in whole.delays]
-        library = library.over([*names, *last]) + ep.polynomial([*names, *last], degree=1)
+    roles = roles.in_zones(whole.sizes).with_known(known_of(fitted, whole))
+    library = ep.polynomial(fitted.state_names, degree=3)
     method = ep.Regression(
         ep.Differential(),
         ep.BestSubset(max_terms=14 if two else 20, n_best=200 if two else 1000),
@@ -192,18 +188,6 @@ def by_neighbourhood(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.D
         depth=6 if two else 4,
     )
     return ep.discover([fitted], library, method, roles=roles, seed=seed)
-
-
-def move_on_later(roles: ep.Roles, delays: Sequence[ep.Delay]) -> ep.Roles:
-    """The roles where what moves on, or leaves, may also do so as it was some time ago."""
-    last = {delay.state: delay.last for delay in delays}
-    exchange = [
-        (giver, taker, [*terms, last[giver]] if giver in last and giver in terms else terms)
-        for giver, taker, terms in roles.exchange
-    ]
-    outflow = {s: [*terms, *filter(None, [last.get(s)])] for s, terms in roles.outflow.items()}
-    known = {name: terms for delay in delays for name, terms in delay.equations.items()}
-    return replace(roles, exchange=exchange, outflow=outflow, equations=known)
 
 
 def free(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
@@ -340,17 +324,6 @@ def print_several(n_zones: int, draws: Sequence[tuple[str, int]]) -> None:
     print(line("all", everything))
 
 
-def print_delayed() -> None:
-    """Neutrals that may leave, or move on, as they were 60 us (some period) ago."""
-    print("\nneutrals with a delay of 60 us; last quarter, one draw")
-    cases = {label: (record(label), 4, conserving) for label in POINTS}
-    cases |= {"two zones": (zones_record("300V_5mgs", 2), 3, by_neighbourhood)}
-    for name, (bare, n_stages, search) in cases.items():
-        whole = with_delays(bare, 60e-6, n_stages)
-        found = [case(*parts(whole.run, "last"), whole, seed=0, search=search)]
-        print("\n".join([line(name, found), structures(found)]), flush=True)
-
-
 def print_zones() -> None:
     """Six operating points, other zones: free terms, since no inflow is known."""
     print(f"\nsix points, by zone, free terms: median / worst of the points and {N_SEEDS} seeds")
@@ -421,7 +394,6 @@ def main() -> None:
         "zones": print_zones,
         "several": lambda: print_several(2, ONCE),
         "three": lambda: print_several(3, [("last", 0)]),
-        "delayed": print_delayed,
         "noise": print_noise,
         "plane": print_plane,
     }

@@ -5,8 +5,9 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.studies.balance import compared_processes, inflows_of, model_balance
+from ep2sindy.studies.balance import compared_processes, model_balance
 from ep2sindy.studies.fits import split_in_time
+from ep2sindy.studies.told import told_roles
 
 STATES = ["n_i", "n_n"]
 CHANNEL = ep.Zone(z="channel")
@@ -42,7 +43,22 @@ def test_the_supply_is_the_mass_flow(field: xr.Dataset, exact: xr.Dataset) -> No
     assert field.attrs["neutral_inflow"] == pytest.approx(particles)
     length_m = float(field["dz"].values[field["z"].values <= 0.025].sum())
     assert exact["supply"].values == pytest.approx(particles / length_m, rel=1e-5)
-    assert inflows_of({"": exact}) == {"n_n": pytest.approx(particles / length_m, rel=1e-5)}
+    told = told_roles({"": exact}, ep.zone_average(field, CHANNEL, states=STATES))
+    assert told["n_n in"].terms == {"1": pytest.approx(particles / length_m, rel=1e-5)}
+
+
+def test_what_leaves_and_comes_back_is_told_by_least_squares(exact: xr.Dataset, data) -> None:
+    """A balance that is made of the terms themselves gives their coefficients."""
+    n_i, n_n = data.states.T
+    made = exact.assign(
+        exit_n=("time", 3e3 * n_n + 2e-16 * n_i * n_n), returned=("time", 1e5 * n_i)
+    )
+    told = told_roles({"": made}, data)
+    assert told["n_n out"].terms == pytest.approx({"n_n": 3e3, "n_i*n_n": 2e-16}, rel=1e-6)
+    assert told["n_i to n_n"].terms == pytest.approx({"n_i": 1e5}, rel=1e-6)
+    assert told["n_n out"].r2 == pytest.approx(1.0)
+    half = told_roles({"": made}, data.window(0, data.n_samples // 2))
+    assert half["n_i to n_n"].terms == pytest.approx({"n_i": 1e5}, rel=1e-6)
 
 
 def test_a_field_without_averages_gives_nearly_the_same(field: xr.Dataset, exact: xr.Dataset):
@@ -63,7 +79,8 @@ def test_a_file_gives_what_it_can(field: xr.Dataset) -> None:
     assert set(ep.thruster.zone_balance(flat, ep.Zone())) == {"change_i", "change_n"}
     downstream = ep.thruster.zone_balance(field, ep.Zone(z="downstream"))
     assert "supply" not in downstream  # what enters through an inner face is not known beforehand
-    assert inflows_of({"": downstream}) == {}
+    run = ep.zone_average(field, ep.Zone(z="downstream"), states=STATES)
+    assert "n_n in" not in told_roles({"": downstream}, run)
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,14 @@
-"""Roles of terms: exact constraints, a search that conserves, signs, inflows, and bad input."""
+"""Roles of terms: exact constraints, a search that conserves, mass action, and bad input."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.library.roles import constraint_of
+from ep2sindy.data.coerce import Task
+from ep2sindy.library.roles import constraint_of, process_values
+from ep2sindy.selection.conserving import conserving_systems
 
 STATES = ["n_i", "n_n"]
 LIBRARY = ep.polynomial(STATES, degree=2)
@@ -95,20 +99,70 @@ def test_an_inflow_may_be_found(record):
     assert found.model.terms("n_n")["1"] == pytest.approx(M, rel=1e-3)
 
 
-def test_a_demanded_sign_is_kept(record):
-    asked = ep.Roles(
-        exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": M}, signs=["n_i: n_n > 0"]
-    )
+MASS_ACTION = replace(ROLES, nonnegative=True)
+
+
+def test_mass_action_takes_terms_that_contain_what_they_lower():
+    found = [(p.role, p.term) for p in MASS_ACTION.processes(LIBRARY, STATES)]
+    ahead = [term for role, term in found if role == "n_n to n_i"]
+    assert ahead == ["n_n", "n_i*n_n", "n_n^2"]
+    assert [term for role, term in found if role == "n_i to n_n"] == ["n_i", "n_i^2"]
+    assert [term for role, term in found if role == "n_n out"] == ["n_n", "n_n^2"]
+    assert all(p.one_sign for p in MASS_ACTION.processes(LIBRARY, STATES))
+    apart = replace(MASS_ACTION, exchange=[("n_n", "n_i"), ("n_i", "n_n")])
+    found = [(p.role, p.term) for p in apart.processes(LIBRARY, STATES)]
+    assert [term for role, term in found if role == "n_n to n_i"] == ahead
+    assert [term for role, term in found if role == "n_i to n_n"] == ["n_i", "n_i^2", "n_i*n_n"]
+    named = replace(MASS_ACTION, outflow={"n_i": ["n_n*n_i", "n_n"]})
+    assert [p.term for p in named.processes(LIBRARY, STATES) if p.role == "n_i out"] == ["n_i*n_n"]
+    with pytest.raises(ValueError, match="no term of the library may play the role 'n_n out'"):
+        MASS_ACTION.processes(ep.polynomial(["n_i"], degree=2), STATES)
+
+
+def test_a_search_by_mass_action_proposes_positive_processes_alone(record):
     method = ep.Regression(
         search=ep.BestSubset(max_terms=4, n_best=60), selection=ep.RefinedScore(), depth=6
     )
-    assert ep.discover(record, LIBRARY, method, roles=asked).model.terms("n_i")["n_n"] > 0.0
-    other = ep.Roles(
-        exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": M}, signs=["n_i: n_n < 0"]
+    found = ep.discover(record, LIBRARY, method, roles=MASS_ACTION)
+    assert found.model.terms("n_i") == pytest.approx({"n_i": -A, "n_n": S, "n_i*n_n": R}, rel=1e-3)
+    rows = ep.Differential().assemble([record], LIBRARY, rng=np.random.default_rng(0))
+    task = Task([record], LIBRARY, roles=MASS_ACTION)
+    systems = conserving_systems(rows, task, MASS_ACTION, method.search, depth=50).systems
+    assert len(systems) > 4
+    assert not any(system.broken(system.model) for system in systems)
+    free = conserving_systems(rows, task, ROLES, method.search, depth=50).systems
+    values = [process_values(s.constraint, coef_of(s)) for s in free]
+    assert any((value < 0.0).any() for value in values)  # without mass action some are negative
+
+
+def coef_of(system) -> np.ndarray:
+    return np.array([system.model.terms(s).get(t, 0.0) for s, t in system.constraint.coefficients])
+
+
+def test_what_is_told_is_kept_beside_what_is_found(record):
+    """n_n leaves by S + B, told apart as an outflow and a seed: the seed alone is to be found."""
+    told = {"n_n out": {"n_n": B}, "n_n in": {"1": M}, "n_i out": {"n_i": A}}
+    roles = ep.Roles(
+        exchange=[("n_n", "n_i")], outflow={"n_n": "known", "n_i": "known or free"},
+        inflow={"n_n": "known"}, nonnegative=True,
+    )  # fmt: skip
+    assert roles.open == ["n_n out", "n_i out", "n_n in"]
+    method = ep.Regression(
+        search=ep.BestSubset(max_terms=3, n_best=60), selection=ep.RefinedScore(), depth=6
     )
-    found = ep.discover(record, LIBRARY, method, roles=other)
-    assert "n_n" not in found.model.terms("n_i")  # the truth has it, with the other sign
-    assert "demands" not in found.note
+    found = ep.discover(record, LIBRARY, method, roles=roles.with_known(told))
+    assert {(p.role, p.term) for p in found.constraint.processes} == {
+        ("n_n to n_i", "n_n"), ("n_n to n_i", "n_i*n_n")
+    }  # fmt: skip
+    values = process_values(found.constraint, coef_of(found))
+    assert values == pytest.approx([S, R], rel=2e-3)
+    assert found.model.terms("n_n")["n_n"] == pytest.approx(-S - B, rel=1e-3)
+    assert found.model.terms("n_i")["n_i"] == -A
+    with pytest.raises(ValueError, match="'n_n out' is not known of this record"):
+        roles.with_known({"n_n in": {"1": M}})
+    wrong = replace(ROLES, outflow={"n_i": {"n_n*n_i": 1.0}})
+    with pytest.raises(ValueError, match=r"as the library does, 'n_i\*n_n'"):
+        wrong.processes(LIBRARY, STATES)
 
 
 @pytest.mark.parametrize(
@@ -116,13 +170,15 @@ def test_a_demanded_sign_is_kept(record):
     [
         (lambda: ep.Roles(exchange=[("x", "x")]), "joins two states"),
         (lambda: ep.Roles(exchange=["xy"]), "joins two states"),
-        (lambda: ep.Roles(inflow={"x": "some"}), "a number in SI per second, 'known', 'free'"),
-        (lambda: ep.Roles(signs=["x < 0"]), "demanded as 'state: term < 0'"),
+        (lambda: ep.Roles(inflow={"x": "some"}), "must be a number, 'known', 'free'"),
+        (lambda: ep.Roles(outflow={"x": 3.0}), "a list of terms, 'known', 'free'"),
+        (lambda: ep.Roles(outflow={"x": {"x": "fast"}}), "terms with their coefficients in SI"),
+        (lambda: ep.Roles(exchange=[("x", "y"), ("x", "y")]), r"\['x to y'\] came twice"),
         (lambda: ep.Roles(inflow={"x": "known"}).with_known({}), "not known of this record"),
         (lambda: ep.Roles(outflow=["z"]).processes(LIBRARY, STATES), r"\['z'\] came"),
         (
             lambda: ep.Roles(inflow={"n_n": "known"}).processes(LIBRARY, STATES),
-            "known only where a record gives it",
+            "known only where a record gives them",
         ),
         (lambda: ep.Roles(outflow={"n_n": ["q"]}).processes(LIBRARY, STATES), "'q'"),
     ],
@@ -154,7 +210,7 @@ def test_roles_that_cannot_be_kept_are_refused(record, options, message):
 
 def test_known_or_free_takes_what_there_is():
     either = ep.Roles(inflow={"n_n": "known or free"})
-    assert either.with_known({"n_n": 2.0}).inflow == {"n_n": 2.0}
+    assert either.with_known({"n_n in": {"1": 2.0}}).inflow == {"n_n": 2.0}
     assert either.with_known({}).inflow == {"n_n": "free"}
 
 

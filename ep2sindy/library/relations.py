@@ -146,7 +146,9 @@ class Constraint:
     coefficients: (state, term) of each, equation by equation, in the order of the library.
     free: (free,), indices of the coefficients that z holds: C[free] is the identity, d[free] zero.
     states: one per equation, including equations without terms. processes: those that the free
-    coefficients determine, as many, if it comes from a search under `Roles`; else empty.
+    coefficients determine, as many, if it comes from a search under `Roles`; else empty. known:
+    what known processes contribute to every coefficient; None if there are processes to be found
+    alone, or none at all.
     """
 
     states: tuple[str, ...]
@@ -155,6 +157,7 @@ class Constraint:
     d: Float[np.ndarray, " coefs"]
     free: Int[np.ndarray, " free"]
     processes: Sequence[Process] = ()
+    known: Float[np.ndarray, " coefs"] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "C", read_only(self.C))

@@ -6,154 +6,202 @@ search takes it into all of them or into none, and what it moves is conserved.
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.library.library import Library, library_of
-from ep2sindy.library.names import VARIABLE
+from ep2sindy.library.names import split_factors
 from ep2sindy.library.relations import Constraint, Place, Process
 from ep2sindy.library.terms import read_term
 from ep2sindy.runtime.values import check_list
 
 KNOWN, FREE, EITHER = "known", "free", "known or free"
-_SIGN = re.compile(rf"\s*(?P<state>{VARIABLE})\s*:\s*(?P<term>\S.*?)\s*(?P<side>[<>])\s*0\s*")
+
+
+class Role(NamedTuple):
+    """What moves from one state to another; "" is the outside.
+
+    how: "free" if any admissible term may move it, the terms that may, the terms with their known
+    coefficients in SI, or "known" and "known or free" while a record has not given them.
+    """
+
+    giver: str
+    taker: str
+    how: Any
+
+    @property
+    def name(self) -> str:
+        """Such as `n_n to n_i`, `n_i out`, `n_n in`."""
+        if self.giver and self.taker:
+            return f"{self.giver} to {self.taker}"
+        return f"{self.giver} out" if self.giver else f"{self.taker} in"
 
 
 @dataclass(frozen=True)
 class Roles:
     """Roles that terms have, for a search that conserves what states exchange.
 
-    Every role is played by a term or more.
     exchange: pairs (from, to); a term in this role leaves the first equation and enters the second
-    with the same coefficient, which may be negative. Any term may, or those of a third entry:
-    (from, to, terms). outflow: states that lose something to the outside, by terms of their own
-    powers, each of which takes away; or state -> the terms that may, of either sign.
-    inflow: state -> the constant that it is supplied with, in SI per second; "free" if it is to be
-    found. An experiment also takes "known", the inflow that the record itself gives, and "known or
-    free". signs: demanded of coefficients, such as "n_i: n_i < 0". A state without a role has an
-    equation of free terms. sizes: state -> length or volume that it is an average over; what leaves
-    a small place changes a large one by less. Absent ones are one. forward: True if in the mean
-    over the records every exchange moves more from the first state to the second than back, and
-    every outflow takes away. equations: state -> terms with their coefficients in SI, where the
-    equation is known and nothing is to be found; the library need not hold these terms.
-    Raises ValueError for an exchange of a state with itself, a size that is not positive, a sign
-    that cannot be read, or a role of a state whose equation is known.
+    with the same coefficient. outflow: states that lose something to the outside. inflow: state ->
+    what it is supplied with, a constant. A state without a role has an equation of free terms.
 
-    >>> roles = ep.Roles(exchange=[("prey", "predator")], outflow=["predator"])
+    Any term of the library may be exchanged, with a coefficient of either sign, and the powers of a
+    state may flow out, each of which takes away. With `nonnegative`, states are numbers of bodies,
+    or densities, and terms obey mass action: what lowers a state contains it as a factor. An
+    exchange then takes terms that contain its first state, and moves them forward; terms that
+    contain the second state, but not the first, go back, unless that way is an exchange of its own.
+    Terms that are named for a role must contain its first state, too. All coefficients are
+    positive, and so no state can turn negative.
+
+    A third entry of an exchange, and the values of outflow, if it is a mapping, say how: "free", as
+    above; a list of the terms that may; a mapping term -> coefficient in SI, where it is known; or
+    "known" and "known or free", for which an experiment puts what the record itself gives. An
+    inflow is a number in SI per second or one of these words.
+    sizes: state -> length or volume that it is an average over; what leaves a small place changes a
+    large one by less. Absent ones are one. equations: state -> terms with their coefficients in SI,
+    where the equation is known and nothing is to be found; the library need not hold these terms.
+    Raises ValueError for an exchange of a state with itself, a size that is not positive, or a role
+    of a state whose equation is known.
+
+    >>> roles = ep.Roles(exchange=[("prey", "predator")], outflow=["predator"], nonnegative=True)
     >>> library = ep.polynomial(["prey", "predator"], degree=2)
-    >>> [process.term for process in roles.processes(library, ["prey", "predator"])][-2:]
-    ['predator', 'predator^2']
+    >>> [f"{p.role}: {p.term}" for p in roles.processes(library, ["prey", "predator"])][:3]
+    ['prey to predator: prey', 'prey to predator: prey^2', 'prey to predator: prey*predator']
     """
 
     exchange: Sequence[Sequence[Any]] = ()
-    outflow: Sequence[str] | Mapping[str, Sequence[str]] = ()
-    inflow: Mapping[str, float | str] = field(default_factory=dict)
-    signs: Sequence[str] = ()
+    outflow: Sequence[str] | Mapping[str, Any] = ()
+    inflow: Mapping[str, Any] = field(default_factory=dict)
+    nonnegative: bool = False
     sizes: Mapping[str, float] = field(default_factory=dict)
-    forward: bool = False
     equations: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_list("exchange", self.exchange)
-        check_list("signs", self.signs)
         for entry in self.exchange:
             if isinstance(entry, str) or len(entry) not in (2, 3) or entry[0] == entry[1]:
                 raise ValueError(
-                    "an exchange joins two states, (from, to), by any term or those of a list, "
-                    f"(from, to, terms): {entry!r} came"
+                    "an exchange joins two states, (from, to), by any term, or by those that a "
+                    f"third entry names: {entry!r} came"
                 )
-            check_list("the terms of an exchange", entry[2] if len(entry) == 3 else ())
+        if not isinstance(self.outflow, Mapping):
+            check_list("outflow", self.outflow)
         for state, size in self.sizes.items():
             if isinstance(size, str | bool) or not 0.0 < size < np.inf:
                 raise ValueError(f"sizes must be positive numbers: {state} has {size!r}")
-        if not isinstance(self.outflow, Mapping):
-            check_list("outflow", self.outflow)
-        for state, value in self.inflow.items():
-            if isinstance(value, str) and value in (KNOWN, FREE, EITHER):
-                continue
-            if isinstance(value, str | bool) or not np.isfinite(value):
-                raise ValueError(
-                    f"the inflow of {state} must be a number in SI per second, {KNOWN!r}, {FREE!r} "
-                    f"or {EITHER!r}: {value!r} came"
-                )
-        for text in self.signs:
-            parse_sign(text)
+        named = Counter(role.name for role in self._roles)
+        if twice := [name for name, n in named.items() if n > 1]:
+            raise ValueError(f"a role must be given once: {twice} came twice")
+        for role in self._roles:
+            _check_how(role)
         if both := [state for state in self.equations if state in self._with_roles]:
             raise ValueError(f"a state has roles or a known equation: {both} have both")
 
     @property
+    def _roles(self) -> list[Role]:
+        """Every role that is given, with how it is played."""
+        found = [Role(*entry[:2], *(entry[2:] or [FREE])) for entry in self.exchange]
+        leaving = self.outflow
+        ways = leaving if isinstance(leaving, Mapping) else dict.fromkeys(leaving, FREE)
+        found += [Role(state, "", how) for state, how in ways.items()]
+        for state, how in self.inflow.items():
+            is_number = not isinstance(how, str | bool | Mapping)
+            found.append(Role("", state, {"1": float(how)} if is_number else how))
+        return found
+
+    @property
+    def names(self) -> set[str]:
+        """The roles that must be played: all that are given."""
+        return {role.name for role in self._roles}
+
+    @property
+    def open(self) -> list[str]:
+        """The roles that a record may have to tell, such as `n_n in`."""
+        return [role.name for role in self._roles if role.how in (KNOWN, EITHER)]
+
+    @property
     def _with_roles(self) -> set[str]:
         """The states whose equations the roles make."""
-        return {s for entry in self.exchange for s in entry[:2]} | {*self.outflow, *self.inflow}
+        return {state for role in self._roles for state in role[:2] if state}
 
     @property
     def states(self) -> tuple[str, ...]:
         """Every state that is named, once."""
-        named = [state for entry in self.exchange for state in entry[:2]]
-        signed = [parse_sign(text)[0][0] for text in self.signs]
-        more = [*self.outflow, *self.inflow, *signed, *self.sizes, *self.equations]
-        return tuple(dict.fromkeys([*named, *more]))
-
-    @property
-    def signed(self) -> dict[Place, int]:
-        """(state, term) -> 1 or -1, for every demanded sign."""
-        return dict(map(parse_sign, self.signs))
+        named = [state for role in self._roles for state in role[:2] if state]
+        return tuple(dict.fromkeys([*named, *self.sizes, *self.equations]))
 
     @property
     def known(self) -> dict[Place, float]:
-        """The coefficients that are given as numbers: of inflows and known equations."""
-        given = {(s, "1"): float(v) for s, v in self.inflow.items() if not isinstance(v, str)}
+        """What known roles and equations add to the coefficients, in SI."""
+        given: dict[Place, float] = {}
+        for role in self._roles:
+            if isinstance(role.how, Mapping):
+                for term, value in role.how.items():
+                    for place, factor in self._process(role, term).factors.items():
+                        given[place] = given.get(place, 0.0) + factor * float(value)
         for state, terms in self.equations.items():
             given |= {(state, term): float(value) for term, value in terms.items()}
         return given
 
-    def with_known(self, known: Mapping[str, float]) -> Roles:
-        """These roles with a record's inflows in place of "known".
+    def with_known(self, known: Mapping[str, Mapping[str, float]]) -> Roles:
+        """These roles with what a record gives in place of "known".
 
-        Raises ValueError for a state whose inflow the record does not give.
+        known: role, such as `n_n in` or `n_i to n_n`, -> term -> coefficient in SI.
+        Raises ValueError for a role that the record does not give.
         """
-        for state in [s for s, value in self.inflow.items() if value == KNOWN]:
-            if state not in known:
+        for role in self._roles:
+            if isinstance(role.how, str) and role.how == KNOWN and role.name not in known:
                 raise ValueError(
-                    f"the inflow of {state!r} is not known of this record, whose inflows are "
-                    f"{dict(known)}: it follows from the mass flow, for the neutrals of a zone "
-                    f"that begins at the anode of a simulated thruster; give it as a number, or "
-                    f"{FREE!r}"
+                    f"{role.name!r} is not known of this record, which gives {dict(known)}: what "
+                    f"enters follows from the mass flow, for the neutrals of a zone that begins at "
+                    f"the anode of a simulated thruster, and the rest from its balance; give "
+                    f"numbers, or {FREE!r}"
                 )
-        own = {s: known[s] if value == KNOWN else value for s, value in self.inflow.items()}
-        own |= {s: known.get(s, FREE) for s, value in self.inflow.items() if value == EITHER}
-        return replace(self, inflow=own)
+
+        def put(role: Role) -> Any:
+            asked = role.name in self.open
+            return dict(known.get(role.name, {})) or FREE if asked else role.how
+
+        new = {role.name: put(role) for role in self._roles}
+        named = isinstance(self.outflow, Mapping)
+        return replace(
+            self,
+            exchange=[(*entry[:2], new[f"{entry[0]} to {entry[1]}"]) for entry in self.exchange],
+            outflow={s: new[f"{s} out"] for s in self.outflow} if named else self.outflow,
+            inflow={
+                s: how["1"] if isinstance(how := new[f"{s} in"], Mapping) else how
+                for s in self.inflow
+            },
+        )
 
     def in_zones(self, sizes: Mapping[str, float]) -> Roles:
         """These roles in adjoining zones of one place, in the order in which the states move on.
 
-        sizes: zone -> its length or volume. States become those of `zone_averages`, `n_i@exit`.
-        What states exchange in a zone, they exchange by their product, alone or times one more
-        density of the zone or of the giver in a neighbouring zone. Every state with a role moves
-        from each zone to the next by terms that it is a factor of, alone or times one other density
-        of its zone or its own in the next one. It enters the first zone and leaves the last.
-        In the mean all of them go forward. A number as inflow is that of all zones together, as if
-        they were one.
-        Raises ValueError for demanded signs, or terms, which are of one zone's equations.
+        sizes: zone -> its length or volume. States become those of `zone_averages`, `n_i@exit`, and
+        are nonnegative. What states exchange in a zone, they exchange by their product, alone or
+        times one more density of the zone or of the giver in a neighbouring zone. Every state with
+        a role moves from each zone to the next by terms that it is a factor of, alone or times one
+        other density of its zone or its own in the next one. It enters the first zone and leaves
+        the last. A number as inflow is that of all zones together, as if they were one.
+        Raises ValueError for terms, which are of one zone's equations.
         """
-        if self.signs or isinstance(self.outflow, Mapping) or any(e[2:] for e in self.exchange):
+        if any(role.how != FREE for role in self._roles if role.giver):
             raise ValueError(
                 "roles in several zones take terms by neighbourhood: give exchanges as (from, to), "
-                f"outflow as a list of states, and no signs; {self} came"
+                f"and outflow as a list of states; {self} came"
             )
         zones, states = list(sizes), self.states
         exchange = [
             (*pair, _exchanged(*pair, near=[f"{giver}@{z}" for z in _beside(zones, k)]))
             for k, zone in enumerate(zones)
-            for giver, taker in self.exchange
+            for giver, taker, _ in [role for role in self._roles if role.giver and role.taker]
             for pair in [(f"{giver}@{zone}", f"{taker}@{zone}")]
         ]
         for zone, beyond in pairwise(zones):
@@ -172,32 +220,28 @@ class Roles:
                 for state, value in self.inflow.items()
             },
             sizes={f"{state}@{zone}": sizes[zone] for zone in zones for state in states},
-            forward=True,
+            nonnegative=True,
         )
 
     def processes(self, library: Library, states: Sequence[str]) -> list[Process]:
-        """Every process that the library and these roles allow, in the equations of the states.
+        """Every process that is to be found, of those that the library and these roles allow.
 
         Raises ValueError for a role of something that is no state, a term that the library lacks,
-        or an inflow that is "known" but not yet given.
+        a role that no term of the library may play, or one that is "known" but not yet given.
         """
         self._check(library, states)
         found = []
-        every = [name for name in library.names if name != "1"]
-        for giver, taker, *some in self.exchange:
-            gain = self.sizes.get(giver, 1.0) / self.sizes.get(taker, 1.0)
-            for term in _names(library, some[0]) if some else every:
-                factors = {(giver, term): -1.0, (taker, term): gain}
-                found.append(Process(f"{giver} to {taker}", term, MappingProxyType(factors)))
-        named = isinstance(self.outflow, Mapping)
-        for state in self.outflow:
-            for term in self._leaving(state, library):
-                factors = {(state, term): -1.0}
-                found.append(
-                    Process(f"{state} out", term, MappingProxyType(factors), one_sign=not named)
+        for role in self._roles:
+            if isinstance(role.how, Mapping):
+                continue
+            played = list(self._played(role, library))
+            if not played:
+                raise ValueError(
+                    f"no term of the library may play the role {role.name!r}, as it must contain "
+                    f"{role.giver!r}: it has {list(library.names)}; raise its degree, or leave the "
+                    "role out"
                 )
-        for state in [s for s, value in self.inflow.items() if value == FREE]:
-            found.append(Process(f"{state} in", "1", MappingProxyType({(state, "1"): 1.0})))
+            found += played
         taken = self._with_roles | {*self.equations}
         for state in [s for s in states if s not in taken]:
             found += [
@@ -206,46 +250,96 @@ class Roles:
             ]
         return found
 
+    def _played(self, role: Role, library: Library) -> Iterator[Process]:
+        """The processes by which a role may be played."""
+        giver, taker, how = role
+        if not giver:
+            yield self._process(role, "1")
+            return
+        terms = [name for name in library.names if name != "1"] if how == FREE else how
+        terms = [library.names[library.index(term)] for term in terms]
+        if how == FREE and not taker:
+            terms = [term for term in terms if set(_factors(term)) == {giver}]
+        if not self.nonnegative:
+            yield from (self._process(role, term) for term in terms)
+            return
+        yield from (self._process(role, term) for term in terms if giver in _factors(term))
+        back = Role(taker, giver, how)
+        if how == FREE and taker and back.name not in self.names:
+            for term in terms:
+                if taker in _factors(term) and giver not in _factors(term):
+                    yield self._process(back, term)
+
+    def _process(self, role: Role, term: str) -> Process:
+        """A term in a role; without `nonnegative` only the powers that flow out have a sign."""
+        factors = {}
+        if role.giver:
+            factors[role.giver, term] = -1.0
+        if role.taker:
+            gain = self.sizes.get(role.giver, 1.0) / self.sizes.get(role.taker, 1.0)
+            factors[role.taker, term] = gain if role.giver else 1.0
+        signed = self.nonnegative or (not role.taker and role.how == FREE)
+        return Process(role.name, term, MappingProxyType(factors), one_sign=signed)
+
     def with_known_terms(self, library: Library, states: Sequence[str]) -> Library:
         """The library with all terms of the known equations; those added stand in no other.
 
         Raises ValueError for a term of something that is no variable or state.
         """
-        named = [term for terms in self.equations.values() for term in terms]
-        missing = [term for term in dict.fromkeys(named) if term not in library.names]
+        missing = [term for _, term in self.known if term not in library.names]
         if not missing:
             return library
         variables = tuple(dict.fromkeys([*library.variables, *states]))
-        more = [read_term(term, variables) for term in missing]
+        more = [read_term(term, variables) for term in dict.fromkeys(missing)]
         return library_of(variables, [*library.terms, *more])
-
-    def _leaving(self, state: str, library: Library) -> list[str]:
-        """The terms by which a state may flow out."""
-        if isinstance(self.outflow, Mapping):
-            return _names(library, self.outflow[state])
-        powers = re.compile(rf"{re.escape(state)}(\^\d+)?")
-        return [name for name in library.names if powers.fullmatch(name)]
 
     def _check(self, library: Library, states: Sequence[str]) -> None:
         if unknown := [state for state in self.states if state not in states]:
             raise ValueError(
                 f"roles must name states: {unknown} came, and the states are {list(states)}"
             )
-        if open_ := [s for s, value in self.inflow.items() if value in (KNOWN, EITHER)]:
+        if self.open:
             raise ValueError(
-                f"the inflow of {open_} is known only where a record gives it, as in the "
-                f"experiments on a simulated thruster: give a number in SI per second, or {FREE!r}"
+                f"{self.open} are known only where a record gives them, as in the experiments on a "
+                f"simulated thruster: give numbers in SI, or {FREE!r}"
             )
         if self.inflow:
             library.index("1")
-        for _, term in self.signed:
-            library.index(term)
-        self.with_known_terms(library, states)
+        names = self.with_known_terms(library, states).names
+        for _, term in self.known:
+            if term not in names:
+                raise ValueError(
+                    f"a known term must be written as the library does, "
+                    f"{names[library.index(term)]!r}: {term!r} came"
+                )
 
 
-def _names(library: Library, terms: Sequence[str]) -> list[str]:
-    """Terms as the library writes them. Raises ValueError for one that it lacks."""
-    return [library.names[library.index(term)] for term in terms]
+def _check_how(role: Role) -> None:
+    """Raises ValueError for a role that is not played in one of the ways that `Roles` names."""
+    how = role.how
+    words = (KNOWN, FREE, EITHER)
+    if isinstance(how, str):
+        if how in words:
+            return
+    elif isinstance(how, Mapping):
+        values = list(how.values())
+        if all(not isinstance(v, str | bool) and np.isfinite(v) for v in values) and values:
+            return
+    elif role.giver and isinstance(how, Sequence):
+        return
+    ways = "terms with their coefficients in SI, a list of terms" if role.giver else "a number"
+    raise ValueError(
+        f"how {role.name!r} is played must be {ways}, {KNOWN!r}, {FREE!r} or {EITHER!r}: "
+        f"{how!r} came"
+    )
+
+
+def _factors(term: str) -> dict[str, int]:
+    """The variables that a term is a product of, and their powers; none for another function."""
+    try:
+        return dict(split_factors(term))
+    except ValueError:
+        return {}
 
 
 def _beside(zones: Sequence[str], k: int) -> list[str]:
@@ -266,14 +360,6 @@ def _carried(state: str, others: Sequence[str]) -> list[str]:
 def _product(*names: str) -> str:
     powers = Counter(names)
     return "*".join(name if n == 1 else f"{name}^{n}" for name, n in powers.items())
-
-
-def parse_sign(text: str) -> tuple[Place, int]:
-    """Read a demanded sign, `state: term < 0` or `> 0`; raises ValueError for anything else."""
-    found = _SIGN.fullmatch(text)
-    if found is None:
-        raise ValueError(f"a sign is demanded as 'state: term < 0' or '... > 0': {text!r} came")
-    return (found["state"], found["term"]), (1 if found["side"] == ">" else -1)
 
 
 def constraint_of(
@@ -299,13 +385,22 @@ def constraint_of(
     # Most factors are 1, -1 and 0 and so is the result: rounding removes what the inverse adds.
     C = np.where(np.abs(C - np.rint(C)) < 1e-9, np.rint(C), C) + 0.0
     d = fixed - C @ fixed[free]
-    return Constraint(tuple(states), tuple(order), C, d, free, tuple(processes))
+    return Constraint(tuple(states), tuple(order), C, d, free, tuple(processes), fixed)
 
 
 def shares_of(held: Constraint) -> Float[np.ndarray, "free processes"]:
     """What the constraint's processes, with coefficients of one, make of its free coefficients."""
     places = [held.coefficients[k] for k in held.free]
     return np.array([[p.factors.get(at, 0.0) for p in held.processes] for at in places])
+
+
+def process_values(
+    held: Constraint, coef: Float[np.ndarray, " coefs"]
+) -> Float[np.ndarray, " processes"]:
+    """The coefficient of every process to be found, from all coefficients of the constraint."""
+    found = coef[held.free] - (0.0 if held.known is None else held.known[held.free])
+    values: Float[np.ndarray, " processes"] = np.linalg.solve(shares_of(held), found)
+    return values
 
 
 def _independent_rows(matrix: Float[np.ndarray, "rows columns"]) -> np.ndarray:

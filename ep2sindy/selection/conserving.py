@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.coerce import Task, noise_inside
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import column_norms
-from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Constraint, Place, Process
+from ep2sindy.library.relations import Place, Process
 from ep2sindy.library.roles import Roles, constraint_of, shares_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.refine import with_coef
@@ -19,7 +18,7 @@ from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
-from ep2sindy.selection.systems import Demand, Systems, TrialSystem
+from ep2sindy.selection.systems import Systems, TrialSystem
 
 Support = tuple[np.ndarray, np.ndarray]  # indices of processes, and their coefficients
 
@@ -31,9 +30,10 @@ def conserving_systems(
 
     One regression over the training rows of all equations, each weighted by its residuals, has one
     column per process; so a search proposes processes, and what they move is conserved exactly. Of
-    every size, the `depth` best systems are kept in which every role is played by a process, in its
-    direction if the roles demand one and any system of the search obeys. problems: rows of the
-    task's library with the terms of known equations, `with_known_terms`.
+    every size, the `depth` best systems are kept in which every role is played by a process, and
+    those that must be positive are: least squares with these bounds would put another to zero,
+    which is a smaller system. problems: rows of the task's library with the terms of known
+    equations, `with_known_terms`.
     Raises ValueError for roles that do not fit the task, or if no system plays them all.
     """
     processes = roles.processes(task.library, task.states)
@@ -42,17 +42,15 @@ def conserving_systems(
     norms = column_norms(columns)
     unit = columns / norms
     masks = search.supports(unit.T @ unit, unit.T @ target, float(target @ target))
-    means = _means(task)
-    whole = _ranked(_complete(masks, processes), unit, target)
-    directed = [
-        (chosen, values)
-        for chosen, values in whole
-        if _is_directed([processes[k] for k in chosen], values / norms[chosen], roles, task, means)
+    whole = _ranked(_complete(masks, processes, roles.names), unit, target)
+    positive = np.array([process.one_sign for process in processes])
+    admissible = [
+        (chosen, values) for chosen, values in whole if (values[positive[chosen]] > 0.0).all()
     ]
     found = []
-    for chosen, values in _first_of_each_size(directed or whole, depth):
+    for chosen, values in _first_of_each_size(admissible or whole, depth):
         ours = [processes[k] for k in chosen]
-        system = _system(task, ours, values / norms[chosen], roles, means)
+        system = _system(task, ours, values / norms[chosen], roles)
         if system is not None:
             found.append(system)
     if not found:
@@ -95,10 +93,11 @@ def _joint_rows(
 
 
 def _complete(
-    masks: Bool[np.ndarray, "supports processes"], processes: Sequence[Process]
+    masks: Bool[np.ndarray, "supports processes"], processes: Sequence[Process], given: set[str]
 ) -> Bool[np.ndarray, "_ processes"]:
-    """The supports in which every role is played by a process or more."""
-    roles = {process.role for process in processes}
+    """The supports in which every role that is given is played, and no equation is empty."""
+    named = {process.role for process in processes}
+    roles = [role for role in named if role in given or role.endswith(" free")]
     played = [np.any(masks[:, [p.role == role for p in processes]], axis=1) for role in roles]
     return masks[np.all(played, axis=0)]
 
@@ -124,31 +123,11 @@ def _first_of_each_size(supports: Sequence[Support], depth: int) -> list[Support
     return [each for k, each in enumerate(supports) if k - sizes.index(sizes[k]) < depth]
 
 
-def _is_directed(
-    processes: Sequence[Process],
-    values: Float[np.ndarray, " processes"],
-    roles: Roles,
-    task: Task,
-    means: Float[np.ndarray, " terms"],
-) -> bool:
-    """Whether the coefficients of a regression obey what `_demands` asks of directions."""
-    rates: dict[str, float] = {}
-    for process, value in zip(processes, values, strict=True):
-        if process.one_sign and value <= 0.0:
-            return False
-        rate = value * means[task.library.index(process.term)]
-        rates[process.role] = rates.get(process.role, 0.0) + rate
-    return not roles.forward or all(
-        rate > 0.0 for role, rate in rates.items() if not role.endswith(" free")
-    )
-
-
 def _system(
     task: Task,
     processes: Sequence[Process],
     values: Float[np.ndarray, " processes"],
     roles: Roles,
-    means: Float[np.ndarray, " terms"],
 ) -> TrialSystem | None:
     """The system of these processes; None if its coefficients do not tell them apart."""
     held = constraint_of(task.library, task.states, processes, roles.known)
@@ -156,45 +135,9 @@ def _system(
         return None
     empty = np.zeros((len(task.library), len(task.states)))
     model = SparseModel(task.library, task.states, empty, task.runs[0].units)
-    coef = held.coef(shares_of(held) @ values)
-    return TrialSystem(
-        with_coef(model, held, coef)[0], held, _demands(held, roles, task.library, means)
-    )
-
-
-def _means(task: Task) -> Float[np.ndarray, " terms"]:
-    """Mean of every term over the records."""
-    library = task.library
-    values = [noise_inside(library, run.columns(library.variables)) for run in task.runs]
-    mean: Float[np.ndarray, " terms"] = library.evaluate(np.concatenate(values)).mean(axis=0)
-    return mean
-
-
-def _demands(
-    held: Constraint, roles: Roles, library: Library, means: Float[np.ndarray, " terms"]
-) -> list[Demand]:
-    """What an outflow takes away is positive, and coefficients have the signs asked for.
-
-    Processes of one sign are positive each; others of an outflow, and of an exchange that goes
-    forward, together and in the mean.
-    """
-    found = []
-    together: dict[str, np.ndarray] = {}
-    for process, row in zip(held.processes, np.linalg.inv(shares_of(held)), strict=True):
-        weights = np.zeros(len(held.coefficients))
-        weights[held.free] = row
-        if process.one_sign:
-            found.append(Demand(f"{process.role} by {process.term} > 0", weights))
-        elif roles.forward and not process.role.endswith(" free"):
-            rate = weights * means[library.index(process.term)]
-            together[process.role] = together.get(process.role, 0.0) + rate
-    found += [Demand(f"{role} > 0 in the mean", weights) for role, weights in together.items()]
-    for (state, term), sign in roles.signed.items():
-        if (state, term) in held.coefficients:
-            weights = np.zeros(len(held.coefficients))
-            weights[held.coefficients.index((state, term))] = sign
-            found.append(Demand(f"{state}: {term} {'<' if sign < 0 else '>'} 0", weights))
-    return found
+    known = np.array([roles.known.get(held.coefficients[k], 0.0) for k in held.free])
+    coef = held.coef(shares_of(held) @ values + known)
+    return TrialSystem(with_coef(model, held, coef)[0], held)
 
 
 def _with_fronts(

@@ -66,6 +66,9 @@ DEARER = 1
 # Largest ratio of the waveform errors of two systems that count as equals.
 ALIKE = 1.5
 
+# Largest ratio of the waveform errors of two systems of which the one of lower order comes first.
+SAME = 1.1
+
 # Smallest modulus of a repelling cycle's multipliers; a neutral cycle's is one but for errors.
 PUSH = 1.003
 
@@ -354,6 +357,7 @@ class FreeRunScore:
             k for k, t in enumerate(trials) if t.error <= 1.0 and (t.loss < FLOOR or not exact)
         ]
         living.sort(key=lambda k: self._rank(trials[k]))
+        living = _simplest_of_equals(living, trials)
         by_error = sorted(range(len(trials)), key=lambda k: (trials[k].error, trials[k].loss))
         window = self._window(records, cycles)
         found: list[Confirmed] = []
@@ -381,6 +385,7 @@ class FreeRunScore:
         return won.number, won.run.model, won.text(len(living), len(trials))
 
     def _rank(self, trial: Trial) -> tuple[bool, int, float]:
+        """Sorts the smallest system first, and of one size the one with the best waveform."""
         return trial.error > self.margin, trial.system.n_free, trial.waveform
 
     def _confirm(
@@ -398,6 +403,26 @@ class FreeRunScore:
         run = free_run(model, longest, initial=start, bounds=self.bounds, judged=self.judged)
         share, repels = _attraction(run, cycles) if run.verdict is Verdict.LIVES else (0.0, False)
         return Confirmed(number, trial, run, share, trial.system.broken(model), repels)
+
+
+def _simplest_of_equals(ranked: Sequence[int], trials: Sequence[Trial]) -> list[int]:
+    """The ranked systems; of those that are as good as the best one left, the lowest order first.
+
+    A search under roles offers the same law with n_n and with n_n^2, which differ by less than the
+    next record would.
+    """
+    left, found = list(ranked), []
+    while left:
+        best = trials[left[0]]
+        equals = [
+            k for k in left
+            if trials[k].system.n_free == best.system.n_free
+            and trials[k].waveform <= SAME * best.waveform
+        ]  # fmt: skip
+        simplest = min(equals, key=lambda k: trials[k].system.order)
+        found.append(simplest)
+        left.remove(simplest)
+    return found
 
 
 def _attraction(run: FreeRun, cycles: Sequence[Cycle]) -> tuple[float, bool]:

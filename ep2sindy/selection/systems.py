@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding, constraint
+from ep2sindy.library.roles import process_values
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
@@ -24,34 +25,32 @@ BATCH_STEPS = 6000
 
 
 @dataclass(frozen=True, eq=False)
-class Demand:
-    """What must be positive: a weighted sum of coefficients (coefs,), in words."""
-
-    words: str
-    weights: Float[np.ndarray, " coefs"]
-
-
-@dataclass(frozen=True, eq=False)
 class TrialSystem:
-    """A model of one candidate per equation, with the constraint that its coefficients obey.
-
-    demands: of refined coefficients, with weights in the order of the constraint's coefficients.
-    """
+    """A model of one candidate per equation, with the constraint that its coefficients obey."""
 
     model: SparseModel
     constraint: Constraint
-    demands: Sequence[Demand] = ()
 
     @property
     def n_free(self) -> int:
         """Number of coefficients that are fitted."""
         return len(self.constraint.free)
 
+    @property
+    def order(self) -> int:
+        """Number of factors of the terms of all processes; zero without processes."""
+        library = self.model.library
+        return sum(int(library.degrees[library.index(p.term)]) for p in self.constraint.processes)
+
     def broken(self, model: SparseModel) -> list[str]:
-        """The demands that the coefficients of a refined model do not meet."""
+        """The processes that must be positive, and are not in a refined model."""
+        signed = [process.one_sign for process in self.constraint.processes]
+        if not any(signed):
+            return []
         terms = {state: model.terms(state) for state in model.states}
         coef = np.array([terms[s].get(term, 0.0) for s, term in self.constraint.coefficients])
-        return [each.words for each in self.demands if each.weights @ coef <= 0.0]
+        found = zip(self.constraint.processes, process_values(self.constraint, coef), strict=True)
+        return [f"{p.role} by {p.term} > 0" for p, value in found if p.one_sign and value <= 0.0]
 
     def refined_on_all(
         self,

@@ -17,7 +17,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.living import balance_figure
 from ep2sindy.library.names import split_factors
 from ep2sindy.library.relations import Constraint, Process, constraint
-from ep2sindy.library.roles import shares_of
+from ep2sindy.library.roles import process_values
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
@@ -26,8 +26,8 @@ from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pic
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
+from ep2sindy.studies.told import IONS, NEUTRALS, recorded_rates
 
-IONS, NEUTRALS = "n_i", "n_n"
 NO_SIZES: Mapping[str, float] = MappingProxyType({})
 CAPTION = (
     "What zones gain or lose by each process, over two periods: in the record (grey), and by "
@@ -49,18 +49,6 @@ PLACES: Mapping[tuple[str, str, bool], tuple[tuple[str, ...], str]] = {
     (NEUTRALS, "neutrals", False): (("exit_n",), "exit"),
     (NEUTRALS, "constant", True): (("supply",), "mass flow"),
 }
-
-
-def inflows_of(balances: Mapping[str, xr.Dataset]) -> dict[str, float]:
-    """The inflows that the balances of zones give, by state, in m^-3/s: those of the neutrals.
-
-    balances: by zone; a single one is called "".
-    """
-    return {
-        f"{NEUTRALS}@{zone}" if zone else NEUTRALS: float(balance["supply"].mean())
-        for zone, balance in balances.items()
-        if "supply" in balance
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +117,7 @@ def compared_processes(
     given = {s: sign * _sum(part, len(theta)) for s, (sign, part) in seen.items()}
     shared = _sum(ahead, len(theta)) - _sum(back, len(theta))
     agree = np.allclose(given[IONS], given[NEUTRALS], rtol=1e-6)
-    known = _recorded(balance, data)
+    known = recorded_rates(balance, data)
     exchanged = _difference(known, "ionization", "returned")
     words = "neutrals that become ions, less those that walls and anode give back"
     found = []
@@ -164,9 +152,8 @@ def zone_processes(
     sizes: zone -> its length. Rates are those of the zone that gives, or takes from outside.
     """
     theta = model.library.evaluate(data.columns(model.library.variables))
-    free = [held_to.coefficients[k] for k in held_to.free]
-    coef = np.array([model.terms(state).get(term, 0.0) for state, term in free])
-    values = np.linalg.solve(shares_of(held_to), coef)
+    coef = np.array([model.terms(s).get(term, 0.0) for s, term in held_to.coefficients])
+    values = process_values(held_to, coef)
     rates: dict[tuple[str, str], dict[str, np.ndarray]] = {}
     for process, value in zip(held_to.processes, values, strict=True):
         column = theta[:, model.library.index(process.term)]
@@ -174,7 +161,7 @@ def zone_processes(
     for (state, term), value in zip(held_to.coefficients, held_to.d, strict=True):
         if term == "1" and value:
             rates.setdefault(("", state), {})["1"] = np.full(len(theta), value)
-    known = {zone: _recorded(balance, data) for zone, balance in balances.items()}
+    known = {zone: recorded_rates(balance, data) for zone, balance in balances.items()}
     gone = _through_ends(known, sizes)
     found = []
     for ends, terms in rates.items():
@@ -267,12 +254,6 @@ def _sum(part: Mapping[str, np.ndarray], n: int) -> np.ndarray:
 
 def _named(state: str, part: Mapping[str, np.ndarray]) -> list[str]:
     return [f"{state}': {term}" for term in part]
-
-
-def _recorded(balance: xr.Dataset, data: Trajectory) -> dict[str, np.ndarray]:
-    """Terms of the balance at the samples of the trajectory."""
-    there = np.isin(balance["time"].values, data.t)
-    return {str(name): balance[name].values[there] for name in balance.data_vars}
 
 
 def _difference(known: Mapping[str, np.ndarray], first: str, second: str) -> np.ndarray | None:
@@ -397,7 +378,7 @@ def model_balance(
     held_to = held_to or constraint(model.library, support)
     ours = balance is not None and set(model.states) == set(model.library.variables)
     ours = ours and set(model.states) == {IONS, NEUTRALS} and not model.library.functions
-    known = _recorded(balance, data) if ours and balance is not None else {}
+    known = recorded_rates(balance, data) if ours and balance is not None else {}
     processes = compared_processes(model, data, balance) if ours and balance is not None else []
     if sizes and balances and held_to is not None and held_to.processes:
         processes = zone_processes(model, held_to, data, balances, sizes)

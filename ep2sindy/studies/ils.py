@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
@@ -29,7 +30,6 @@ from ep2sindy.report.document import Captioned, Section, Table
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.balance import inflows_of
 from ep2sindy.studies.fits import (
     COMPARED,
     Evaluation,
@@ -113,8 +113,8 @@ class Study:
             name: fit_and_evaluate(train, held, library, each, form, rng=next(streams))
             for name, each, form in count_pieces(run.watch, fits, "fit")
         }
-        inflow = inflows_of(balances_of(self.source, field, run))
-        lives, own = self._living(train, inflow, rng=next(streams), progress=run.watch)
+        balances = balances_of(self.source, field, run)
+        lives, own = self._living(train, balances, rng=next(streams), progress=run.watch)
         starts = {
             "ils": (judged["base"].model, free),
             "ils_constrained": (judged["constrained"].model, tied),
@@ -146,7 +146,7 @@ class Study:
     def _living(
         self,
         train: Trajectory,
-        inflow: Mapping[str, float],
+        balances: Mapping[str, xr.Dataset],
         *,
         rng: np.random.Generator,
         progress: Progress,
@@ -154,7 +154,9 @@ class Study:
         """The model that oscillates on its own, and what its coefficients obey."""
         rows = Regression(self.formulation)
         library = polynomial(train.state_names, degree=2)
-        found = self.living.found(train, library, rows, inflow=inflow, rng=rng, progress=progress)
+        found = self.living.found(
+            train, library, rows, balances=balances, rng=rng, progress=progress
+        )
         model = found.model
         support = {state: list(model.terms(state)) for state in model.states}
         return model, found.constraint or constraint(model.library, support)

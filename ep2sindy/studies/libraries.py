@@ -30,7 +30,7 @@ from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.smoothers import Smoother
-from ep2sindy.studies.balance import ModelBalance, inflows_of, model_balance
+from ep2sindy.studies.balance import ModelBalance, model_balance
 from ep2sindy.studies.fits import Terms, n_before, split_in_time
 from ep2sindy.studies.forecasts import (
     forecast_errors,
@@ -291,7 +291,7 @@ class Study:
         assert self.living is not None
         parts = split_in_time(data, self.held_out or HELD_OUT)
         lives = living_model(
-            *parts, library, rows, self.living, selected, inflow=inflows_of(zones.balances),
+            *parts, library, rows, self.living, selected, balances=zones.balances,
             sizes=zones.sizes, rng=rng, progress=progress,
         )  # fmt: skip
         beside = model_balance(

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
@@ -37,6 +38,7 @@ from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.spectrum import samples_in_periods
 from ep2sindy.studies.study import Count, Positive
+from ep2sindy.studies.told import TELLING, told_roles
 from ep2sindy.studies.views import (
     coefficients,
     display_equation,
@@ -80,27 +82,42 @@ class LivingSearch:
         library: Library,
         rows: Regression,
         *,
-        inflow: Mapping[str, float],
+        balances: Mapping[str, xr.Dataset],
         sizes: Mapping[str, float] = NO_SIZES,
         rng: np.random.Generator,
         progress: Progress = SILENT,
     ) -> Discovery:
         """The discovery in a record, with the formulation and bootstraps of `rows`.
 
-        inflow: of states, as far as the record gives it. sizes: length of each of several zones,
-        in which the roles then hold.
+        balances: of the zones, which tell what the roles take as known. sizes: length of each of
+        several zones, in which the roles then hold.
         """
         own = replace(rows, search=self.search, depth=self.depth, selection=self.selection)
         library = polynomial(train.state_names, degree=self.degree) if self.degree else library
-        roles = self.roles.in_zones(sizes) if self.roles and sizes else self.roles
-        roles = roles and roles.with_known(inflow)
+        roles, told = self._told(train, balances, sizes)
         seen, words = self._quiet(train)
         found = discover(seen, library, own, roles=roles, seed=rng, progress=progress)
+        found = replace(found, note=f"{found.note}{told}")
         if not words:
             return found
         # The noise is gone from the samples, and with it what intervals are made of.
         model = replace(found.model, covariance=None)
         return replace(found, model=model, note=f"{words}{found.note}")
+
+    def _told(
+        self, train: Trajectory, balances: Mapping[str, xr.Dataset], sizes: Mapping[str, float]
+    ) -> tuple[Roles | None, str]:
+        """The roles with what the record tells, and how well it tells what is fitted to it."""
+        if self.roles is None:
+            return None, ""
+        roles = self.roles.in_zones(sizes) if sizes else self.roles
+        told = told_roles(balances, train)
+        fitted = [role for role in roles.open if role in told and role in TELLING]
+        known = {name: role.terms for name, role in told.items()}
+        words = (
+            f"{name} by {', '.join(told[name].terms)} (R2 {told[name].r2:.3f})" for name in fitted
+        )
+        return roles.with_known(known), f"; told: {', '.join(words)}" if fitted else ""
 
     def _quiet(self, train: Trajectory) -> tuple[Trajectory, str]:
         """What the search sees of a record, and why, if that is its mean cycle."""
@@ -313,18 +330,18 @@ def living_model(
     settings: LivingSearch,
     selected: SparseModel,
     *,
-    inflow: Mapping[str, float],
+    balances: Mapping[str, xr.Dataset],
     sizes: Mapping[str, float],
     rng: np.random.Generator,
     progress: Progress = SILENT,
 ) -> Living:
     """Find a living model in one part of a record, and run it over the other.
 
-    selected: the model selected by derivatives, which is refined for comparison. inflow: of states,
-    as far as the record gives it. sizes: length of each of several zones.
+    selected: the model selected by derivatives, which is refined for comparison. balances: of
+    the zones, as far as the record gives them. sizes: length of each of several zones.
     """
     found = settings.found(
-        train, library, rows, inflow=inflow, sizes=sizes, rng=rng, progress=progress
+        train, library, rows, balances=balances, sizes=sizes, rng=rng, progress=progress
     )
     with progress.stage(None, "", "free run and limit cycle"):
         start = start_of(held, found.model)
