@@ -19,6 +19,7 @@ from dataclasses import field as field_of
 from functools import cache
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -60,6 +61,18 @@ TOLD = replace(
     MASS_ACTION,
     exchange=[("n_n", "n_i"), ("n_i", "n_n", "known")],
     outflow={"n_i": "free", "n_n": "known"},
+)
+# One structure for every point: every term a process, five free coefficients. Nothing but the mass
+# flow is known of the law; of the other one, what leaves as neutrals and comes back, too.
+LAW = replace(
+    MASS_ACTION,
+    exchange=[("n_n", "n_i", ["n_i^2*n_n", "n_i*n_n^2"])],
+    outflow={"n_i": ["n_i", "n_i^2"], "n_n": ["n_n"]},
+)
+LAW_TOLD = replace(
+    LAW,
+    exchange=[("n_n", "n_i", ["n_i*n_n", "n_i^2*n_n", "n_i*n_n^2"]), ("n_i", "n_n", "known")],
+    outflow={"n_i": ["n_i", "n_i^2"], "n_n": "known"},
 )
 SETS = {"default": ep.thruster.Thruster(), "former": FORMER}
 
@@ -157,11 +170,35 @@ def told(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
     return under(TOLD, fitted, whole, seed=seed)
 
 
-def under(roles: ep.Roles, fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
+class AllTerms:
+    """A search that proposes all terms."""
+
+    def supports(self, xx: np.ndarray, xy: np.ndarray, yy: float) -> np.ndarray:
+        return np.ones((1, len(xy)), dtype=np.bool_)
+
+
+def law(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
+    """The terms of `LAW`, with nothing selected."""
+    return under(LAW, fitted, whole, seed=seed, search=AllTerms())
+
+
+def law_told(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
+    """The terms of `LAW_TOLD`, with nothing selected."""
+    return under(LAW_TOLD, fitted, whole, seed=seed, search=AllTerms())
+
+
+def under(
+    roles: ep.Roles,
+    fitted: ep.Trajectory,
+    whole: Record,
+    *,
+    seed: int,
+    search: Any = None,
+) -> ep.Discovery:
     """A search over the whole channel under roles, whose known parts are those of the record."""
     method = ep.Regression(
         ep.Differential(),
-        ep.BestSubset(max_terms=6, n_best=2000),
+        search or ep.BestSubset(max_terms=6, n_best=2000),
         ep.FreeRunScore(seed=seed, window_periods=4.0, n_confirmed=16),
         depth=16,
     )

@@ -192,15 +192,14 @@ def test_a_search_in_zones_finds_the_truth_and_conserves() -> None:
     }
 
 
-def test_every_process_of_zones_goes_forward() -> None:
+def test_every_role_of_zones_goes_forward() -> None:
     record = chain()
     back = ep.Roles(exchange=[("n_i", "n_n")], outflow=STATES, inflow={"n_n": 0.4}).in_zones(SIZES)
-    assert all(p.one_sign for p in back.processes(ep.polynomial(NAMES, degree=3), NAMES))
     method = ep.Regression(
         search=ep.BestSubset(max_terms=6, n_best=100), selection=ep.RefinedScore(), depth=2
     )
     found = ep.discover(record, ep.polynomial(NAMES, degree=3), method, roles=back)
-    assert "n_i@a to n_n@a by" in found.note  # no model gives ions to neutrals
+    assert "n_i@a to n_n@a > 0 in the mean" in found.note  # no model gives ions to neutrals
 
 
 def test_terms_are_of_one_zone() -> None:

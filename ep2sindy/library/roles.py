@@ -67,6 +67,8 @@ class Roles:
     sizes: state -> length or volume that it is an average over; what leaves a small place changes a
     large one by less. Absent ones are one. equations: state -> terms with their coefficients in SI,
     where the equation is known and nothing is to be found; the library need not hold these terms.
+    forward: True if in the mean over the records every role must move more forward than back, as
+    in several zones.
     Raises ValueError for an exchange of a state with itself, a size that is not positive, or a role
     of a state whose equation is known.
 
@@ -82,6 +84,7 @@ class Roles:
     nonnegative: bool = False
     sizes: Mapping[str, float] = field(default_factory=dict)
     equations: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    forward: bool = False
 
     def __post_init__(self) -> None:
         check_list("exchange", self.exchange)
@@ -184,12 +187,13 @@ class Roles:
     def in_zones(self, sizes: Mapping[str, float]) -> Roles:
         """These roles in adjoining zones of one place, in the order in which the states move on.
 
-        sizes: zone -> its length or volume. States become those of `zone_averages`, `n_i@exit`, and
-        are nonnegative. What states exchange in a zone, they exchange by their product, alone or
-        times one more density of the zone or of the giver in a neighbouring zone. Every state with
-        a role moves from each zone to the next by terms that it is a factor of, alone or times one
-        other density of its zone or its own in the next one. It enters the first zone and leaves
-        the last. A number as inflow is that of all zones together, as if they were one.
+        sizes: zone -> its length or volume. States become those of `zone_averages`, `n_i@exit`.
+        What states exchange in a zone, they exchange by their product, alone or times one more
+        density of the zone or of the giver in a neighbouring zone. Every state with a role moves
+        from each zone to the next by terms that it is a factor of, alone or times one other density
+        of its zone or its own in the next one. It enters the first zone and leaves the last. In the
+        mean all of them go forward. A number as inflow is that of all zones together, as if they
+        were one.
         Raises ValueError for terms, which are of one zone's equations.
         """
         if any(role.how != FREE for role in self._roles if role.giver):
@@ -220,7 +224,8 @@ class Roles:
                 for state, value in self.inflow.items()
             },
             sizes={f"{state}@{zone}": sizes[zone] for zone in zones for state in states},
-            nonnegative=True,
+            nonnegative=self.nonnegative,
+            forward=True,
         )
 
     def processes(self, library: Library, states: Sequence[str]) -> list[Process]:

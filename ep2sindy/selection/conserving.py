@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.relations import Place, Process
 from ep2sindy.library.roles import Roles, constraint_of, shares_of
@@ -18,7 +18,7 @@ from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
-from ep2sindy.selection.systems import Systems, TrialSystem
+from ep2sindy.selection.systems import Systems, TrialSystem, broken_demands
 
 Support = tuple[np.ndarray, np.ndarray]  # indices of processes, and their coefficients
 
@@ -43,14 +43,22 @@ def conserving_systems(
     unit = columns / norms
     masks = search.supports(unit.T @ unit, unit.T @ target, float(target @ target))
     whole = _ranked(_complete(masks, processes, roles.names), unit, target)
-    positive = np.array([process.one_sign for process in processes])
+    means = _means(task, processes) if roles.forward else None
     admissible = [
-        (chosen, values) for chosen, values in whole if (values[positive[chosen]] > 0.0).all()
+        (chosen, values)
+        for chosen, values in whole
+        if not broken_demands(
+            [processes[k] for k in chosen],
+            values / norms[chosen],
+            None if means is None else means[chosen],
+        )
     ]
     found = []
     for chosen, values in _first_of_each_size(admissible or whole, depth):
         ours = [processes[k] for k in chosen]
         system = _system(task, ours, values / norms[chosen], roles)
+        if system is not None and means is not None:
+            system = replace(system, means=means[chosen])
         if system is not None:
             found.append(system)
     if not found:
@@ -138,6 +146,14 @@ def _system(
     known = np.array([roles.known.get(held.coefficients[k], 0.0) for k in held.free])
     coef = held.coef(shares_of(held) @ values + known)
     return TrialSystem(with_coef(model, held, coef)[0], held)
+
+
+def _means(task: Task, processes: Sequence[Process]) -> Float[np.ndarray, " processes"]:
+    """Mean of the term of every process over the records."""
+    library = task.library
+    values = [noise_inside(library, run.columns(library.variables)) for run in task.runs]
+    mean = library.evaluate(np.concatenate(values)).mean(axis=0)
+    return mean[[library.index(process.term) for process in processes]]
 
 
 def _with_fronts(

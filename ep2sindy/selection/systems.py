@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Constraint, Relation, binding, constraint
+from ep2sindy.library.relations import Constraint, Process, Relation, binding, constraint
 from ep2sindy.library.roles import process_values
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
@@ -26,10 +26,14 @@ BATCH_STEPS = 6000
 
 @dataclass(frozen=True, eq=False)
 class TrialSystem:
-    """A model of one candidate per equation, with the constraint that its coefficients obey."""
+    """A model of one candidate per equation, with the constraint that its coefficients obey.
+
+    means: of the term of every process over the records, if roles must go forward in the mean.
+    """
 
     model: SparseModel
     constraint: Constraint
+    means: Float[np.ndarray, " processes"] | None = None
 
     @property
     def n_free(self) -> int:
@@ -43,14 +47,13 @@ class TrialSystem:
         return sum(int(library.degrees[library.index(p.term)]) for p in self.constraint.processes)
 
     def broken(self, model: SparseModel) -> list[str]:
-        """The processes that must be positive, and are not in a refined model."""
-        signed = [process.one_sign for process in self.constraint.processes]
-        if not any(signed):
+        """The demands on processes that a refined model does not meet."""
+        processes = self.constraint.processes
+        if self.means is None and not any(process.one_sign for process in processes):
             return []
         terms = {state: model.terms(state) for state in model.states}
         coef = np.array([terms[s].get(term, 0.0) for s, term in self.constraint.coefficients])
-        found = zip(self.constraint.processes, process_values(self.constraint, coef), strict=True)
-        return [f"{p.role} by {p.term} > 0" for p, value in found if p.one_sign and value <= 0.0]
+        return broken_demands(processes, process_values(self.constraint, coef), self.means)
 
     def refined_on_all(
         self,
@@ -110,6 +113,23 @@ def combined(
     places = combinations(fronts, most, relations)
     systems = systems_of(fronts, places, library, runs, relations)
     return Systems(fronts, places, systems, left_out(fronts, len(places), most))
+
+
+def broken_demands(
+    processes: Sequence[Process],
+    values: Float[np.ndarray, " processes"],
+    means: Float[np.ndarray, " processes"] | None,
+) -> list[str]:
+    """What is not positive of these processes, though it must be; see `TrialSystem`."""
+    pairs = list(zip(processes, values.tolist(), strict=True))
+    found = [f"{p.role} by {p.term} > 0" for p, value in pairs if p.one_sign and value <= 0.0]
+    if means is None:
+        return found
+    rates: dict[str, float] = {}
+    for (process, value), mean in zip(pairs, means.tolist(), strict=True):
+        rates[process.role] = rates.get(process.role, 0.0) + value * mean
+    back = [role for role, rate in rates.items() if rate <= 0.0 and not role.endswith(" free")]
+    return found + [f"{role} > 0 in the mean" for role in back]
 
 
 def demands_note(note: str, broken: Sequence[str]) -> str:
