@@ -161,3 +161,11 @@ def split_factors(name: str) -> list[tuple[str, int]]:
             "like 'n_i^2*n_n'"
         )
     return [(variable, _power(power, name)) for variable, power in _PARTS.findall(name)]
+
+
+def factors_of(name: str) -> dict[str, int]:
+    """The variables that a term is a product of, and their powers; none for another function."""
+    try:
+        return dict(split_factors(name))
+    except ValueError:
+        return {}

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.library.library import Library, library_of
-from ep2sindy.library.names import split_factors
+from ep2sindy.library.names import factors_of
 from ep2sindy.library.relations import Constraint, Place, Process
 from ep2sindy.library.terms import read_term
 from ep2sindy.runtime.values import check_list
@@ -264,15 +264,15 @@ class Roles:
         terms = [name for name in library.names if name != "1"] if how == FREE else how
         terms = [library.names[library.index(term)] for term in terms]
         if how == FREE and not taker:
-            terms = [term for term in terms if set(_factors(term)) == {giver}]
+            terms = [term for term in terms if set(factors_of(term)) == {giver}]
         if not self.nonnegative:
             yield from (self._process(role, term) for term in terms)
             return
-        yield from (self._process(role, term) for term in terms if giver in _factors(term))
+        yield from (self._process(role, term) for term in terms if giver in factors_of(term))
         back = Role(taker, giver, how)
         if how == FREE and taker and back.name not in self.names:
             for term in terms:
-                if taker in _factors(term) and giver not in _factors(term):
+                if taker in factors_of(term) and giver not in factors_of(term):
                     yield self._process(back, term)
 
     def _process(self, role: Role, term: str) -> Process:
@@ -337,14 +337,6 @@ def _check_how(role: Role) -> None:
         f"how {role.name!r} is played must be {ways}, {KNOWN!r}, {FREE!r} or {EITHER!r}: "
         f"{how!r} came"
     )
-
-
-def _factors(term: str) -> dict[str, int]:
-    """The variables that a term is a product of, and their powers; none for another function."""
-    try:
-        return dict(split_factors(term))
-    except ValueError:
-        return {}
 
 
 def _beside(zones: Sequence[str], k: int) -> list[str]:

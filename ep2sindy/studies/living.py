@@ -27,6 +27,7 @@ from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.free_run import FreeCycle, FreeRun, free_run
+from ep2sindy.model.mass_action import consequences
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.regression.searches import Search
@@ -244,6 +245,7 @@ LIVING: Metrics[Living] = [
     Metric("verdict_by_derivatives", lambda found: str(found.by_derivatives.run.verdict), View.CSV),
     Metric("coefficients", lambda found: _with_intervals(found.model), View.JSON),
     Metric("text", lambda found: found.model.text(), View.JSON),
+    Metric("proved", lambda found: consequences(found.model), View.JSON),
     Metric("selection", lambda found: found.discovery.note, View.JSON),
     Metric("by_derivatives", lambda found: facts(found.by_derivatives, REFINED), View.JSON),
 ]
@@ -295,7 +297,8 @@ def run_title(run: FreeRun) -> str:
 
 def _note(living: Living) -> str:
     """Note on the selection, the stability, and the columns of the table."""
-    found = [f"Selection: {living.discovery.note}."]
+    found = [f"By its terms: {words}." for words in consequences(living.model)]
+    found.append(f"Selection: {living.discovery.note}.")
     found += [living.free.text] if living.free.text else []
     found += [f"Misfit: {living.discovery.misfit}."] if living.discovery.misfit else []
     found.append(
