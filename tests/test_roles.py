@@ -48,7 +48,7 @@ def test_every_role_has_its_terms_and_no_other():
 
 def test_the_constraint_is_that_of_the_processes():
     chosen = processes(("n_n to n_i", "n_i*n_n"), ("n_n to n_i", "n_i"), ("n_i out", "n_i"))
-    held = constraint_of(LIBRARY, STATES, chosen, {("n_n", "1"): 7.0})
+    held = constraint_of(LIBRARY, STATES, chosen, ep.Roles(inflow={"n_n": 7.0}).told)
     assert held.coefficients == (
         ("n_i", "n_i"), ("n_i", "n_i*n_n"), ("n_n", "1"), ("n_n", "n_i"), ("n_n", "n_i*n_n"),
     )  # fmt: skip
@@ -60,8 +60,8 @@ def test_the_constraint_is_that_of_the_processes():
 def test_processes_that_no_coefficients_tell_apart_make_no_system():
     twice = processes(("n_n to n_i", "n_i"), ("n_i out", "n_i"))
     spare = ep.Roles(outflow={"n_n": ["n_i"]}).processes(LIBRARY, STATES)[:1]
-    assert constraint_of(LIBRARY, STATES, twice, {}) is not None
-    assert constraint_of(LIBRARY, STATES, [*twice, *spare], {}) is None
+    assert constraint_of(LIBRARY, STATES, twice) is not None
+    assert constraint_of(LIBRARY, STATES, [*twice, *spare]) is None
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +222,7 @@ def test_three_states_exchange_in_pairs():
         p for p in roles.processes(library, names)
         if (p.role, p.term) in {("x to y", "x"), ("y to z", "y"), ("z out", "z")}
     ]  # fmt: skip
-    held = constraint_of(library, names, chosen, {})
+    held = constraint_of(library, names, chosen)
     coef = dict(zip(held.coefficients, held.coef(np.array([-2.0, -3.0, -5.0])), strict=True))
     assert coef == {("x", "x"): -2.0, ("y", "x"): 2.0, ("y", "y"): -3.0, ("z", "y"): 3.0,
                     ("z", "z"): -5.0}  # fmt: skip
@@ -235,7 +235,7 @@ def test_a_known_equation_is_kept_and_its_terms_stand_in_no_other() -> None:
     assert whole.names == (*library.names, "n_i^2*n_n")
     processes = roles.processes(library, STATES)
     assert [(p.role, p.term) for p in processes] == [("n_i out", "n_i"), ("n_i out", "n_i^2")]
-    held = constraint_of(whole, STATES, processes[:1], roles.known)
+    held = constraint_of(whole, STATES, processes[:1], roles.told)
     assert held.coefficients == (("n_i", "n_i"), ("n_n", "1"), ("n_n", "n_i^2*n_n"))
     assert held.coef(np.array([-5.0])).tolist() == [-5.0, -1.0, 2.0]
 

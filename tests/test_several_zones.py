@@ -235,7 +235,7 @@ def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones,
     )
     library = ep.polynomial(run.state_names, degree=3)
     chosen = {p.role: p for p in roles.processes(library, run.state_names)}  # the last of each
-    held = constraint_of(library, run.state_names, [*chosen.values()], roles.known)
+    held = constraint_of(library, run.state_names, [*chosen.values()], roles.told)
     assert held is not None
     rates = 1e23 * np.arange(1.0, 7.0)
     theta = library.evaluate(run.states)

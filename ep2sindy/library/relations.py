@@ -130,13 +130,14 @@ class Process:
     """One term in one role: its coefficient enters the equations with these factors.
 
     factors: (state, term) -> what a coefficient of one adds to the equation. one_sign: True if its
-    coefficient must be positive.
+    coefficient must be positive. value: of its coefficient in SI, if it is known.
     """
 
     role: str
     term: str
     factors: Mapping[Place, float]
     one_sign: bool = False
+    value: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +148,7 @@ class Constraint:
     free: (free,), indices of the coefficients that z holds: C[free] is the identity, d[free] zero.
     states: one per equation, including equations without terms. processes: those that the free
     coefficients determine, as many, if it comes from a search under `Roles`; else empty. known:
-    what known processes contribute to every coefficient; None if there are processes to be found
-    alone, or none at all.
+    processes whose coefficients are known.
     """
 
     states: tuple[str, ...]
@@ -157,7 +157,7 @@ class Constraint:
     d: Float[np.ndarray, " coefs"]
     free: Int[np.ndarray, " free"]
     processes: Sequence[Process] = ()
-    known: Float[np.ndarray, " coefs"] | None = None
+    known: Sequence[Process] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "C", read_only(self.C))

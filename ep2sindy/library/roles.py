@@ -141,17 +141,24 @@ class Roles:
         return tuple(dict.fromkeys([*named, *self.sizes, *self.equations]))
 
     @property
-    def known(self) -> dict[Place, float]:
-        """What known roles and equations add to the coefficients, in SI."""
-        given: dict[Place, float] = {}
-        for role in self._roles:
-            if isinstance(role.how, Mapping):
-                for term, value in role.how.items():
-                    for place, factor in self._process(role, term).factors.items():
-                        given[place] = given.get(place, 0.0) + factor * float(value)
+    def told(self) -> list[Process]:
+        """The processes whose coefficients are known: of known roles, and of known equations."""
+        found = [
+            replace(self._process(role, term), value=float(value))
+            for role in self._roles
+            if isinstance(role.how, Mapping)
+            for term, value in role.how.items()
+        ]
         for state, terms in self.equations.items():
-            given |= {(state, term): float(value) for term, value in terms.items()}
-        return given
+            for term, value in terms.items():
+                one = MappingProxyType({(state, term): 1.0})
+                found.append(Process(f"{state} known", term, one, value=float(value)))
+        return found
+
+    @property
+    def known(self) -> dict[Place, float]:
+        """What known processes add to the coefficients, in SI."""
+        return summed(self.told)
 
     def with_known(self, known: Mapping[str, Mapping[str, float]]) -> Roles:
         """These roles with what a record gives in place of "known".
@@ -359,17 +366,27 @@ def _product(*names: str) -> str:
     return "*".join(name if n == 1 else f"{name}^{n}" for name, n in powers.items())
 
 
+def summed(told: Sequence[Process]) -> dict[Place, float]:
+    """What processes with known coefficients add to the coefficients of a model, in SI."""
+    found: dict[Place, float] = {}
+    for process in told:
+        for place, factor in process.factors.items():
+            found[place] = found.get(place, 0.0) + factor * (process.value or 0.0)
+    return found
+
+
 def constraint_of(
     library: Library,
     states: Sequence[str],
     processes: Sequence[Process],
-    known: Mapping[Place, float],
+    told: Sequence[Process] = (),
 ) -> Constraint | None:
-    """The exact constraint of a model with these processes and known coefficients.
+    """The exact constraint of a model with these processes, and those with known coefficients.
 
     Returns None if the coefficients do not determine the processes, as with an exchange and the
     outflow of both states by one term.
     """
+    known = summed(told)
     places = {place for process in processes for place in process.factors}
     places |= {*known}
     order = sorted(places, key=lambda at: (states.index(at[0]), library.index(at[1])))
@@ -382,7 +399,7 @@ def constraint_of(
     # Most factors are 1, -1 and 0 and so is the result: rounding removes what the inverse adds.
     C = np.where(np.abs(C - np.rint(C)) < 1e-9, np.rint(C), C) + 0.0
     d = fixed - C @ fixed[free]
-    return Constraint(tuple(states), tuple(order), C, d, free, tuple(processes), fixed)
+    return Constraint(tuple(states), tuple(order), C, d, free, tuple(processes), tuple(told))
 
 
 def shares_of(held: Constraint) -> Float[np.ndarray, "free processes"]:
@@ -395,7 +412,8 @@ def process_values(
     held: Constraint, coef: Float[np.ndarray, " coefs"]
 ) -> Float[np.ndarray, " processes"]:
     """The coefficient of every process to be found, from all coefficients of the constraint."""
-    found = coef[held.free] - (0.0 if held.known is None else held.known[held.free])
+    known = summed(held.known)
+    found = coef[held.free] - [known.get(held.coefficients[k], 0.0) for k in held.free]
     values: Float[np.ndarray, " processes"] = np.linalg.solve(shares_of(held), found)
     return values
 

@@ -138,7 +138,7 @@ def _system(
     roles: Roles,
 ) -> TrialSystem | None:
     """The system of these processes; None if its coefficients do not tell them apart."""
-    held = constraint_of(task.library, task.states, processes, roles.known)
+    held = constraint_of(task.library, task.states, processes, roles.told)
     if held is None:
         return None
     empty = np.zeros((len(task.library), len(task.states)))
