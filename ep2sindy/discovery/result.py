@@ -186,14 +186,16 @@ class Discovery:
         left = len(self._notes()) - len(shown)
         tail = [*notes, *([f"... {left} more notes"] if left else [])]
         head = [self._headline(), *(sentences(self.note) if self.note else [])]
-        body = model_lines(self.model, n_lines=N_LINES - len(head) - len(tail))
+        body = model_lines(self.model, self.constraint, n_lines=N_LINES - len(head) - len(tail))
         return one_screen([*head, *body, *tail])
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<li>{html.escape(each)}</li>" for each in self._notes())
         lines = [self._headline(), *([self.note] if self.note else [])]
         head = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
-        return head + model_html(self.model) + (f"<ul>{notes}</ul>" if notes else "")
+        return (
+            head + model_html(self.model, self.constraint) + (f"<ul>{notes}</ul>" if notes else "")
+        )
 
     def _notes(self) -> list[str]:
         return [*self.remarks, *(each.message for each in self.ambiguities)]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from html.entities import name2codepoint
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from ep2sindy.library.functions import number_sympy
 from ep2sindy.library.names import RECIPROCAL, Part, split_term
+from ep2sindy.library.processes import Group
 
 if TYPE_CHECKING:
     import sympy
@@ -81,18 +82,28 @@ def _latex_power(part: Part) -> str:
     return f"^{{{part.power}}}" if part.power > 1 else ""
 
 
-def equation_text(state: str, terms: Mapping[str, float], *, digits: int = 3) -> str:
+Sum: TypeAlias = Mapping[str, float] | Sequence[Group]  # terms, or an equation by process
+
+
+def equation_text(state: str, terms: Sum, *, digits: int = 3) -> str:
     """Equation as text: `n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
     return f"{state}' = {' '.join(equation_parts(terms, digits=digits)) or '0'}"
 
 
 def equation_parts(
-    terms: Mapping[str, float], *, digits: int = 3, reach: Mapping[str, float] = NOTHING
+    terms: Sum, *, digits: int = 3, reach: Mapping[str, float] = NOTHING
 ) -> list[str]:
     """Terms of an equation as texts such as `+ 5.48e-14 n_i n_n`.
 
-    reach: half-width of the confidence interval by term name; adds it as `(±2e-16)`.
+    terms: or groups of them, which become `+ n_i n_n (1.6e-32 n_i + 3.1e-33 n_n)`. reach:
+    half-width of the confidence interval by term name; adds it as `(±2e-16)`.
     """
+    if not isinstance(terms, Mapping):
+        return _group_parts(
+            terms,
+            lambda group: equation_parts(group.terms, digits=digits, reach=group.reach),
+            lambda factor: factor.replace("*", " "),
+        )
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
         sign = "-" if coef < 0 else "+" if k else ""
@@ -103,13 +114,38 @@ def equation_parts(
     return parts
 
 
-def sum_latex(terms: Mapping[str, float], *, digits: int = 3) -> str:
+def _group_parts(
+    groups: Sequence[Group], write: Callable[[Group], list[str]], name: Callable[[str], str]
+) -> list[str]:
+    """Groups with their signs. write: the terms of a group; name: its factor."""
+    parts = []
+    for k, group in enumerate(groups):
+        inner = write(group)
+        value = next(iter(group.terms.values()))
+        if len(inner) == 1:  # its own sign and that of the group make one
+            sign = group.sign if value > 0.0 else -group.sign
+            body = inner[0].removeprefix("-").strip()
+        else:
+            factor = f"{name(group.factor)} " if group.factor != "1" else ""
+            sign, body = group.sign, f"{factor}({' '.join(inner)})"
+        mark = "-" if sign < 0 else "+" if k else ""
+        parts.append(f"{mark}{' ' if k else ''}{body}")
+    return parts
+
+
+def sum_latex(terms: Sum, *, digits: int = 3) -> str:
     r"""LaTeX of the right-hand side of an equation: `- 2.62 \cdot 10^{5} \, n_{i} + ...`."""
     return " ".join(terms_latex(terms, digits=digits)) or "0"
 
 
-def terms_latex(terms: Mapping[str, float], *, digits: int = 3) -> list[str]:
-    """LaTeX of every term with its sign; a factor of exactly one is not written."""
+def terms_latex(terms: Sum, *, digits: int = 3) -> list[str]:
+    """LaTeX of every term, or group of terms, with its sign; a factor of one is not written."""
+    if not isinstance(terms, Mapping):
+        return _group_parts(
+            terms,
+            lambda group: terms_latex(group.terms, digits=digits),
+            lambda factor: rf"{latex_term_name(factor)} \,",
+        )
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
         sign = "-" if coef < 0 else "+" if k else ""
@@ -122,7 +158,7 @@ def terms_latex(terms: Mapping[str, float], *, digits: int = 3) -> list[str]:
     return parts
 
 
-def equations_latex(equations: Mapping[str, Mapping[str, float]], *, digits: int = 3) -> str:
+def equations_latex(equations: Mapping[str, Sum], *, digits: int = 3) -> str:
     """LaTeX `aligned` block with one equation per line. equations: state -> terms."""
     lines = (
         f"{latex_derivative(state)} &= {sum_latex(terms, digits=digits)}"
@@ -132,25 +168,31 @@ def equations_latex(equations: Mapping[str, Mapping[str, float]], *, digits: int
 
 
 def equation_html(
-    state: str,
-    terms: Mapping[str, float],
-    *,
-    digits: int = 3,
-    reach: Mapping[str, float] = NOTHING,
+    state: str, terms: Sum, *, digits: int = 3, reach: Mapping[str, float] = NOTHING
 ) -> str:
     """HTML of one equation, with sub- and superscripts.
 
-    reach: half-width of the confidence interval by term name.
+    terms: or groups of them. reach: half-width of the confidence interval by term name.
     """
+    right = " ".join(_html_parts(terms, digits=digits, reach=reach)) or "0"
+    return f"d{_variable_html(state)}/dt = {right}".replace("-", "&minus;")
+
+
+def _html_parts(terms: Sum, *, digits: int, reach: Mapping[str, float]) -> list[str]:
+    if not isinstance(terms, Mapping):
+        return _group_parts(
+            terms,
+            lambda group: _html_parts(group.terms, digits=digits, reach=group.reach),
+            _term_html,
+        )
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
-        sign = "&minus;" if coef < 0 else "+" if k else ""
+        sign = "-" if coef < 0 else "+" if k else ""
         number = _number_html(coef, digits)
         if name in reach:
             number += f" (&plusmn;{_number_html(reach[name], 2)})"
         parts.append(" ".join([sign, number, _term_html(name)]).strip())
-    left = f"d{_variable_html(state)}/dt"
-    return f"{left} = {' '.join(parts) or '0'}".replace("-", "&minus;")
+    return parts
 
 
 def sum_sympy(terms: Mapping[str, float]) -> sympy.Expr:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 # The grammar of terms, as patterns without capturing groups. Possessive quantifiers (`++`, `*+`)
@@ -161,6 +162,12 @@ def split_factors(name: str) -> list[tuple[str, int]]:
             "like 'n_i^2*n_n'"
         )
     return [(variable, _power(power, name)) for variable, power in _PARTS.findall(name)]
+
+
+def product_of(powers: Mapping[str, int]) -> str:
+    """The term that is the product of variables to these powers; "1" without any."""
+    parts = [name if n == 1 else f"{name}^{n}" for name, n in powers.items() if n]
+    return "*".join(parts) or "1"
 
 
 def factors_of(name: str) -> dict[str, int]:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.library.library import Library, library_of
-from ep2sindy.library.names import factors_of
+from ep2sindy.library.names import factors_of, product_of
 from ep2sindy.library.relations import Constraint, Place, Process
 from ep2sindy.library.terms import read_term
 from ep2sindy.runtime.values import check_list
@@ -353,17 +353,13 @@ def _beside(zones: Sequence[str], k: int) -> list[str]:
 
 def _exchanged(giver: str, taker: str, *, near: Sequence[str]) -> list[str]:
     """Terms by which a state gives another of its zone something; see `Roles.in_zones`."""
-    return [_product(giver, taker), *(_product(giver, taker, x) for x in (giver, taker, *near))]
+    pair = [giver, taker]
+    return [product_of(Counter(pair)), *(product_of(Counter([*pair, x])) for x in [*pair, *near])]
 
 
 def _carried(state: str, others: Sequence[str]) -> list[str]:
     """Terms by which a state moves on."""
-    return [state, *(_product(state, other) for other in others)]
-
-
-def _product(*names: str) -> str:
-    powers = Counter(names)
-    return "*".join(name if n == 1 else f"{name}^{n}" for name, n in powers.items())
+    return [state, *(product_of(Counter([state, other])) for other in others)]
 
 
 def summed(told: Sequence[Process]) -> dict[Place, float]:

@@ -8,8 +8,10 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from ep2sindy.library.equations import equation_html, equation_parts
-from ep2sindy.library.units import Clock
+from ep2sindy.library.equations import Sum, equation_html, equation_parts
+from ep2sindy.library.processes import groups_of
+from ep2sindy.library.relations import Constraint
+from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.rollout import Equations
 from ep2sindy.runtime.screen import N_LINES, cut, wrap
 
@@ -31,8 +33,13 @@ class Readable(Equations, Protocol):
     def intervals(self, state: str) -> dict[str, tuple[float, float]]: ...
 
 
-def model_lines(model: Readable, *, n_lines: int = N_LINES) -> list[str]:
-    """Equations with their units, then the units of the variables; at most n_lines."""
+def model_lines(
+    model: Readable, held: Constraint | None = None, *, n_lines: int = N_LINES
+) -> list[str]:
+    """Equations with their units, then the units of the variables; at most n_lines.
+
+    held: from a search under `Roles`, by whose processes the equations are then written.
+    """
     foot = cut(_units_text(model))
     room = n_lines - 1
     if len(model.states) > room:
@@ -44,7 +51,7 @@ def model_lines(model: Readable, *, n_lines: int = N_LINES) -> list[str]:
     spare = n_lines - len(tail) - len(states)
     lines: list[str] = []
     for k, state in enumerate(states):
-        terms, reach = _per_time_unit(model, state)
+        terms, reach = _per_time_unit(model, state, held)
         parts = equation_parts(terms, reach=reach) or ["0"]
         parts[-1] += f" [{_rate_unit(model, state)}]"
         share = 1 + spare // (len(states) - k)
@@ -54,13 +61,14 @@ def model_lines(model: Readable, *, n_lines: int = N_LINES) -> list[str]:
     return [*lines, *tail]
 
 
-def model_html(model: Readable) -> str:
+def model_html(model: Readable, held: Constraint | None = None) -> str:
     """Equations with their units and the units of the variables, as HTML for a notebook."""
     lines = []
     for state in model.states:
-        all_terms, reach = _per_time_unit(model, state)
-        terms = dict(list(all_terms.items())[:MAX_TERMS])
-        left = len(all_terms) - len(terms)
+        terms, reach = _per_time_unit(model, state, held)
+        left = max(0, len(terms) - MAX_TERMS) if isinstance(terms, Mapping) else 0
+        if isinstance(terms, Mapping):
+            terms = dict(list(terms.items())[:MAX_TERMS])
         text = equation_html(state, terms, reach=reach)
         more = f" ... {left} more terms" if left else ""
         lines.append(f"<div>{text}{more} &nbsp; [{html.escape(_rate_unit(model, state))}]</div>")
@@ -74,11 +82,24 @@ def half_widths(model: Readable, state: str) -> Mapping[str, float]:
     return {name: (high - low) / 2.0 for name, (low, high) in model.intervals(state).items()}
 
 
-def _per_time_unit(model: Readable, state: str) -> tuple[dict[str, float], Mapping[str, float]]:
+def grouped(model: Readable, held: Constraint | None, clock: Clock = SECONDS) -> Mapping[str, Sum]:
+    """State -> terms of its equation per time unit; by process, if roles hold the model."""
+    if held is None or not held.processes:
+        return {
+            state: {name: clock.seconds * value for name, value in model.terms(state).items()}
+            for state in model.states
+        }
+    coef = {state: model.terms(state) for state in model.states}
+    reach = {state: half_widths(model, state) for state in model.states}
+    return groups_of(held, coef, reach, per=clock.seconds)
+
+
+def _per_time_unit(
+    model: Readable, state: str, held: Constraint | None
+) -> tuple[Sum, Mapping[str, float]]:
     """Coefficients and half-widths per unit of the model's clock."""
-    unit_s = model.clock.seconds
-    terms = {name: unit_s * value for name, value in model.terms(state).items()}
-    return terms, {name: unit_s * value for name, value in half_widths(model, state).items()}
+    terms, widths = grouped(model, held, model.clock)[state], half_widths(model, state)
+    return terms, {name: model.clock.seconds * value for name, value in widths.items()}
 
 
 def _rate_unit(model: Readable, state: str) -> str:

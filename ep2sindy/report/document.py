@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import pandas as pd
 
-from ep2sindy.library.equations import equation_text
+from ep2sindy.library.equations import Sum, equation_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,7 +25,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Equation:
-    """One equation: state -> terms.
+    """One equation: state -> terms, or their groups by process.
 
     rate: the terms make the time derivative of the state; if False, they make its value, as in a
     law. lead: text before it; mark: text after it. unit: of the left side, consistent with the
@@ -34,7 +34,7 @@ class Equation:
     """
 
     state: str
-    terms: Mapping[str, float]
+    terms: Sum
     lead: str = ""
     mark: str = ""
     unit: str = ""

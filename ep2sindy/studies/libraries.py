@@ -443,6 +443,7 @@ class Outcome:
             where="held-out time" if is_living else records,
             seen=not is_living,
             misfit="" if is_living else self.results[best].discovery.misfit,
+            held=self.living[best].discovery.constraint if is_living else None,
         )
 
     def _cautions(self, best: str) -> list[Block]:
@@ -480,8 +481,10 @@ class Outcome:
             run = result.selected if living is None else living.run
             text = f"{name}: equations {result.how}; run freely: {run.words(seen=living is None)}"
             blocks.append(Text(text, page_only=True))
+            held = None if living is None else living.discovery.constraint
             for state in run.model.states:
-                blocks.append(display_equation(run.model, state, clock, on_screen=False))
+                equation = display_equation(run.model, state, clock, held=held, on_screen=False)
+                blocks.append(equation)
             if living is None:
                 blocks += interval_table(run.model, clock=clock, page_only=True)
         return Section("All libraries", blocks)

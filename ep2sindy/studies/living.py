@@ -25,13 +25,15 @@ from ep2sindy.figures import living as figures
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
+from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.comparison import FreeRunBounds
+from ep2sindy.model.display import grouped
 from ep2sindy.model.free_run import FreeCycle, FreeRun, free_run
 from ep2sindy.model.mass_action import consequences
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.regression.searches import Search
-from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
+from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.rule import SystemSelection
@@ -181,12 +183,17 @@ class Living:
     def n_terms(self) -> int:
         return int(np.count_nonzero(self.model.coef))
 
+    def equations(self, clock: Clock = SECONDS) -> list[Equation]:
+        """By process, if they were found under roles."""
+        held = self.discovery.constraint
+        return [display_equation(self.model, s, clock, held=held) for s in self.model.states]
+
     def section(self, name: str) -> Section:
         """Equations with intervals, how they run, and the behaviour of the derivatives' choice."""
         model, clock = self.model, self.run.rollout.clock
         rows = ResultTable([self], LIVING).screen(by_state=True)
         blocks: list[Block] = [
-            *(display_equation(model, state, clock) for state in model.states),
+            *self.equations(clock),
             *interval_table(model, clock=clock),
             Table(rows, title=run_title(self.run)),
             *(Text(text) for text in (_note(self), _by_derivatives(self))),
@@ -244,7 +251,7 @@ LIVING: Metrics[Living] = [
     Metric("status_by_derivatives", lambda found: found.by_derivatives.status, View.CSV),
     Metric("verdict_by_derivatives", lambda found: str(found.by_derivatives.run.verdict), View.CSV),
     Metric("coefficients", lambda found: _with_intervals(found.model), View.JSON),
-    Metric("text", lambda found: found.model.text(), View.JSON),
+    Metric("text", lambda found: _text(found), View.JSON),
     Metric("proved", lambda found: consequences(found.model), View.JSON),
     Metric("selection", lambda found: found.discovery.note, View.JSON),
     Metric("by_derivatives", lambda found: facts(found.by_derivatives, REFINED), View.JSON),
@@ -264,6 +271,12 @@ def living_tables(living: Mapping[str, Living]) -> dict[str, pd.DataFrame]:
         found |= rollout_tables(each.held, {f"{name}_living": each.run})
     models = {name: each.model for name, each in living.items()}
     return found | {"coefficients_living": coefficients(models, heading="library")}
+
+
+def _text(living: Living) -> str:
+    """The equations in SI, as they are printed."""
+    sums = grouped(living.model, living.discovery.constraint)
+    return "\n".join(equation_text(state, terms) for state, terms in sums.items())
 
 
 def _terms(model: SparseModel) -> dict[str, list[str]]:

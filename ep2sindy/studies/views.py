@@ -12,8 +12,10 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
+from ep2sindy.library.relations import Constraint
 from ep2sindy.library.units import SECONDS, Clock, unit_product
 from ep2sindy.model.comparison import Verdict
+from ep2sindy.model.display import grouped
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Result, Section, Table, Text
@@ -156,11 +158,12 @@ def display_equation(
     state: str,
     clock: Clock = SECONDS,
     *,
+    held: Constraint | None = None,
     lead: str = "",
     on_screen: bool = True,
 ) -> Equation:
-    """One equation of a model with its unit, per time unit of the clock."""
-    terms = {name: clock.seconds * coef for name, coef in model.terms(state).items()}
+    """One equation of a model with its unit, per time unit of the clock; held: see `grouped`."""
+    terms = grouped(model, held, clock)[state]
     unit = clock.rate_unit(model.units[state])
     return Equation(state, terms, lead=lead, unit=unit, on_screen=on_screen)
 
@@ -235,18 +238,20 @@ def found_model(
     where: str,
     seen: bool = False,
     misfit: str = "",
+    held: Constraint | None = None,
 ) -> Result:
     """A model as what was found: its equations, and how it runs.
 
     found: how it was found, such as `Found from I_d`. file: its name among the run's models. where:
     what it was run over, in words, such as `held-out time`. seen: whether it was fitted to that.
-    misfit: why it does not explain the data, a warning; may be empty.
+    misfit: why it does not explain the data, a warning; may be empty. held: that its coefficients
+    obey, if it was found under roles.
     """
     clock, model = run.rollout.clock, run.model
     return Result(
         f"{found}: a model that {_fate(run, seen=seen, misfit=misfit)}",
         [
-            *(display_equation(model, state, clock) for state in model.states),
+            *(display_equation(model, state, clock, held=held) for state in model.states),
             Text(f"run freely from one sample over {where}: {run_words(run)}"),
             *([Text(misfit, warning=True)] if misfit else []),
             *more,
