@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ep2sindy.library.library import polynomial
+from ep2sindy.model.fixed_point import eigenvalues, fixed_point
 from ep2sindy.operating.choice import (
     StructureCase,
     StructureTrial,
@@ -16,7 +17,7 @@ from ep2sindy.operating.choice import (
 )
 from ep2sindy.operating.fit import SETTINGS
 from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.operating.map import Fate, eigenvalues, fixed_point, law_map
+from ep2sindy.operating.map import Fate, law_map
 from ep2sindy.operating.records import OperatingRecord
 from tests.models import model_of
 from tests.test_operating_law import LIBRARY, STATES, STRUCTURE, recorded, records

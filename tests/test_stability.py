@@ -8,12 +8,14 @@ from scipy.integrate import solve_ivp
 
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.draws import halton
+from ep2sindy.model.fixed_point import rest_point
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import (
     CycleStability,
     LimitCycle,
     _starts,
     limit_cycle,
+    periods_to_reach,
     share_reaching,
 )
 from tests.models import model_of
@@ -307,3 +309,27 @@ def test_starts_are_spread_as_by_haltons_sequence(n_dimensions: int) -> None:
 
     scipys = qmc.Halton(n_dimensions, scramble=False).fast_forward(1).random(64)
     np.testing.assert_array_equal(halton(64, n_dimensions), scipys)
+
+
+def test_a_slow_cycle_is_waited_for() -> None:
+    """A cycle whose departures shrink by 2 % in a period is reached, in some hundred periods."""
+    rate = -np.log(0.98) / (2.0 * 2.0 * np.pi)  # of Hopf's normal form: exp(-2 rate period)
+    slow = {
+        "x": {"x": rate, "y": -1.0, "x^3": -rate, "x*y^2": -rate},
+        "y": {"x": 1.0, "y": rate, "x^2*y": -rate, "y^3": -rate},
+    }
+    model, cycle = found(slow, [1.0, 0.0], 2.0 * np.pi)
+    assert cycle.largest_multiplier == pytest.approx(0.98, abs=1e-6)
+    assert periods_to_reach(cycle) == pytest.approx(-3.0 / np.log(0.98), rel=1e-3)
+    assert share_reaching(model, cycle, n_starts=8, n_periods=40.0) < 1.0
+    assert share_reaching(model, cycle, n_starts=8) == 1.0
+
+
+def test_a_living_cycle_says_where_its_model_rests() -> None:
+    model, cycle = found(VAN_DER_POL, [2.0, 0.0], 6.66)
+    states = cycle.states
+    rest = rest_point(model, states.mean(axis=0), states.std(axis=0), states.min(axis=0) > 0.0)
+    assert rest is not None
+    assert rest.state == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert rest.growth_per_s == pytest.approx(0.5, rel=1e-6)  # eigenvalues (1 +- i sqrt(3)) / 2
+    assert rest.frequency_Hz == pytest.approx(np.sqrt(3.0) / 4.0 / np.pi, rel=1e-6)

@@ -14,9 +14,17 @@ from ep2sindy.data.coerce import Run, trajectory_of
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Verdict, record_of
+from ep2sindy.model.fixed_point import RestPoint, rest_point
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
-from ep2sindy.model.stability import CycleStability, LimitCycle, limit_cycle, share_reaching
+from ep2sindy.model.stability import (
+    LEAST_WAIT,
+    CycleStability,
+    LimitCycle,
+    limit_cycle,
+    periods_to_reach,
+    share_reaching,
+)
 from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.attractor import phase_along
@@ -88,25 +96,30 @@ class FreeCycle:
     """A free run and the limit cycle of its model.
 
     cycle: None if the run ends on none. share: the share of starts around the cycle that reach it;
-    NaN without a cycle.
+    NaN without a cycle. rest: where the model rests inside the cycle, if it does.
     """
 
     run: FreeRun
     cycle: LimitCycle | None
     share: float
+    rest: RestPoint | None = None
 
     @staticmethod
     def of(run: FreeRun) -> FreeCycle:
         """The cycle on which a free run ends, and how many starts reach it."""
         cycle = cycle_of(run)
-        return FreeCycle(run, cycle, np.nan if cycle is None else share_reaching(run.model, cycle))
+        if cycle is None:
+            return FreeCycle(run, None, np.nan)
+        model, states = run.model, cycle.states
+        rest = rest_point(model, states.mean(axis=0), states.std(axis=0), states.min(axis=0) > 0.0)
+        return FreeCycle(run, cycle, share_reaching(model, cycle), rest)
 
     @property
     def multiplier(self) -> float:
         """Largest modulus of the nontrivial Floquet multipliers; NaN without a cycle."""
         if self.cycle is None:
             return float("nan")
-        return float(np.abs(self.cycle.multipliers[1:]).max(initial=0.0))
+        return self.cycle.largest_multiplier
 
     @property
     def caution(self) -> str:
@@ -123,11 +136,28 @@ class FreeCycle:
         """The stability of the cycle, in a sentence; empty without a cycle."""
         if self.cycle is None:
             return ""
-        return (
+        wait = periods_to_reach(self.cycle)
+        slowly = f", slowly, over {wait:.0f} periods" if wait > LEAST_WAIT else ""
+        text = (
             f"The cycle is {self.cycle.stability}: of a departure {self.multiplier:.3g} is left "
             f"after a period (Floquet multiplier); {100.0 * self.share:.0f} % of starts from 0.3 "
-            "to 3 times the cycle's mean reach it."
+            f"to 3 times the cycle's mean reach it{slowly}."
         )
+        return text if self.rest is None else f"{text} {self._rest_text(self.rest)}"
+
+    def _rest_text(self, rest: RestPoint) -> str:
+        """Where the model rests, and what becomes of a small departure, in a sentence."""
+        units, clock = self.run.model.units, self.run.rollout.clock
+        place = ", ".join(
+            f"{state} = {value:.3g}{'' if units[state] == '1' else f' {units[state]}'}"
+            for state, value in zip(self.run.model.states, rest.state.tolist(), strict=True)
+        )
+        change = "grows" if rest.growth_per_s > 0.0 else "decays"
+        rate = f"{clock.seconds * abs(rest.growth_per_s):.3g} {clock.rate_unit('1')}"
+        turns = (
+            f" and turns at {clock.frequency_text(rest.frequency_Hz)}" if rest.frequency_Hz else ""
+        )
+        return f"It rests at {place}, where a departure {change} by {rate}{turns}."
 
 
 def free_run(

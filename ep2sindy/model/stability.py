@@ -39,6 +39,10 @@ REACHED_WITHIN, N_LATE = 0.1, 3.0
 # the stability limit of the fourth-order scheme (2.8).
 MIN_STEPS, STEP_TIMES_RATE = 64, 1.0
 
+# A departure from an attracting cycle is waited for until it has shrunk to e^-3, a twentieth, over
+# a number of periods between these.
+SHRUNK, LEAST_WAIT, MOST_WAIT = 3.0, 40.0, 400.0
+
 # A run is given up as diverged when it is BLOW_UP times as far from the cycle's mean as the
 # farthest start, and as stuck after PATIENCE times the steps that the cycle itself takes.
 BLOW_UP, PATIENCE = 30.0, 4.0
@@ -79,12 +83,14 @@ class LimitCycle:
             )
 
     @property
-    def stability(self) -> CycleStability:
-        """Stability by the largest modulus of the multipliers other than that of the flow.
+    def largest_multiplier(self) -> float:
+        """Largest modulus of the multipliers other than that of the flow."""
+        return float(np.abs(self.multipliers[1:]).max(initial=0.0))
 
-        Neutral if it is within 1e-3 of one.
-        """
-        largest = float(np.abs(self.multipliers[1:]).max(initial=0.0))
+    @property
+    def stability(self) -> CycleStability:
+        """By the largest of the other multipliers; neutral if it is within 1e-3 of one."""
+        largest = self.largest_multiplier
         if abs(largest - 1.0) <= NEUTRAL_WITHIN:
             return CycleStability.NEUTRAL
         return CycleStability.ATTRACTING if largest < 1.0 else CycleStability.REPELLING
@@ -165,10 +171,12 @@ def share_reaching(
     cycle: LimitCycle,
     *,
     n_starts: int = 64,
-    n_periods: float = 40.0,
+    n_periods: float | None = None,
     spread: tuple[float, float] = (0.3, 3.0),
 ) -> float:
     """Share of starts that end on a cycle: within 0.1 of it over their last three periods.
+
+    n_periods: that are waited for; None takes `periods_to_reach`.
 
     Distances are to the cycle's curve, with states in units of their standard deviation on it.
     In the last periods a run must also pass through all quarters of the cycle.
@@ -180,6 +188,7 @@ def share_reaching(
     farthest start, or after four times the steps that the cycle takes.
     Raises ValueError for a model with inputs, a cycle of another model or a wrong setting.
     """
+    n_periods = periods_to_reach(cycle) if n_periods is None else n_periods
     _check_reach(model, cycle, n_starts=n_starts, n_periods=n_periods, spread=spread)
     scale = deviations(cycle.states)
     scaled = ScaledModel.of(model, scale, cycle.period_s)
@@ -188,6 +197,17 @@ def share_reaching(
     per_period = float(np.mean(1.0 / _steps(scaled, curve.T)))
     on_cycle = _on_cycle(scaled, y, curve, n_periods, round(PATIENCE * n_periods * per_period))
     return float(on_cycle) / n_starts
+
+
+def periods_to_reach(cycle: LimitCycle) -> float:
+    """Periods in which a departure from an attracting cycle shrinks to a twentieth, 40 to 400.
+
+    Forty where nothing decays: what is on another cycle of a neutral family stays there.
+    """
+    largest = cycle.largest_multiplier
+    if not 0.0 < largest < 1.0:
+        return LEAST_WAIT
+    return float(np.clip(-SHRUNK / np.log(largest), LEAST_WAIT, MOST_WAIT))
 
 
 def _on_cycle(

@@ -8,10 +8,10 @@ from enum import StrEnum
 from itertools import product
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
-from scipy.optimize import root
+from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.model.fixed_point import eigenvalues, fixed_point
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import CycleStability, limit_cycle
@@ -27,11 +27,8 @@ STILL = SIMULATED.spread  # of the mean: a smaller spread is no cycle (the simul
 
 N_PERIODS = 40  # length of a run, in which it may settle
 
-RESTING = 1e-8  # rates at a fixed point, relative to those half a standard deviation away
 
 MAX_PARAMETERS = 2  # most parameters of a map that can be drawn
-
-STEP = 1e-6  # of central differences, in units of the states
 
 
 class Fate(StrEnum):
@@ -117,7 +114,7 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, f
             mean = cycle.states.mean(axis=0)
             frequency_Hz = 1.0 / cycle.period_s
             amplitude = relative_amplitude(mean, cycle.states.std(axis=0))
-            second = float(np.abs(cycle.multipliers[1:]).max(initial=0.0))
+            second = cycle.largest_multiplier
             fate = Fate.OSCILLATES if amplitude >= STILL else Fate.RESTS
     elif fate is Fate.RESTS:
         mean = late
@@ -156,38 +153,3 @@ def _run(
     late = run.states[-5 * n :]
     amplitude = relative_amplitude(late.mean(axis=0), late.std(axis=0))
     return (Fate.OSCILLATES if amplitude >= STILL else Fate.RESTS), run.states[-1]
-
-
-def fixed_point(
-    model: SparseModel,
-    near: Float[np.ndarray, " n_states"],
-    *,
-    scale: Float[np.ndarray, " n_states"],
-    positive: Bool[np.ndarray, " n_states"],
-) -> Float[np.ndarray, " n_states"] | None:
-    """Fixed point of an autonomous model, by Newton's method from a nearby state; None if none.
-
-    scale: of the states. positive: mask of the states that must be positive, such as densities.
-    """
-    rates = model.derivative(near + 0.5 * np.diag(scale), np.empty((len(near), 0)))
-    size = zero_to_one(np.abs(rates).max(axis=0))
-    found = root(lambda y: model.derivative(y * scale, np.empty(0)) / size, near / scale)
-    state: np.ndarray = found.x * scale
-    wrong_sign = bool((state[positive] <= 0.0).any())
-    return None if not np.abs(found.fun).max() < RESTING or wrong_sign else state
-
-
-def eigenvalues(
-    model: SparseModel,
-    state: Float[np.ndarray, " n_states"],
-    *,
-    scale: Float[np.ndarray, " n_states"],
-) -> Complex[np.ndarray, " n_states"]:
-    """Eigenvalues of the Jacobian of an autonomous model, in 1/s. scale: of the states."""
-    steps = STEP * np.diag(scale)
-    ahead, behind = (
-        model.derivative(state + sign * steps, np.empty((len(state), 0))) for sign in (1.0, -1.0)
-    )
-    jacobian = ((ahead - behind) / (2.0 * STEP)).T / scale[:, None]  # in units of the states
-    found: np.ndarray = np.linalg.eigvals(jacobian).astype(np.complex128)
-    return found

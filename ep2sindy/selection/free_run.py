@@ -437,7 +437,7 @@ def _attraction(run: FreeRun, cycles: Sequence[Cycle]) -> tuple[float, bool]:
     cycle = limit_cycle(run.model, run.rollout.states[-1], period_s=period_s)
     if cycle is None:
         return 0.0, False
-    largest = float(np.abs(cycle.multipliers[1:]).max(initial=0.0))
+    largest = cycle.largest_multiplier
     if largest > PULL:
         return 0.0, largest > PUSH
     share = share_reaching(run.model, cycle, n_starts=N_REACHING)

@@ -248,6 +248,7 @@ LIVING: Metrics[Living] = [
     Metric("floquet", lambda found: found.cycle and _multipliers(found.cycle), View.JSON),
     Metric("stability", lambda found: found.cycle and str(found.cycle.stability)),
     Metric("share_reaching", lambda found: found.free.share),
+    Metric("rest", lambda found: _rest(found), View.JSON),
     Metric("status_by_derivatives", lambda found: found.by_derivatives.status, View.CSV),
     Metric("verdict_by_derivatives", lambda found: str(found.by_derivatives.run.verdict), View.CSV),
     Metric("coefficients", lambda found: _with_intervals(found.model), View.JSON),
@@ -281,6 +282,14 @@ def _text(living: Living) -> str:
 
 def _terms(model: SparseModel) -> dict[str, list[str]]:
     return {state: list(model.terms(state)) for state in model.states}
+
+
+def _rest(living: Living) -> dict[str, Any] | None:
+    rest = living.free.rest
+    if rest is None:
+        return None
+    state = dict(zip(living.model.states, rest.state.tolist(), strict=True))
+    return {"state": state, "growth_per_s": rest.growth_per_s, "frequency_Hz": rest.frequency_Hz}
 
 
 def _multipliers(cycle: LimitCycle) -> list[list[float]]:
