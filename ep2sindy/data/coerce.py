@@ -286,6 +286,8 @@ def keep_inside(
 # Repeated data: a state that is a copy of another one, and samples that two runs share.
 
 
+# Times the noise, and share of the RMS, by which a state that is nonnegative may lie below zero.
+BELOW_NOISE, BELOW_ZERO = 6.0, 0.05
 SAME = 1e-12  # residual of an exact copy due to rounding, as a fraction of the state's variance
 MIN_SHARED = 8  # consecutive samples; shorter matches of rounded samples can occur by chance
 
@@ -339,6 +341,22 @@ def _common_start(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m 
     return n if same and np.array_equal(first[:n], second[:n]) else 0
 
 
+def _check_nonnegative(runs: Sequence[Trajectory], state: str) -> None:
+    """Raise ValueError for a state that is below zero by more than its noise."""
+    for run in runs:
+        k = run.state_names.index(state)
+        values = run.states[:, k] if run.missing is None else run.states[~run.missing[:, k], k]
+        # The second difference of white noise has six times its variance.
+        noise = np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6.0))
+        allowed = max(BELOW_NOISE * noise, BELOW_ZERO * np.sqrt(np.square(values).mean()))
+        if values.mean() < 0.0 or values.min() < -allowed:
+            raise ValueError(
+                "nonnegative roles need states that are concentrations or numbers: "
+                f"{state} is {values.mean():.3g} in the mean and falls to {values.min():.3g}; "
+                "shift or turn its values, or leave nonnegative out"
+            )
+
+
 # What a method is asked.
 
 
@@ -353,7 +371,8 @@ class Task:
     that is named, terms of the library that its equation may not have.
     Raises ValueError for runs that do not agree or that share samples, a state that repeats
     another, a variable that a run lacks, a relation, term or role of unknown names, roles beside
-    relations, terms or exclude, or a term that is excluded and named elsewhere.
+    relations, terms, exclude or hidden states, states that are negative where roles say that they
+    are not, or a term that is excluded and named elsewhere.
     """
 
     runs: Sequence[Trajectory]
@@ -425,7 +444,15 @@ class Task:
                     "roles say which terms the equations may have and how they are tied: "
                     "relations, terms or exclude came as well; give roles alone, or leave them out"
                 )
+            if self.hidden:
+                raise ValueError(
+                    f"roles need samples of every state: {list(self.hidden)} came as hidden; give "
+                    "relations between coefficients instead, or leave roles out"
+                )
             self.roles.processes(self.library, self.states)
+            if self.roles.nonnegative:
+                for state in sorted(self.roles.balanced):
+                    _check_nonnegative(self.runs, state)
         named = [(state, term) for r in self.relations for _, state, term in r.factors]
         named += [(state, term) for state, terms in self.terms.items() for term in terms]
         for state in (*self.terms, *self.exclude, *(state for state, _ in named)):

@@ -137,15 +137,17 @@ class TrajectorySearch:
     ) -> IdentifiedEquations:
         """Estimate states and coefficients, and choose; the search is deterministic.
 
-        Ambiguities are terms whose values at the samples are alike. Raises ValueError for roles.
+        Ambiguities are terms whose values at the samples are alike. Raises ValueError for roles
+        with a rule that runs models.
         """
-        if task.roles is not None:
+        if task.roles is not None and isinstance(self.selection, SystemSelection):
             raise ValueError(
-                "roles are kept by a regression: TrajectorySearch() came with roles; take "
-                "Regression(selection=FreeRunScore())"
+                "a search of trajectories keeps roles by likelihood: selection must be Evidence(), "
+                f"{self.selection!r} came; Regression(selection=FreeRunScore()) judges by runs"
             )
         found = self._estimate(task, progress)
-        task = replace(task, runs=found.runs, hidden=())
+        library = found.model.library  # with the terms of known equations
+        task = replace(task, runs=found.runs, hidden=(), roles=None, library=library)
         choice = self._choose(found, task, progress)
         return IdentifiedEquations(choice, _ambiguities_of_samples(task), found.remarks, found)
 
@@ -172,7 +174,8 @@ class TrajectorySearch:
             return replace(choice, model=replace(choice.model, courses=found.model.courses))
         scores = self.selection.scores(fronts)
         scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
-        return Choice(scored, [front.best for front in scored], found.model, found.note)
+        best = [front.best for front in scored]
+        return Choice(scored, best, found.model, found.note, constraint=found.constraint)
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int

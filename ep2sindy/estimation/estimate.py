@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
 
 import numpy as np
 from jaxtyping import Float
@@ -26,7 +27,8 @@ from ep2sindy.estimation.solver import (
 )
 from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.library.relations import Relation, relations_of
+from ep2sindy.library.relations import Constraint, Relation, relations_of
+from ep2sindy.library.roles import Roles, constraint_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
 from ep2sindy.runtime.screen import joined
@@ -86,7 +88,7 @@ class Estimate:
     kurtosis: (d,), of the noise; 3 if it is normal, NaN if every sample is a limit. growth: (d,),
     share of the noise variance that grows with the state. delays_s: (d,), the delay of each
     channel. `align=True` shifts the channels back into step, and leaves out the samples at the ends
-    that this costs.
+    that this costs. constraint: that the coefficients obey under roles, with the processes found.
     """
 
     model: SparseModel
@@ -105,6 +107,7 @@ class Estimate:
     delays_s: Float[np.ndarray, " d"]
     push_std: Float[np.ndarray, " d"]
     holds: tuple[str, ...]
+    constraint: Constraint | None = field(default=None, repr=False)
 
     @property
     def note(self) -> str:
@@ -128,6 +131,7 @@ def estimate(
     align: bool = False,
     relations: Sequence[Relation | str] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
+    roles: Roles | None = None,
     hidden: Sequence[str] = (),
     exclude: Mapping[str, Sequence[str]] | None = None,
     courses: Mapping[str, str] | None = None,
@@ -144,7 +148,8 @@ def estimate(
     found to be late are shifted forward; if False, late channels make the model a misfit, and their
     delays are reported.
     relations: between coefficients, held in fit and search. terms: for each state whose equation is
-    known but for its coefficients, all terms of that equation. hidden: states that nobody measured,
+    known but for its coefficients, all terms of that equation. roles: of terms, for equations that
+    conserve what states exchange (`Roles`). hidden: states that nobody measured,
     which the library has; all ways in which they may enter are compared. exclude: for each state
     that is named, terms of the library that its equation may not have. courses: input -> how it
     goes from one sample to the next, "held", "linear" or "smooth"; of others the likeliest course
@@ -156,9 +161,7 @@ def estimate(
     refuses.
     """
     known = trajectories_of(runs, partial=True)
-    task = Task(
-        known, library, relations_of(relations), terms or {}, hidden=hidden, exclude=exclude or {}
-    )
+    task = Task(known, library, relations_of(relations), terms or {}, roles, hidden, exclude or {})
     return estimate_task(
         task,
         max_terms=max_terms,
@@ -186,7 +189,7 @@ def estimate_task(
     if max_terms is not None:
         max_terms = check_count("max_terms", max_terms)
     check_limit_s(limit_s)
-    tied = bool(task.relations or task.hidden)
+    tied = bool(task.relations or task.hidden or task.roles)
     bytes_each = check_size(task.runs, task.library, task.terms, tied=tied, limit_s=limit_s)
     watch, found, part = Watch(progress, limit_s), None, task.runs
     for larger in growing_parts(task.runs, bytes_each, watch):
@@ -197,8 +200,20 @@ def estimate_task(
     answer, runs = found
     if part is not task.runs:
         answer = replace(answer, said=(_part_words(part, task.runs, limit_s), *answer.said))
-    model = _model(answer, task.library, units or runs[0].units, provenance or {})
-    return _report(answer, model, runs, progress)
+    library = task.library
+    if task.roles is not None:
+        library = task.roles.with_known_terms(library, task.states)
+    model = _model(answer, library, units or runs[0].units, provenance or {})
+    return replace(_report(answer, model, runs, progress), constraint=_held(answer, task, library))
+
+
+def _held(answer: Explanation, task: Task, library: Library) -> Constraint | None:
+    """What the roles that are played make of the model's coefficients; None without roles."""
+    if task.roles is None:
+        return None
+    used = answer.solution.annealed.fit.free != 0.0
+    played = list(compress(answer.problem.processes, used))
+    return constraint_of(library, task.states, played, task.roles.told)
 
 
 def _answer(
@@ -249,7 +264,7 @@ def _try(
     def problem_of(library: Library) -> EstimationProblem:
         return scale_problem(
             known.runs, library, known.relations, known.terms, measured=measured,
-            exclude=known.exclude, courses=courses, watch=watch,
+            exclude=known.exclude, courses=courses, roles=known.roles, watch=watch,
         )  # fmt: skip
 
     problem = replace(

@@ -26,6 +26,7 @@ from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 
 FREE_START = 100.0  # prior variance of the first state: ten times its RMS, squared
+HELD_START = 1e-24  # the same of one that starts at zero
 MAX_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of a step tried
 STEERED = 1.0  # parting of paths, in nats per sample; chaotic systems that are resolved reach 0.3
 MAX_FOLLOWING, WORTH_FOLLOWING = 3, 0.5  # steps of the states alone; what each must leave at most
@@ -79,13 +80,15 @@ class TrajectoryFit:
     """Fitted states and coefficients.
 
     paths: for each record, (samples, d), scaled. free: (free,), zero outside the support.
-    squares: (d,), the objective by state; infinite if the flow is not finite.
+    squares: (d,), the objective by state; infinite if the flow is not finite. at_zero: (records,
+    d), states that start at zero, and would start below it; None for none.
     """
 
     paths: tuple[np.ndarray, ...]
     free: Float[np.ndarray, " free"]
     support: Bool[np.ndarray, " free"]
     squares: Float[np.ndarray, " d"]
+    at_zero: Bool[np.ndarray, "records d"] | None = None
 
     @property
     def total(self) -> float:
@@ -132,12 +135,55 @@ def squares(
 def fit_paths(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, follow: bool = False
 ) -> TrajectoryFit:
-    """Minimise the squares over states and coefficients by Gauss-Newton with step halving.
+    """Minimise the squares over states and coefficients, which keep their signs.
 
-    The result is the nearest local minimum. follow: before a step is halved, let the states follow
-    its coefficients, which takes far fewer steps where the flow is nearly exact. On the way there
-    it would lead into models that follow any samples.
+    The result is the nearest local minimum. A coefficient that must be positive and would not be
+    leaves the support, and a state that is nonnegative and would start below zero starts there.
+    follow: before a step is halved, let the states follow its coefficients, which takes far fewer
+    steps where the flow is nearly exact. On the way there it would lead into models that follow any
+    samples.
     """
+    fit = _descend(problem, replace(fit, at_zero=None), level, follow)
+    while np.isfinite(fit.total):
+        below = problem.nonnegative & [path[0] < 0.0 for path in fit.paths]
+        below &= True if fit.at_zero is None else ~fit.at_zero
+        if (fit.free[problem.positive] < 0.0).any():
+            fit = _without_negative(problem, fit, level)
+        elif below.any():
+            fit = _from_zero(fit, below)
+        else:
+            break
+        fit = _descend(problem, fit, level, follow)
+    return fit
+
+
+def _without_negative(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level
+) -> TrajectoryFit:
+    """The fit without what least squares with bounds puts to zero, or all that is negative."""
+    negative = problem.positive & (fit.free < 0.0)
+    kept, own = fit.support & ~negative, np.flatnonzero(fit.support)
+    quadratic, gradient = _hessian(problem, fit, fit.support, level)[:2]
+    if np.isfinite(quadratic).all() and np.isfinite(gradient).all():
+        linear = quadratic @ fit.free[own] + gradient
+        bounded = within_bounds(quadratic, linear, problem.positive[own])
+        kept[own] = kept[own] if bounded.all() else bounded
+    return replace(fit, support=kept, free=np.where(kept & ~negative, fit.free, 0.0))
+
+
+def _from_zero(fit: TrajectoryFit, below: Bool[np.ndarray, "records d"]) -> TrajectoryFit:
+    """The fit with states that start below zero at zero, where they are held."""
+    paths = tuple(path.copy() for path in fit.paths)
+    for path, own in zip(paths, below, strict=True):
+        path[0, own] = 0.0
+    held = below if fit.at_zero is None else below | fit.at_zero
+    return replace(fit, paths=paths, at_zero=held)
+
+
+def _descend(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level, follow: bool
+) -> TrajectoryFit:
+    """Gauss-Newton with step halving, whatever the signs."""
     fit = replace(fit, squares=squares(problem, fit.paths, fit.free, level))
     if not np.isfinite(fit.total):
         return fit  # no gradient to follow
@@ -218,8 +264,8 @@ def innovations(
     seen = observe(problem.all_records, joined(fit.paths), level.variance)
     flow = _flow(problem, fit, np.zeros_like(fit.support), level)
     misses = _misses(problem, fit, flow)
-    case = misses, seen.residuals, seen.variance, level.process
-    _, _, least, logs = eliminate(flow.slopes, *case, FREE_START)
+    case = misses, seen.residuals, seen.variance, *_errors(problem, fit, level)
+    _, _, least, logs = eliminate(flow.slopes, *case)
     return seen, least, logs
 
 
@@ -290,7 +336,8 @@ def _moves(
     misses = _misses(problem, fit, flow) + flow.slopes[:, :, d:] @ change
     by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
     residuals, variance, _ = observe(problem.all_records, joined(fit.paths), level.variance)
-    moves = departures(by_state, misses, residuals, variance, level.process, FREE_START)
+    case = misses, residuals, variance, *_errors(problem, fit, level)
+    moves = departures(by_state, *case)
     return np.split(moves, problem.all_records.breaks + 1)
 
 
@@ -341,8 +388,37 @@ def hessian(
     flow.slopes[record.breaks] = 0.0
     misses = _misses(problem, fit, flow)
     residuals, apparent, _ = observe(record, path, level.variance)
-    case = misses, residuals, apparent, level.process
-    return *eliminate(flow.slopes, *case, FREE_START)[:3], flow
+    case = misses, residuals, apparent, *_errors(problem, fit, level)
+    return *eliminate(flow.slopes, *case)[:3], flow
+
+
+def _errors(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level
+) -> tuple[Float[np.ndarray, "steps d"], Float[np.ndarray, " d"]]:
+    """Variances of the flow's error over all steps, and of the first state."""
+    process, start = level.process, np.full(len(problem.states), FREE_START)
+    if fit.at_zero is not None:
+        first, *others = np.where(fit.at_zero, HELD_START, FREE_START)
+        process[problem.all_records.breaks], start = np.reshape(others, (-1, len(start))), first
+    return process, start
+
+
+def within_bounds(
+    quadratic: Float[np.ndarray, "n n"],
+    linear: Float[np.ndarray, " n"],
+    positive: Bool[np.ndarray, " n"],
+) -> Bool[np.ndarray, " n"]:
+    """Mask of what least squares, z' quadratic z - 2 linear' z, leaves if some must be >= 0."""
+    from scipy.optimize import lsq_linear  # import takes 0.5 s; most searches do not need it
+
+    size = unit_sizes(quadratic)
+    values, vectors = np.linalg.eigh(quadratic / np.outer(size, size))
+    root = np.sqrt(np.maximum(values, RIDGE * values[-1]))
+    bounds = np.where(positive, 0.0, -np.inf), np.inf
+    target = vectors.T @ (linear / size) / root
+    found = lsq_linear(root[:, None] * vectors.T, target, bounds, method="bvls").x
+    kept: np.ndarray = ~positive | (found > 0.0)
+    return kept
 
 
 def unit_sizes(hessian: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -16,7 +18,8 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import Watch
 from ep2sindy.estimation.flow import Flow, RightHandSides, Steps
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Relation, constraint
+from ep2sindy.library.relations import Process, Relation, constraint
+from ep2sindy.library.roles import Roles
 from ep2sindy.model.inputs import Curve, check_courses, curve_through, plausible_courses
 
 MIN_SAMPLES = 5  # of a record: a smoother accepts no fewer
@@ -146,7 +149,8 @@ class ScaledRecord:
 class EstimationProblem:
     """Records, the library of their variables, and the coefficients: coef = C free + fixed.
 
-    Without relations between coefficients all are free: C is None, and fixed is zero.
+    Without relations and roles all are free: C is None, and fixed is zero. Under roles each process
+    is one free coefficient.
 
     library: of scaled variables, states first. term_names: names of its terms in SI variables.
     equation, column: (coefficients,), the equation and the term of each coefficient.
@@ -157,7 +161,8 @@ class EstimationProblem:
     measured: (d,), False for hidden states. watch: told of every step of a fit. whole: the
     problem with all terms, if this one has only those of a working set; places: (terms,), their
     positions in its library. allowed_courses: of each input, the most plausible first. widen: makes
-    the problem with all products of one degree more.
+    the problem with all products of one degree more. processes: one for each free coefficient under
+    roles; else none. nonnegative: (d,), states that never start below zero.
     """
 
     library: Library
@@ -175,6 +180,8 @@ class EstimationProblem:
     step_s: float
     measured: Bool[np.ndarray, " d"]
     places: Int[np.ndarray, " terms"]
+    nonnegative: Bool[np.ndarray, " d"]
+    processes: tuple[Process, ...] = ()
     inputs: tuple[str, ...] = ()
     allowed_courses: tuple[tuple[str, ...], ...] = ()
     watch: Watch = field(default_factory=Watch)
@@ -200,6 +207,7 @@ class EstimationProblem:
             required=self.required[kept],
             to_SI=self.to_SI[rows],
             places=self.places[columns],
+            processes=tuple(compress(self.processes, kept)),
             whole=self.candidates,
         )
 
@@ -281,6 +289,13 @@ class EstimationProblem:
     @property
     def n_free(self) -> int:
         return len(self.column) if self.C is None else self.C.shape[1]
+
+    @cached_property
+    def positive(self) -> Bool[np.ndarray, " free"]:
+        """Mask of the free coefficients that must be positive."""
+        found = np.zeros(self.n_free, dtype=np.bool_)
+        found[: len(self.processes)] = [process.one_sign for process in self.processes]
+        return found
 
     @cached_property
     def block(self) -> Int[np.ndarray, " free"]:
@@ -370,13 +385,14 @@ def scale_problem(
     runs: Sequence[Trajectory], library: Library, relations: Sequence[Relation] = (),
     terms: Mapping[str, Sequence[str]] | None = None, *, measured: Sequence[str] = (),
     exclude: Mapping[str, Sequence[str]] | None = None, courses: Mapping[str, str] | None = None,
-    watch: Watch | None = None,
+    roles: Roles | None = None, watch: Watch | None = None,
 ) -> EstimationProblem:  # fmt: skip
     """Scale records and library, and collect the coefficients that may be in the model.
 
     relations: hold between coefficients. terms: for each state whose equation is known but for its
     coefficients, all terms of that equation. measured: names of states; empty means all. exclude:
-    for each state that is named, terms that its equation may not have. Inputs that the library does
+    for each state that is named, terms that its equation may not have. roles: give the terms of all
+    equations, in place of relations, terms and exclude. Inputs that the library does
     not have are left out; the others are taken by name, in the order of the first run. courses: of
     inputs between their samples; others have all courses that their samples allow.
     Raises ValueError for an unknown input or course.
@@ -385,14 +401,20 @@ def scale_problem(
     inputs = [name for name in runs[0].input_names if name in library.variables]
     allowed = _allowed_courses(runs, inputs, courses or {})
     names = [*states, *inputs]
+    processes = roles.processes(library, states) if roles else []
+    library = roles.with_known_terms(library, states) if roles else library
     over = library.over(names)
     size = _rms(runs, names)
     step_s = mean_step(*(run.t for run in runs))
     scaled, numbers = over.scaled(size)
-    asked = _asked(over, states, terms or {}, exclude or {})
-    held = constraint(over, asked, relations) if relations else None
-    equation, column = _coefficients(over, asked)  # in the order of the constraint's
+    asked = (
+        _moved(states, processes, roles)
+        if roles
+        else _asked(over, states, terms or {}, exclude or {})
+    )
+    equation, column = _coefficients(over, asked)
     to_SI = size[equation] / (numbers[column] * step_s)
+    held = _ties(over, asked, relations, processes, roles)
     known = np.isin(equation, [states.index(state) for state in terms or {}])
     problem = EstimationProblem(
         library=scaled,
@@ -401,8 +423,8 @@ def scale_problem(
         records=(),
         equation=equation,
         column=column,
-        C=held.C * to_SI[held.free] / to_SI[:, None] if held else None,
-        fixed_SI=held.d if held else np.zeros(len(column)),
+        C=held.C * to_SI[held.leads] / to_SI[:, None] if held else None,
+        fixed_SI=held.fixed if held else np.zeros(len(column)),
         required=(held.C[known] != 0.0).any(axis=0) if held else known,
         to_SI=to_SI,
         scale=size[: len(states)],
@@ -410,6 +432,8 @@ def scale_problem(
         step_s=step_s,
         measured=np.isin(states, measured or states),
         places=np.arange(len(over)),
+        nonnegative=np.isin(states, [*roles.balanced] if roles and roles.nonnegative else []),
+        processes=tuple(processes),
         inputs=tuple(inputs),
         allowed_courses=tuple(allowed.values()),
         watch=watch or Watch(),
@@ -476,6 +500,45 @@ def _asked(
         else [name for k, name in enumerate(library.names) if k not in barred.get(state, ())]
         for state in states
     }
+
+
+class Ties(NamedTuple):
+    """coef = C free + fixed, in SI; leads: the coefficient in whose scale each free one is."""
+
+    C: Float[np.ndarray, "coefficients free"]
+    fixed: Float[np.ndarray, " coefficients"]
+    leads: Int[np.ndarray, " free"]
+
+
+def _ties(
+    library: Library,
+    asked: Mapping[str, Sequence[str]],
+    relations: Sequence[Relation],
+    processes: Sequence[Process],
+    roles: Roles | None,
+) -> Ties | None:
+    """What relations or roles make of the coefficients; None if all are free."""
+    if relations:
+        held = constraint(library, asked, relations)
+        return Ties(held.C, held.d, held.free)
+    if roles is None:
+        return None
+    states = list(asked)
+    places = [
+        (states[equation], library.names[column])
+        for equation, column in zip(*_coefficients(library, asked), strict=True)
+    ]
+    C = np.array([[process.factors.get(at, 0.0) for process in processes] for at in places])
+    fixed = np.array([roles.known.get(at, 0.0) for at in places])
+    return Ties(C, fixed, np.argmax(C != 0.0, axis=0))
+
+
+def _moved(
+    states: Sequence[str], processes: Sequence[Process], roles: Roles
+) -> dict[str, Sequence[str]]:
+    """Terms that processes or known roles bring into each equation."""
+    places = [*roles.known, *(place for process in processes for place in process.factors)]
+    return {state: [term for s, term in places if s == state] for state in states}
 
 
 def _coefficients(

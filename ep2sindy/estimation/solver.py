@@ -305,7 +305,7 @@ def _exchange_terms(
         if np.array_equal(found.support, fit.support):
             break
         tried = fit_paths(problem, replace(fit, support=found.support, free=found.free), level)
-        tried_score = tried.total + prices[found.support].sum()
+        tried_score = tried.total + prices[tried.support].sum()
         too_large = excess(problem, fit.support, max_terms) > 0
         if not (tried_score < score or (too_large and np.isfinite(tried_score))):
             break

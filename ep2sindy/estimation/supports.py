@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.estimation.likelihood import Gram, unit_sizes
+from ep2sindy.estimation.likelihood import Gram, unit_sizes, within_bounds
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.regression.exchanges import exchanged_supports
 from ep2sindy.regression.gram_kernels import fit_masks
@@ -68,8 +69,9 @@ def best_support(
     Required terms are always in. held: an equation that is not changed.
     """
 
-    def rank(each: PenalisedFit) -> tuple[int, float]:
-        return excess(problem, each.support, max_terms), each.score
+    def rank(each: PenalisedFit) -> tuple[int, int, float]:
+        negative = int((each.free[problem.positive] < 0.0).sum())
+        return negative, excess(problem, each.support, max_terms), each.score
 
     best = penalise(gram, start, prices)
     for _ in range(MAX_SWEEPS):
@@ -197,7 +199,27 @@ def _offer_supports(
         support = kept.copy()
         support[own] = mask
         found.append(Offered(support, yy - gain))
-    return found
+    return _admissible(problem, gram, found) if problem.positive.any() else found
+
+
+def _admissible(
+    problem: EstimationProblem, gram: Gram, offered: Sequence[Offered]
+) -> list[Offered]:
+    """The supports on which coefficients that must be positive are.
+
+    One that has negative ones is replaced by what least squares with bounds leaves of it.
+    """
+    found = {}
+    for support, squares in offered:
+        none = np.zeros(len(support))
+        free = penalise(gram, support, none).free
+        if (free[problem.positive] < 0.0).any():
+            own, quadratic = np.flatnonzero(support), gram.quadratic[np.ix_(support, support)]
+            kept = within_bounds(quadratic, gram.linear[support], problem.positive[support])
+            support = np.isin(np.arange(len(support)), own[kept])
+            squares = penalise(gram, support, none).score
+        found[support.tobytes()] = Offered(support, squares)
+    return list(found.values())
 
 
 def _gains(

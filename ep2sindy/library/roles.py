@@ -104,7 +104,7 @@ class Roles:
             raise ValueError(f"a role must be given once: {twice} came twice")
         for role in self._roles:
             _check_how(role)
-        if both := [state for state in self.equations if state in self._with_roles]:
+        if both := [state for state in self.equations if state in self.balanced]:
             raise ValueError(f"a state has roles or a known equation: {both} have both")
 
     @property
@@ -130,7 +130,7 @@ class Roles:
         return [role.name for role in self._roles if role.how in (KNOWN, EITHER)]
 
     @property
-    def _with_roles(self) -> set[str]:
+    def balanced(self) -> set[str]:
         """The states whose equations the roles make."""
         return {state for role in self._roles for state in role[:2] if state}
 
@@ -254,7 +254,7 @@ class Roles:
                     "role out"
                 )
             found += played
-        taken = self._with_roles | {*self.equations}
+        taken = self.balanced | {*self.equations}
         for state in [s for s in states if s not in taken]:
             found += [
                 Process(f"{state} free", term, MappingProxyType({(state, term): 1.0}))
