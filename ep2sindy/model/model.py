@@ -26,7 +26,7 @@ from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.screen import N_LINES
-from ep2sindy.runtime.values import check_count, check_positive, read_only
+from ep2sindy.runtime.values import check_count, read_only
 from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
 if TYPE_CHECKING:
@@ -281,37 +281,6 @@ class SparseModel:
         """LaTeX `aligned` block with one equation per line."""
         terms = {state: self.terms(state) for state in self.states}
         return equations_latex(terms, digits=digits)
-
-    def to_code(
-        self, language: str, *, x0: ArrayLike | None = None, duration_s: float = 1.0
-    ) -> str:
-        """Program of the equations that needs no EP2-SINDy: a text in Python, C, Julia or Modelica.
-
-        language: "python" (NumPy; SciPy in its example), "c" (C99), "julia" (for
-        DifferentialEquations.jl) or "modelica". All numbers are in SI, coefficients exact, and
-        the comment at the top has states, inputs, units and provenance.
-        Inputs are an argument of `rhs` in Python and C, functions of t in Julia, and `input Real`
-        in Modelica. Names that a language cannot take are changed, and the comment says so.
-        x0: (n_states,), in SI, and duration_s, in s: start and length of the run that Modelica
-        makes, and Python and Julia as an example; None starts at ones. C has the right-hand side
-        alone. These programs do not stop where a function of the model ends or its values blow
-        up, as `simulate` does; the comment has the domain.
-        Raises ValueError for another language, a wrong start or duration, and for a function of
-        your own that is not written in NumPy's arithmetic and functions.
-        """
-        from ep2sindy.library.code import program_text  # here, for it imports sympy
-
-        check_positive("duration_s", duration_s)
-        return program_text(
-            language,
-            self.library,
-            {state: self.terms(state) for state in self.states},
-            inputs=self.inputs,
-            units=self.units,
-            provenance=self.provenance,
-            start=np.ones(len(self.states)) if x0 is None else check_start(self.states, x0),
-            duration_s=duration_s,
-        )
 
     def __str__(self) -> str:
         """Equations with units and, where a covariance is known, 95 % intervals."""
