@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.estimation.missing_state import missing_state
+from ep2sindy.estimation.explanation import missing_state
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.systems.systems import System, van_der_pol
 from tests.models import model_of

@@ -191,7 +191,8 @@ def test_bad_roles_say_what_must_hold(make, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": ep.TrajectorySearch()}, "roles are kept by a regression"),
+        ({"method": ep.TrajectorySearch(selection=ep.FreeRunScore())}, "keeps roles by likelihood"),
+        ({"method": ep.TrajectorySearch(), "hidden": ["g"]}, "roles need samples of every state"),
         ({"method": ep.Regression()}, "a rule must judge whole systems"),
         ({"method": recipe(), "relations": ["n_n: 1 == 2"]}, "give roles alone"),
         ({"method": recipe(), "roles": "n_n to n_i"}, "Roles"),

@@ -7,13 +7,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.draws import halton
+from ep2sindy.model.draws import halton, starts_around
 from ep2sindy.model.fixed_point import rest_point
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import (
     CycleStability,
     LimitCycle,
-    _starts,
     limit_cycle,
     periods_to_reach,
     share_reaching,
@@ -209,7 +208,7 @@ def test_starts_outside_a_bounded_basin_do_not_reach_the_cycle() -> None:
 
     equations = {"x": {**names("x", "y"), "y": -1.0}, "y": {**names("y", "x"), "x": 1.0}}
     model, cycle = found(equations, [1.1, 0.0], 6.0)
-    starts = _starts(cycle.states, 64, (0.3, 3.0))
+    starts = starts_around(cycle.states, 64, (0.3, 3.0))
     inside = np.linalg.norm(starts, axis=1) < 2.0
     assert share_reaching(model, cycle, n_periods=FEW) == inside.mean()
     assert inside.mean() == pytest.approx(np.pi / 9.0, abs=0.05)  # of a disc in the square
@@ -217,7 +216,7 @@ def test_starts_outside_a_bounded_basin_do_not_reach_the_cycle() -> None:
 
 def test_starts_keep_the_sign_that_the_cycle_keeps() -> None:
     states = np.array([[1.0, -3.0, -1.0], [3.0, -1.0, 1.0]])
-    starts = _starts(states, 256, (0.3, 3.0))
+    starts = starts_around(states, 256, (0.3, 3.0))
     low, high = starts.min(axis=0), starts.max(axis=0)
     np.testing.assert_allclose(low, [0.6, -6.0, -3.0], rtol=0.1)
     np.testing.assert_allclose(high, [6.0, -0.6, 3.0], rtol=0.1)

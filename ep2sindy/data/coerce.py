@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.export import CLOCK
 from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
-from ep2sindy.data.numbers import count_dates, real_numbers, seconds
+from ep2sindy.data.numbers import check_nonnegative, count_dates, real_numbers, seconds
 from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import check_state
@@ -286,8 +286,6 @@ def keep_inside(
 # Repeated data: a state that is a copy of another one, and samples that two runs share.
 
 
-# Times the noise, and share of the RMS, by which a state that is nonnegative may lie below zero.
-BELOW_NOISE, BELOW_ZERO = 6.0, 0.05
 SAME = 1e-12  # residual of an exact copy due to rounding, as a fraction of the state's variance
 MIN_SHARED = 8  # consecutive samples; shorter matches of rounded samples can occur by chance
 
@@ -339,22 +337,6 @@ def _common_start(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m 
     n = min(len(first), len(second))
     same = n >= MIN_SHARED and np.array_equal(first[:MIN_SHARED], second[:MIN_SHARED])
     return n if same and np.array_equal(first[:n], second[:n]) else 0
-
-
-def _check_nonnegative(runs: Sequence[Trajectory], state: str) -> None:
-    """Raise ValueError for a state that is below zero by more than its noise."""
-    for run in runs:
-        k = run.state_names.index(state)
-        values = run.states[:, k] if run.missing is None else run.states[~run.missing[:, k], k]
-        # The second difference of white noise has six times its variance.
-        noise = np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6.0))
-        allowed = max(BELOW_NOISE * noise, BELOW_ZERO * np.sqrt(np.square(values).mean()))
-        if values.mean() < 0.0 or values.min() < -allowed:
-            raise ValueError(
-                "nonnegative roles need states that are concentrations or numbers: "
-                f"{state} is {values.mean():.3g} in the mean and falls to {values.min():.3g}; "
-                "shift or turn its values, or leave nonnegative out"
-            )
 
 
 # What a method is asked.
@@ -450,9 +432,8 @@ class Task:
                     "relations between coefficients instead, or leave roles out"
                 )
             self.roles.processes(self.library, self.states)
-            if self.roles.nonnegative:
-                for state in sorted(self.roles.balanced):
-                    _check_nonnegative(self.runs, state)
+            for state in self.roles.positive:
+                check_nonnegative(state, [run.columns([state])[:, 0] for run in self.runs])
         named = [(state, term) for r in self.relations for _, state, term in r.factors]
         named += [(state, term) for state, terms in self.terms.items() for term in terms]
         for state in (*self.terms, *self.exclude, *(state for state, _ in named)):

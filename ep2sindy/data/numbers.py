@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 # above the second a square overflows. Terms that overflow raise their own error.
 LEAST, MOST = 1e-50, 1e150
 
+# Times the noise, and share of the RMS, by which a state that is nonnegative may lie below zero.
+BELOW_NOISE, BELOW_ZERO = 6.0, 0.05
+
 
 def real_numbers(values: object, what: str) -> np.ndarray:
     """Copy values to float64; a masked value becomes NaN, which always means missing.
@@ -139,3 +142,18 @@ def band_of(draws: Float[np.ndarray, "draws ..."], level: float) -> np.ndarray:
     if not 0.0 < level < 1.0:
         raise ValueError(f"level must lie between 0 and 1: {level} came")
     return quantiles(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
+
+
+def check_nonnegative(name: str, runs: Sequence[Float[np.ndarray, " samples"]]) -> None:
+    """Raise ValueError for a state that is below zero by more than its noise; NaN is missing."""
+    for values in runs:
+        x = values[np.isfinite(values)]
+        # The second difference of white noise has six times its variance.
+        noise = np.median(np.abs(np.diff(x, 2))) / (0.6745 * np.sqrt(6.0))
+        allowed = max(BELOW_NOISE * noise, BELOW_ZERO * np.sqrt(np.square(x).mean()))
+        if x.mean() < 0.0 or x.min() < -allowed:
+            raise ValueError(
+                f"nonnegative roles need states that are concentrations or numbers: {name} is "
+                f"{x.mean():.3g} in the mean and falls to {x.min():.3g}; shift or turn its values, "
+                "or leave nonnegative out"
+            )

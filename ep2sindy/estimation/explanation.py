@@ -7,13 +7,14 @@ starts again from states that random pushes let go their own way, and then from 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import compress
+from math import log
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.estimation.cost import OutOfTimeError
-from ep2sindy.estimation.courses import on_likeliest_courses
 from ep2sindy.estimation.lateness import (
     PAYS,
     SURE,
@@ -24,8 +25,7 @@ from ep2sindy.estimation.lateness import (
     move_channels,
     suspect_delays,
 )
-from ep2sindy.estimation.likelihood import STEERED
-from ep2sindy.estimation.missing_state import ROADS, missing_state
+from ep2sindy.estimation.likelihood import STEERED, Level
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem
 from ep2sindy.estimation.pushed import (
@@ -40,15 +40,30 @@ from ep2sindy.estimation.solver import (
     AnnealedFit,
     Solution,
     astray,
+    at_level,
     enough_samples,
     from_smooth,
     max_terms_for,
     settle,
+    smoothed,
+    start_from_smooth,
 )
 from ep2sindy.estimation.supports import term_prices
-from ep2sindy.estimation.working_set import search_within, with_entrances
+from ep2sindy.estimation.working_set import first_set, search_within, with_entrances
 from ep2sindy.runtime.progress import SILENT
 from ep2sindy.trust.interruption import is_interruption
+
+CLEAR = 4.0  # steps between the points of a path, in standard deviations of the noise
+MOST_POINTS = 3000  # of a path that is looked at, the first ones
+STRAIGHT = 0.95  # least cosine of the turn from one step to the next
+LEAST_SINE = 0.5  # of the angle of a crossing: noise turns a path by less
+LEAST_CROSSINGS = 3  # one may come from a gap or an outlier
+ROADS = (
+    "Name a hidden state (hidden=[...]), embed one signal (+exp=trace), or measure another state"
+)
+WARM = 0.1  # rho of the fits that are compared: an input half a step late shows, with all terms
+BETTER = 4.0  # least fall of -2 log likelihood for which the most plausible course is left
+
 
 FIRST_MAX_TERMS, MORE_TERMS = 7, 5  # of one equation, and how many more where all are used
 LET_GO = 0.5  # residual, as a share of a state's spread, if the model ignores the state
@@ -357,3 +372,88 @@ def _at_limit(problem: EstimationProblem, found: Solution, max_terms: int) -> st
         "stand for one that the library lacks, and intervals are not given; add terms to it, or "
         "raise max_terms"
     )
+
+
+def on_likeliest_courses(problem: EstimationProblem, *, max_terms: int) -> EstimationProblem:
+    """The problem with every input on the likeliest of the courses that its samples allow.
+
+    They are compared before the search, with all terms: a wrong course would ask for wrong ones,
+    and pass for a state that comes late. Noise is of unknown size, so that n log(squares) counts.
+    """
+    if all(len(options) == 1 for options in problem.allowed_courses):
+        return problem
+    part = problem.restricted(first_set(problem, max_terms))
+    start, noise = start_from_smooth(part, None)
+
+    @cache
+    def unlikely(courses: tuple[str, ...]) -> float:
+        fit, _ = at_level(part.on_courses(courses), start, Level(noise, WARM))
+        return part.n_squares * log(max(fit.total, np.finfo(np.float64).tiny))
+
+    best = problem.courses
+    for j, options in enumerate(problem.allowed_courses):
+        first, *others = [(*best[:j], course, *best[j + 1 :]) for course in options]
+        best = min([first, *others], key=lambda c: unlikely(c) - BETTER * (c == first))
+    return problem.on_courses(best)
+
+
+# Signs that a state is missing: a state that moves by a law of its own cannot pass a value upwards
+# and later downwards, and the path of two states in their plane cannot cross itself.
+
+
+def missing_state(problem: EstimationProblem) -> str:
+    """The sign that a state is missing; empty if there is none, inputs drive, or d is above two."""
+    d = len(problem.states)
+    if problem.driven or d > 2 or not problem.measured.all():
+        return ""
+    start = smoothed(problem, None)
+    noise = start.noise[0][0]
+    paths = [_clear_steps(path / noise) for path in start.paths]
+    name = problem.states[0]
+    if d == 1 and sum(_turns(path[:, 0]) for path in paths) >= LEAST_CROSSINGS:
+        return f"{name} passes the same values up and down, which no law of {name} alone does"
+    if d == 2 and sum(_crossings(path) for path in paths) >= LEAST_CROSSINGS:
+        both = " and ".join(problem.states)
+        return f"the path of {both} crosses itself, which no law of {both} alone does"
+    return ""
+
+
+def _clear_steps(path: Float[np.ndarray, "samples d"]) -> Float[np.ndarray, "points d"]:
+    """Points of a path that lie clearly apart; in units of the noise."""
+    kept = [0]
+    for k in range(1, len(path)):
+        if np.square(path[k] - path[kept[-1]]).sum() > CLEAR**2:
+            kept.append(k)
+            if len(kept) == MOST_POINTS:
+                break
+    return path[kept]
+
+
+def _turns(x: Float[np.ndarray, " points"]) -> int:
+    """Number of turns from up to down."""
+    up = np.diff(x) > 0.0
+    return int((up[:-1] & ~up[1:]).sum())
+
+
+def _crossings(path: Float[np.ndarray, "points 2"]) -> int:
+    """Number of pairs of steps that cross each other at a clear angle."""
+    if len(path) < 4:
+        return 0
+    points = path / np.maximum(path.std(axis=0), 1e-150)
+    step = np.diff(points, axis=0)
+    length = np.maximum(np.linalg.norm(step, axis=1), 1e-150)
+    along = (step[1:] * step[:-1]).sum(axis=1) > STRAIGHT * length[1:] * length[:-1]
+    # The chord of an arc cuts its corner: only where the path goes straight does it lie on it.
+    straight = np.flatnonzero(along[1:] & along[:-1]) + 1
+    points, step, length = points[straight], step[straight], length[straight]
+    count = 0
+    for k in range(len(step) - 1):
+        # Step k is p + s u, and a later one q + t v, with s and t from 0 to 1.
+        between, later = points[k + 1 :] - points[k], step[k + 1 :]
+        area = step[k, 0] * later[:, 1] - step[k, 1] * later[:, 0]
+        clear = np.abs(area) > LEAST_SINE * length[k] * length[k + 1 :]
+        safe = np.where(clear, area, 1.0)
+        s = (between[:, 0] * later[:, 1] - between[:, 1] * later[:, 0]) / safe
+        t = (between[:, 0] * step[k, 1] - between[:, 1] * step[k, 0]) / safe
+        count += int((clear & (s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0)).sum())
+    return count

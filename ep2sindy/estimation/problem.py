@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,10 +14,11 @@ from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.coefficients import coefficients_of
 from ep2sindy.estimation.cost import Watch
 from ep2sindy.estimation.flow import Flow, RightHandSides, Steps
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Process, Relation, constraint
+from ep2sindy.library.relations import Process, Relation
 from ep2sindy.library.roles import Roles
 from ep2sindy.model.inputs import Curve, check_courses, curve_through, plausible_courses
 
@@ -389,33 +389,25 @@ def scale_problem(
 ) -> EstimationProblem:  # fmt: skip
     """Scale records and library, and collect the coefficients that may be in the model.
 
-    relations: hold between coefficients. terms: for each state whose equation is known but for its
-    coefficients, all terms of that equation. measured: names of states; empty means all. exclude:
-    for each state that is named, terms that its equation may not have. roles: give the terms of all
-    equations, in place of relations, terms and exclude. Inputs that the library does
-    not have are left out; the others are taken by name, in the order of the first run. courses: of
-    inputs between their samples; others have all courses that their samples allow.
+    relations, terms, roles, exclude: as in `Task`. measured: names of states; empty means all.
+    Inputs that the library does not have are left out; the others are taken by name, in the order
+    of the first run. courses: of inputs between their samples; others have all that these allow.
     Raises ValueError for an unknown input or course.
     """
     states = runs[0].state_names
     inputs = [name for name in runs[0].input_names if name in library.variables]
     allowed = _allowed_courses(runs, inputs, courses or {})
-    names = [*states, *inputs]
-    processes = roles.processes(library, states) if roles else []
-    library = roles.with_known_terms(library, states) if roles else library
-    over = library.over(names)
+    names, known = [*states, *inputs], terms or {}
+    over = (roles.with_known_terms(library, states) if roles else library).over(names)
     size = _rms(runs, names)
     step_s = mean_step(*(run.t for run in runs))
     scaled, numbers = over.scaled(size)
-    asked = (
-        _moved(states, processes, roles)
-        if roles
-        else _asked(over, states, terms or {}, exclude or {})
+    processes = roles.processes(library, states) if roles else []
+    equation, column, held = coefficients_of(
+        over, states, known, exclude or {}, relations, processes, roles
     )
-    equation, column = _coefficients(over, asked)
     to_SI = size[equation] / (numbers[column] * step_s)
-    held = _ties(over, asked, relations, processes, roles)
-    known = np.isin(equation, [states.index(state) for state in terms or {}])
+    fixed = np.isin(equation, [states.index(state) for state in known])
     problem = EstimationProblem(
         library=scaled,
         term_names=over.names,
@@ -425,14 +417,14 @@ def scale_problem(
         column=column,
         C=held.C * to_SI[held.leads] / to_SI[:, None] if held else None,
         fixed_SI=held.fixed if held else np.zeros(len(column)),
-        required=(held.C[known] != 0.0).any(axis=0) if held else known,
+        required=(held.C[fixed] != 0.0).any(axis=0) if held else fixed,
         to_SI=to_SI,
         scale=size[: len(states)],
         input_scale=size[len(states) :],
         step_s=step_s,
         measured=np.isin(states, measured or states),
         places=np.arange(len(over)),
-        nonnegative=np.isin(states, [*roles.balanced] if roles and roles.nonnegative else []),
+        nonnegative=np.isin(states, roles.positive if roles else []),
         processes=tuple(processes),
         inputs=tuple(inputs),
         allowed_courses=tuple(allowed.values()),
@@ -484,74 +476,6 @@ def _as_fitted(
     kept = np.isin((run.t - run.t[0]) / problem.step_s, times)
     missing = None if run.missing is None else run.missing[kept]
     return replace(run, t=run.t[kept], states=states, inputs=run.inputs[kept], missing=missing)
-
-
-def _asked(
-    library: Library,
-    states: Sequence[str],
-    terms: Mapping[str, Sequence[str]],
-    exclude: Mapping[str, Sequence[str]],
-) -> dict[str, Sequence[str]]:
-    """Terms that may be in each equation: those that are known, or all that are not excluded."""
-    barred = {state: {*map(library.index, names)} for state, names in exclude.items()}
-    return {
-        state: terms[state]
-        if state in terms
-        else [name for k, name in enumerate(library.names) if k not in barred.get(state, ())]
-        for state in states
-    }
-
-
-class Ties(NamedTuple):
-    """coef = C free + fixed, in SI; leads: the coefficient in whose scale each free one is."""
-
-    C: Float[np.ndarray, "coefficients free"]
-    fixed: Float[np.ndarray, " coefficients"]
-    leads: Int[np.ndarray, " free"]
-
-
-def _ties(
-    library: Library,
-    asked: Mapping[str, Sequence[str]],
-    relations: Sequence[Relation],
-    processes: Sequence[Process],
-    roles: Roles | None,
-) -> Ties | None:
-    """What relations or roles make of the coefficients; None if all are free."""
-    if relations:
-        held = constraint(library, asked, relations)
-        return Ties(held.C, held.d, held.free)
-    if roles is None:
-        return None
-    states = list(asked)
-    places = [
-        (states[equation], library.names[column])
-        for equation, column in zip(*_coefficients(library, asked), strict=True)
-    ]
-    C = np.array([[process.factors.get(at, 0.0) for process in processes] for at in places])
-    fixed = np.array([roles.known.get(at, 0.0) for at in places])
-    return Ties(C, fixed, np.argmax(C != 0.0, axis=0))
-
-
-def _moved(
-    states: Sequence[str], processes: Sequence[Process], roles: Roles
-) -> dict[str, Sequence[str]]:
-    """Terms that processes or known roles bring into each equation."""
-    places = [*roles.known, *(place for process in processes for place in process.factors)]
-    return {state: [term for s, term in places if s == state] for state in states}
-
-
-def _coefficients(
-    library: Library, asked: Mapping[str, Sequence[str]]
-) -> tuple[Int[np.ndarray, " coefficients"], Int[np.ndarray, " coefficients"]]:
-    """Equation and term of every coefficient that may be in the model."""
-    pairs = [
-        (equation, column)
-        for equation, terms in enumerate(asked.values())
-        for column in sorted({library.index(term) for term in terms})
-    ]
-    equation, column = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-    return equation, column
 
 
 def _limits(run: Trajectory, size: np.ndarray) -> Bounds | None:

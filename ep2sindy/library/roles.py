@@ -135,6 +135,11 @@ class Roles:
         return {state for role in self._roles for state in role[:2] if state}
 
     @property
+    def positive(self) -> list[str]:
+        """The states that cannot turn negative."""
+        return sorted(self.balanced) if self.nonnegative else []
+
+    @property
     def states(self) -> tuple[str, ...]:
         """Every state that is named, once."""
         named = [state for role in self._roles for state in role[:2] if state]

@@ -180,3 +180,14 @@ def halton(n: int, n_dimensions: int) -> np.ndarray:
             digits, digit = np.divmod(digits, base)
             column += place * digit
     return points
+
+
+def starts_around(states: np.ndarray, n_starts: int, spread: tuple[float, float]) -> np.ndarray:
+    """Starts (starts, n_states) that fill a box; see `share_reaching`."""
+    share = halton(n_starts, states.shape[1])
+    mean = states.mean(axis=0)
+    reach = spread[1] * 0.5 * np.ptp(states, axis=0)
+    low, high = np.log(spread)
+    one_sign = (states > 0.0).all(axis=0) | (states < 0.0).all(axis=0)
+    around = mean * np.exp(low + (high - low) * share)
+    return np.where(one_sign, around, mean + reach * (2.0 * share - 1.0))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.integrate import DOP853, OdeSolution
 
-from ep2sindy.model.draws import halton
+from ep2sindy.model.draws import starts_around
 from ep2sindy.model.many import rk4_step
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import start_scale
@@ -193,7 +193,7 @@ def share_reaching(
     scale = deviations(cycle.states)
     scaled = ScaledModel.of(model, scale, cycle.period_s)
     curve = cycle.states / scale
-    y = (_starts(cycle.states, n_starts, spread) / scale).T
+    y = (starts_around(cycle.states, n_starts, spread) / scale).T
     per_period = float(np.mean(1.0 / _steps(scaled, curve.T)))
     on_cycle = _on_cycle(scaled, y, curve, n_periods, round(PATIENCE * n_periods * per_period))
     return float(on_cycle) / n_starts
@@ -214,9 +214,12 @@ def _on_cycle(
     scaled: ScaledModel, y: np.ndarray, curve: np.ndarray, n_periods: float, n_steps: int
 ) -> int:
     """Number of starts (n_states, starts) that follow the curve over the last periods."""
+    from scipy.interpolate import CubicSpline  # imports take 0.25 s, and are seldom needed
     from scipy.spatial import KDTree
 
-    nearest = KDTree(_interpolate(curve))
+    closed = np.append(curve, curve[:1], axis=0)
+    spline = CubicSpline(np.arange(len(closed)), closed, bc_type="periodic")
+    nearest = KDTree(spline(np.arange(16 * len(curve)) / 16.0))
     centre = curve.mean(axis=0)[:, None]
     bound = BLOW_UP * np.abs(y - centre).max()
     y, t, left = scaled.approach(
@@ -243,26 +246,6 @@ def _on_cycle(
 def _steps(scaled: ScaledModel, y: np.ndarray) -> np.ndarray:
     """Time step at every state (n_states, points), in periods."""
     return STEP_TIMES_RATE / np.maximum(scaled.rate(y), STEP_TIMES_RATE * MIN_STEPS)
-
-
-def _interpolate(curve: np.ndarray) -> np.ndarray:
-    """Closed curve through the samples, with sixteen points per sample."""
-    from scipy.interpolate import CubicSpline  # import takes 0.25 s, and is seldom needed
-
-    n = len(curve)
-    spline = CubicSpline(np.arange(n + 1), np.append(curve, curve[:1], axis=0), bc_type="periodic")
-    return spline(np.arange(16 * n) / 16.0)
-
-
-def _starts(states: np.ndarray, n_starts: int, spread: tuple[float, float]) -> np.ndarray:
-    """Starts (starts, n_states); see `share_reaching`."""
-    share = halton(n_starts, states.shape[1])
-    mean = states.mean(axis=0)
-    reach = spread[1] * 0.5 * np.ptp(states, axis=0)
-    low, high = np.log(spread)
-    one_sign = (states > 0.0).all(axis=0) | (states < 0.0).all(axis=0)
-    around = mean * np.exp(low + (high - low) * share)
-    return np.where(one_sign, around, mean + reach * (2.0 * share - 1.0))
 
 
 def _check_search(

@@ -406,19 +406,14 @@ class FreeRunScore:
 
 
 def _simplest_of_equals(ranked: Sequence[int], trials: Sequence[Trial]) -> list[int]:
-    """The ranked systems; of those that are as good as the best one left, the lowest order first.
-
-    A search under roles offers the same law with n_n and with n_n^2, which differ by less than the
-    next record would.
-    """
+    """The ranked systems; of those as good as the best one left, the lowest order comes first."""
     left, found = list(ranked), []
     while left:
         best = trials[left[0]]
+        size, reach = best.system.n_free, SAME * best.waveform
         equals = [
-            k for k in left
-            if trials[k].system.n_free == best.system.n_free
-            and trials[k].waveform <= SAME * best.waveform
-        ]  # fmt: skip
+            k for k in left if trials[k].system.n_free == size and trials[k].waveform <= reach
+        ]
         simplest = min(equals, key=lambda k: trials[k].system.order)
         found.append(simplest)
         left.remove(simplest)

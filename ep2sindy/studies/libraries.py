@@ -482,9 +482,8 @@ class Outcome:
             text = f"{name}: equations {result.how}; run freely: {run.words(seen=living is None)}"
             blocks.append(Text(text, page_only=True))
             held = None if living is None else living.discovery.constraint
-            for state in run.model.states:
-                equation = display_equation(run.model, state, clock, held=held, on_screen=False)
-                blocks.append(equation)
+            shown = partial(display_equation, run.model, clock=clock, held=held, on_screen=False)
+            blocks += [shown(state) for state in run.model.states]
             if living is None:
                 blocks += interval_table(run.model, clock=clock, page_only=True)
         return Section("All libraries", blocks)
