@@ -27,6 +27,7 @@ from ep2sindy.estimation.problem import (
 )
 from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, error_variances, likely_errors
 from ep2sindy.model.model import SparseModel
+from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.signals.spectrum import dominant_frequency
 
@@ -185,6 +186,7 @@ def track(
     run: Trajectory,
     *,
     measured: Sequence[str] | None = None,
+    progress: Progress = SILENT,
 ) -> Tracker:
     """Estimate with what errors a model follows a record, usually the one that it was fitted to.
 
@@ -223,7 +225,7 @@ def track(
         per_period=_per_period(own, names),
         noise=_noise_of(problem, rough, 0.1 * rough),
     )
-    for _ in range(N_PASSES):
+    for _ in count_pieces(progress, range(N_PASSES), "pass", "errors of the model, for forecasts"):
         tracker, paths = _with_likely_noise(tracker, paths)
     return tracker
 

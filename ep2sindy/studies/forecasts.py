@@ -51,8 +51,7 @@ def skill_of(
     if not starts or model.inputs or is_short(run, n_fitted) or not model.coef.any():
         return None
     fitted = run.window(0, n_fitted)
-    with progress.stage(None, "", "errors of the model, for forecasts"):
-        tracker = track(model, fitted)
+    tracker = track(model, fitted, progress=progress)
     with progress.stage(None, "", "width of the forecasts' bands"):
         tracker = calibrate(tracker, fitted)
     with progress.stage(starts, "start", "forecasts") as advance:
