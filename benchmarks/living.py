@@ -29,7 +29,7 @@ import ep2sindy as ep
 from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.free_run import cycle_of
-from ep2sindy.studies.balance import ComparedProcess, compared_processes, zone_processes
+from ep2sindy.studies.balance import ComparedProcess, compared_processes
 from ep2sindy.studies.living import start_of
 from ep2sindy.studies.told import told_roles
 
@@ -89,11 +89,10 @@ class Record:
     sizes: dict[str, float] = field_of(default_factory=dict)
 
     def processes(self, model: ep.SparseModel, held: Constraint | None) -> list[ComparedProcess]:
-        """What zones exchange, in the record and by a model."""
-        if self.sizes:
-            assert held is not None
-            return zone_processes(model, held, self.run, self.balances, self.sizes)
-        return compared_processes(model, self.run, self.balances[""])
+        """What zones exchange, in the record and by a model; nothing if its terms are free."""
+        if held is None or not held.processes:
+            return []
+        return compared_processes(model, held, self.run, self.balances, self.sizes)
 
 
 @dataclass(frozen=True)

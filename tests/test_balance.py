@@ -1,10 +1,13 @@
 """Balance of a zone: exact from averages, estimated from fields, and beside a model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
 
 import ep2sindy as ep
+from ep2sindy.library.roles import constraint_of, summed
 from ep2sindy.studies.balance import compared_processes, model_balance
 from ep2sindy.studies.fits import split_in_time
 from ep2sindy.studies.told import told_roles
@@ -97,15 +100,37 @@ def model_of(ions: dict[str, float], neutrals: dict[str, float]) -> ep.SparseMod
     return ep.SparseModel(library, STATES, coef, dict.fromkeys(STATES, "m^-3"))
 
 
+def under(roles: ep.Roles, values: dict[tuple[str, str], float]):
+    """The model whose processes have these coefficients, by role and term, and its constraint."""
+    library = ep.polynomial(STATES, degree=2)
+    chosen = [p for p in roles.processes(library, STATES) if (p.role, p.term) in values]
+    held_to = constraint_of(library, STATES, chosen, roles.told)
+    assert held_to is not None
+    known = summed(roles.told)
+    coef = np.array([known.get(at, 0.0) for at in held_to.coefficients])
+    for process in chosen:
+        shares = [process.factors.get(at, 0.0) for at in held_to.coefficients]
+        coef += values[process.role, process.term] * np.array(shares)
+    terms: dict[str, dict[str, float]] = {state: {} for state in STATES}
+    for (state, term), value in zip(held_to.coefficients, coef.tolist(), strict=True):
+        terms[state][term] = value
+    return model_of(terms["n_i"], terms["n_n"]), held_to
+
+
+ROLES = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": 2e23}, nonnegative=True)
+VALUES = {
+    ("n_n to n_i", "n_n"): 200.0, ("n_n to n_i", "n_i*n_n"): 4e-14, ("n_i out", "n_i"): 4e5,
+    ("n_n out", "n_n"): 1000.0,
+}  # fmt: skip
+
+
 def test_processes_of_a_conserving_model(data: ep.Trajectory, exact: xr.Dataset) -> None:
-    model = model_of(
-        {"n_i": -5e5, "n_n": 200.0, "n_i*n_n": 4e-14},
-        {"1": 2e23, "n_i": 1e5, "n_n": -1200.0, "n_i*n_n": -4e-14},
-    )
+    model, held_to = under(ROLES, VALUES)
     n_i, n_n = data.states.T
-    found = {each.name.split(",")[0]: each for each in compared_processes(model, data, exact)}
+    compared = compared_processes(model, held_to, data, {"": exact})
+    found = {each.name.split(",")[0]: each for each in compared}
     exchanged = found["neutrals that become ions"]
-    np.testing.assert_allclose(exchanged.modelled, 4e-14 * n_i * n_n + 200.0 * n_n - 1e5 * n_i)
+    np.testing.assert_allclose(exchanged.modelled, 4e-14 * n_i * n_n + 200.0 * n_n)
     np.testing.assert_allclose(exchanged.recorded, exact["ionization"] - exact["returned"])
     np.testing.assert_allclose(found["ions that leave"].modelled, 4e5 * n_i)
     np.testing.assert_allclose(found["neutrals that leave"].modelled, 1000.0 * n_n)
@@ -117,36 +142,55 @@ def test_processes_of_a_conserving_model(data: ep.Trajectory, exact: xr.Dataset)
     assert found["ions that leave"].r2 == pytest.approx(1.0 - off)
 
 
-def test_equations_that_disagree_are_both_compared(data: ep.Trajectory, exact: xr.Dataset) -> None:
-    model = model_of({"n_i": -5e5, "n_i*n_n": 5e-14}, {"1": 2e23, "n_i*n_n": -4e-14})
-    found = compared_processes(model, data, exact)
-    both = [each for each in found if each.name.startswith("neutrals that become")]
-    assert [each.name.split(", in ")[1] for each in both] == ["n_i'", "n_n'"]
-    assert both[0].ratio == pytest.approx(1.25 * both[1].ratio)
+def test_what_ions_give_back_by_a_process_of_their_own_is_compared(data, exact) -> None:
+    """Told or found, it stands beside what walls and anode give back, and ionization is whole."""
+    told = replace(ROLES, exchange=[("n_n", "n_i"), ("n_i", "n_n", {"n_i": 1e5})])
+    free = VALUES | {("n_i to n_n", "n_i"): 1e5}
+    for roles, values in ((told, VALUES), (ROLES, free)):
+        compared = compared_processes(*under(roles, values), data, {"": exact})
+        found = {each.name: each for each in compared}
+        np.testing.assert_allclose(found["neutrals that become ions"].recorded, exact["ionization"])
+        back = found["ions that become neutrals, back from walls and anode"]
+        np.testing.assert_allclose(back.recorded, exact["returned"])
+        assert back.coef == pytest.approx({"n_i": 1e5})
+
+
+def test_counterparts_are_those_of_the_record(data: ep.Trajectory, exact: xr.Dataset) -> None:
+    """A record whose processes are made of the model's terms gives their coefficients."""
+    n_i, n_n = data.states.T
+    made = exact.assign(
+        ionization=("time", 250.0 * n_n + 5e-14 * n_i * n_n + exact["returned"].values),
+        exit_i=("time", 3e5 * n_i),
+    )
+    model, held_to = under(ROLES, VALUES)
+    compared = compared_processes(model, held_to, data, {"": made})
+    found = {each.name.split(",")[0]: each for each in compared}
+    exchanged = found["neutrals that become ions"]
+    assert exchanged.counterpart == pytest.approx({"n_n": 250.0, "n_i*n_n": 5e-14}, rel=1e-6)
+    assert exchanged.fit_r2 == pytest.approx(1.0)
+    assert found["ions that leave"].counterpart == pytest.approx({"n_i": 3e5})
+    entered = float(exact["supply"].mean())
+    assert found["neutrals that enter"].counterpart == pytest.approx({"1": entered})
 
 
 def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exact: xr.Dataset):
-    library = ep.polynomial(STATES, degree=2)
-    support = {"n_i": ["n_i", "n_i*n_n"], "n_n": ["1", "n_n", "n_i*n_n"]}
-    tie = ["n_i: n_i*n_n == -1 * n_n: n_i*n_n", "n_n: 1 == 2.3e23"]
-    held_to = ep.constraint(library, support, tie)
-    model = model_of({"n_i": -5e5, "n_i*n_n": 5e-14}, {"1": 2.3e23, "n_n": -3e3, "n_i*n_n": -5e-14})
+    values = {
+        ("n_n to n_i", "n_i*n_n"): 5e-14, ("n_i out", "n_i"): 5e5, ("n_n out", "n_n"): 3e3
+    }  # fmt: skip
+    model, held_to = under(ROLES, values)
     parts = split_in_time(data, 0.25)
     beside = model_balance(
         model, held_to, data, *parts, {"": exact}, ep.FreeRunBounds(), period_s=5e-5
     )
-    roles = {(each.state, each.term): each for each in beside.terms}
-    assert roles["n_n", "1"].without is None  # known: it is not left out
-    assert roles["n_n", "1"].alone == pytest.approx(float(exact["supply"].mean()))
-    n_i, n_n = data.states.T
-    mean = float(exact["ionization"].mean()) / (n_i * n_n).mean()
-    assert roles["n_i", "n_i*n_n"].alone == pytest.approx(mean)
-    assert roles["n_n", "n_i*n_n"].alone == pytest.approx(-mean)
-    assert roles["n_i", "n_i*n_n"].process == "ionization"
-    without = roles["n_n", "n_n"].without
+    roles = {(each.process.split(",")[0], each.term): each for each in beside.terms}
+    assert [each.term for each in beside.terms] == ["1", "n_i*n_n", "n_i", "n_n"]
+    entering = roles["neutrals that enter", "1"]
+    assert entering.without is None  # known: it is not left out
+    assert entering.counterpart == pytest.approx(float(exact["supply"].mean()))
+    without = roles["neutrals that leave", "n_n"].without
     assert without is not None
     assert list(without.model.terms("n_n")) == ["1", "n_i*n_n"]
-    assert without.model.terms("n_n")["1"] == 2.3e23
+    assert without.model.terms("n_n")["1"] == 2e23
     assert set(beside.tables("simple")) == {"terms_simple", "balance_simple"}
     figure = beside.figures("simple")["balance_simple"].draw()
     drawn = [ax for ax in figure.axes if ax.get_visible()]

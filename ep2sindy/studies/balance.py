@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
@@ -15,8 +15,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.living import balance_figure
-from ep2sindy.library.names import split_factors
-from ep2sindy.library.relations import Constraint, Process, constraint
+from ep2sindy.library.relations import Constraint, Place, Process, constraint
 from ep2sindy.library.roles import process_values
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.free_run import FreeRun, free_run
@@ -26,7 +25,7 @@ from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pic
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
-from ep2sindy.studies.told import IONS, NEUTRALS, recorded_rates
+from ep2sindy.studies.told import IONS, NEUTRALS, is_constant, recorded_rates
 
 NO_SIZES: Mapping[str, float] = MappingProxyType({})
 CAPTION = (
@@ -37,31 +36,23 @@ NOTE = (
     "Rates are means over the record; the model's are its terms at the record's densities. R2: of "
     "the model's rate against the record's, sample by sample."
 )
-# Term's equation, its kind and sign -> terms of the zone's balance, and what they are.
-PLACES: Mapping[tuple[str, str, bool], tuple[tuple[str, ...], str]] = {
-    (IONS, "mixed", True): (("ionization",), "ionization"),
-    (IONS, "neutrals", True): (("ionization",), "ionization"),
-    (IONS, "ions", True): (("ionization",), "ionization"),
-    (IONS, "ions", False): (("exit_i", "returned"), "exit, walls and anode"),
-    (NEUTRALS, "mixed", False): (("ionization",), "ionization"),
-    (NEUTRALS, "ions", False): (("ionization",), "ionization"),
-    (NEUTRALS, "ions", True): (("returned",), "back from walls and anode"),
-    (NEUTRALS, "neutrals", False): (("exit_n",), "exit"),
-    (NEUTRALS, "constant", True): (("supply",), "mass flow"),
-}
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedProcess:
     """A process of the zone: in the record and by the model's terms, in m^-3/s at every sample.
 
-    recorded: None if the record does not give it. terms: of the model, as `n_i': n_i^2`.
+    recorded: None if the record does not give it. coef: of the model's terms. counterpart: of the
+    same terms, by least squares on the record; empty if it does not give the process. fit_r2: of
+    these, at each instant.
     """
 
     name: str
     recorded: Float[np.ndarray, " samples"] | None
     modelled: Float[np.ndarray, " samples"]
-    terms: Sequence[str]
+    coef: Mapping[str, float]
+    counterpart: Mapping[str, float] = field(default_factory=dict)
+    fit_r2: float = float("nan")
 
     @property
     def ratio(self) -> float:
@@ -73,7 +64,7 @@ class ComparedProcess:
     @property
     def r2(self) -> float:
         """R2 at each instant; NaN for a rate that is constant or not recorded."""
-        if self.recorded is None or np.ptp(self.recorded) <= 1e-6 * np.abs(self.recorded).max():
+        if self.recorded is None or is_constant(self.recorded):
             return float("nan")
         return float(r2(truth=self.recorded, prediction=self.modelled[None])[0])
 
@@ -90,85 +81,62 @@ PROCESSES: Metrics[ComparedProcess] = [
     ),
     Metric("ratio", lambda each: each.ratio, View.SHOWN, format="{:.2f}"),
     Metric("r2", lambda each: each.r2, View.SHOWN, "R2", format="{:.3f}"),
-    Metric("terms", lambda each: "; ".join(each.terms), View.SHOWN),
+    Metric("terms", lambda each: ", ".join(each.coef), View.SHOWN),
 ]  # fmt: skip
 
 
 def compared_processes(
-    model: SparseModel, data: Trajectory, balance: xr.Dataset
-) -> list[ComparedProcess]:
-    """The processes of ions and neutrals, in the record and in a model of n_i and n_n alone.
-
-    What the terms of one equation take away, the other gains: a term of neutrals, or of both, moves
-    as much from neutrals to ions as it gives the ions; a term of ions alone as much back as it
-    gives the neutrals. The rest leaves. If the two equations do not agree on what they exchange,
-    both views of it are compared.
-    """
-    theta = model.library.evaluate(data.columns(model.library.variables))
-    rates: dict[str, dict[str, np.ndarray]] = {}
-    for state in (IONS, NEUTRALS):
-        rates[state] = {
-            term: coef * theta[:, model.library.index(term)]
-            for term, coef in model.terms(state).items()
-        }
-    mixed, ions, neutrals = (partial(_part, rates, kind=k) for k in ("mixed", "ions", "neutrals"))
-    back, ahead = ions(NEUTRALS), neutrals(IONS)
-    seen = {IONS: (1.0, mixed(IONS)), NEUTRALS: (-1.0, mixed(NEUTRALS))}
-    given = {s: sign * _sum(part, len(theta)) for s, (sign, part) in seen.items()}
-    shared = _sum(ahead, len(theta)) - _sum(back, len(theta))
-    agree = np.allclose(given[IONS], given[NEUTRALS], rtol=1e-6)
-    known = recorded_rates(balance, data)
-    exchanged = _difference(known, "ionization", "returned")
-    words = "neutrals that become ions, less those that walls and anode give back"
-    found = []
-    for state in (IONS,) if agree else (IONS, NEUTRALS):
-        name = words if agree else f"{words}, in {state}'"
-        terms = [*_named(state, seen[state][1]), *_named(IONS, ahead), *_named(NEUTRALS, back)]
-        found.append(ComparedProcess(name, exchanged, given[state] + shared, terms))
-    for state, own, other, key in (
-        (IONS, ions, back, "exit_i"), (NEUTRALS, neutrals, ahead, "exit_n"),
-    ):  # fmt: skip
-        leaving = -_sum(own(state), len(theta)) - _sum(other, len(theta))
-        words = "ions that leave" if state == IONS else "neutrals that leave"
-        terms = [*_named(state, _less_of(own(state), other))]
-        found.append(ComparedProcess(words, known.get(key), leaving, terms))
-    supply = _sum(_part(rates, NEUTRALS, kind="constant"), len(theta))
-    inflow = ComparedProcess(
-        "neutrals that enter", known.get("supply"), supply, [f"{NEUTRALS}': 1"]
-    )
-    return [each for each in (inflow, *found) if each.modelled.any() or each.recorded is not None]
-
-
-def zone_processes(
     model: SparseModel,
     held_to: Constraint,
     data: Trajectory,
     balances: Mapping[str, xr.Dataset],
-    sizes: Mapping[str, float],
+    sizes: Mapping[str, float] = NO_SIZES,
 ) -> list[ComparedProcess]:
-    """The processes of ions and neutrals in and between several zones, in record and model.
+    """The processes of ions and neutrals, in zones and between them, in record and model.
 
-    held_to: the model's constraint, from a search under `Roles.in_zones`. balances: by zone.
-    sizes: zone -> its length. Rates are those of the zone that gives, or takes from outside.
+    held_to: the model's constraint, from a search under `Roles`. balances: by zone; a single one is
+    called "". sizes: zone -> its length, of several. Rates are those of the zone that gives, or
+    takes from outside. Where ions give back by a process of their own, ionization is the whole of
+    it; else what is given back is subtracted, as the model's terms are net of it.
     """
     theta = model.library.evaluate(data.columns(model.library.variables))
     coef = np.array([model.terms(s).get(term, 0.0) for s, term in held_to.coefficients])
-    values = process_values(held_to, coef)
-    rates: dict[tuple[str, str], dict[str, np.ndarray]] = {}
-    for process, value in zip(held_to.processes, values, strict=True):
-        column = theta[:, model.library.index(process.term)]
-        rates.setdefault(_ends(process), {})[process.term] = value * column
-    for (state, term), value in zip(held_to.coefficients, held_to.d, strict=True):
-        if term == "1" and value:
-            rates.setdefault(("", state), {})["1"] = np.full(len(theta), value)
+    found: dict[tuple[str, str], dict[str, float]] = {}
+    amounts = [*process_values(held_to, coef).tolist(), *(p.value or 0.0 for p in held_to.known)]
+    for process, amount in zip([*held_to.processes, *held_to.known], amounts, strict=True):
+        found.setdefault(_ends(process), {})[process.term] = amount
     known = {zone: recorded_rates(balance, data) for zone, balance in balances.items()}
-    gone = _through_ends(known, sizes)
-    found = []
-    for ends, terms in rates.items():
-        recorded = _zone_rate(*ends, known, gone)
-        modelled = _sum(terms, len(theta))
-        found.append(ComparedProcess(_zone_words(*ends), recorded, modelled, list(terms)))
-    return found
+    gone = _through_ends(known, sizes or dict.fromkeys(balances, 1.0))
+    compared = []
+    for ends, terms in sorted(found.items(), key=lambda each: _order(*each[0])):
+        columns = theta[:, [model.library.index(term) for term in terms]]
+        gross = ends[::-1] in found
+        rate = _zone_rate(*ends, known, gone, gross=gross)
+        modelled = columns @ np.array([*terms.values()])
+        beside = _counterpart(rate, columns, list(terms))
+        compared.append(
+            ComparedProcess(_zone_words(*ends, gross=gross), rate, modelled, terms, *beside)
+        )
+    return compared
+
+
+def _order(giver: str, taker: str) -> int:
+    """What enters first, what leaves last."""
+    return 0 if not giver else 2 if not taker else 1
+
+
+def _counterpart(
+    rate: np.ndarray | None, columns: np.ndarray, terms: Sequence[str]
+) -> tuple[dict[str, float], float]:
+    """Coefficients of these terms by least squares on the recorded rate, and R2."""
+    if rate is None:
+        return {}, float("nan")
+    size = np.abs(columns).max(axis=0)
+    coef = np.linalg.lstsq(columns / size, rate, rcond=None)[0] / size
+    if is_constant(rate):
+        return dict(zip(terms, coef.tolist(), strict=True)), float("nan")
+    score = float(r2(truth=rate, prediction=(columns @ coef)[None])[0])
+    return dict(zip(terms, coef.tolist(), strict=True)), score
 
 
 def _ends(process: Process) -> tuple[str, str]:
@@ -195,7 +163,7 @@ def _through_ends(
     return found
 
 
-def _zone_words(giver: str, taker: str) -> str:
+def _zone_words(giver: str, taker: str, *, gross: bool) -> str:
     (state, _, zone), (other, _, beyond) = giver.partition("@"), taker.partition("@")
     names = {IONS: "ions", NEUTRALS: "neutrals"}
     if not giver:
@@ -204,7 +172,12 @@ def _zone_words(giver: str, taker: str) -> str:
         return f"{names[state]} that leave"
     if zone != beyond:
         return f"{names[state]} from {zone} to {beyond}"
-    return f"{zone}: {names[state]} that become {names[other]}, less those given back"
+    place = f"{zone}: " if zone else ""
+    if gross:
+        back = "" if state == NEUTRALS else ", back from walls and anode"
+        return f"{place}{names[state]} that become {names[other]}{back}"
+    given_back = "those given back" if zone else "those that walls and anode give back"
+    return f"{place}{names[state]} that become {names[other]}, less {given_back}"
 
 
 def _zone_rate(
@@ -212,48 +185,19 @@ def _zone_rate(
     taker: str,
     known: Mapping[str, Mapping[str, np.ndarray]],
     gone: Mapping[tuple[str, str], np.ndarray],
+    *,
+    gross: bool,
 ) -> np.ndarray | None:
     """The rate of a process in the record; None if it does not give it."""
     (state, _, zone), (_, _, beyond) = giver.partition("@"), taker.partition("@")
     if not giver:
         return known[beyond].get("supply")
-    if zone != beyond:  # to the next zone, or to the outside
+    if not taker or zone != beyond:  # to the outside, or to the next zone
         return gone.get((state, zone))
+    if gross:
+        return known[zone].get("ionization" if state == NEUTRALS else "returned")
     exchanged = _difference(known[zone], "ionization", "returned")
     return exchanged if state == NEUTRALS or exchanged is None else -exchanged
-
-
-def _less_of(
-    own: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """The terms that take away more than the other equation gains by them."""
-    return {
-        term: rate
-        for term, rate in own.items()
-        if term not in other or not np.allclose(rate, -other[term], rtol=1e-6)
-    }
-
-
-def _kind(term: str) -> str:
-    """Which densities a term holds: both, that of ions or of neutrals alone, or none."""
-    if term == "1":
-        return "constant"
-    names = {name for name, _ in split_factors(term)}
-    return "mixed" if len(names) > 1 else "ions" if names == {IONS} else "neutrals"
-
-
-def _part(
-    rates: Mapping[str, Mapping[str, np.ndarray]], state: str, *, kind: str
-) -> dict[str, np.ndarray]:
-    return {term: rate for term, rate in rates[state].items() if _kind(term) == kind}
-
-
-def _sum(part: Mapping[str, np.ndarray], n: int) -> np.ndarray:
-    return np.sum([*part.values(), np.zeros(n)], axis=0)
-
-
-def _named(state: str, part: Mapping[str, np.ndarray]) -> list[str]:
-    return [f"{state}': {term}" for term in part]
 
 
 def _difference(known: Mapping[str, np.ndarray], first: str, second: str) -> np.ndarray | None:
@@ -264,9 +208,10 @@ def _difference(known: Mapping[str, np.ndarray], first: str, second: str) -> np.
 class TermRole:
     """One term of the model.
 
-    process: what the term stands for in the balance; empty if the balance has no such term. alone:
-    the coefficient with which it would exchange as much as the record, if it did so alone; NaN if
-    the record does not say. without: free run of the model refined without the term, and without
+    process: what the term stands for in the balance; empty if the model was not found under roles.
+    coef: in the process, or in the equation of the state. counterpart: the coefficient by least
+    squares of the recorded process on all of the model's terms for it, with fit_r2; NaN if the
+    record does not give it. without: free run of the model refined without the term, and without
     those that share its coefficient; None if it cannot be refined.
     """
 
@@ -274,7 +219,8 @@ class TermRole:
     term: str
     coef: float
     process: str
-    alone: float
+    counterpart: float
+    fit_r2: float
     without: FreeRun | None
 
 
@@ -296,7 +242,14 @@ ROLES: Metrics[TermRole] = [
     Metric("term", lambda role: role.term, View.SHOWN),
     Metric("coefficient", lambda role: role.coef, View.SHOWN),
     Metric("process", lambda role: role.process, View.SHOWN),
-    Metric("alone", lambda role: role.alone, View.SHOWN, "if alone"),
+    Metric("counterpart", lambda role: role.counterpart, View.SHOWN, "by the record"),
+    Metric(
+        "ratio",
+        lambda role: role.coef / role.counterpart if role.counterpart else np.nan,
+        View.SHOWN,
+        format="{:.2f}",
+    ),
+    Metric("fit_r2", lambda role: role.fit_r2, View.SHOWN, "its R2", "{:.3f}"),
     *(metric.of(lambda role: role.without, "without_{}") for metric in WITHOUT),
 ]
 
@@ -305,7 +258,8 @@ ROLES: Metrics[TermRole] = [
 class ModelBalance:
     """A living model beside the balance of its zone.
 
-    processes: none if the model is not of products of n_i and n_n. terms: each left out in turn.
+    processes: none if the model was not found under roles of n_i and n_n. terms: each left out in
+    turn.
     """
 
     processes: Sequence[ComparedProcess]
@@ -336,10 +290,10 @@ class ModelBalance:
             blocks.append(Table(rows, title="what is exchanged, in record and model", note=NOTE))
         rows = ResultTable(self.terms, ROLES).screen()
         blocks.append(Table(rows, title="each term by its process, and left out"))
-        if any(np.isfinite(each.alone) for each in self.terms):
+        if any(np.isfinite(each.counterpart) for each in self.terms):
             blocks.append(Text(
-                "If alone: the coefficient with which the term would exchange as much as the "
-                "record, in the mean, if no other term did."
+                "By the record: the coefficients of the same terms by least squares of the "
+                "recorded process on them, with its R2 at each instant."
             ))  # fmt: skip
         return Section(
             f"{name}: what the terms mean", [*blocks, *pictures(self.figures(name))], level=3
@@ -373,43 +327,45 @@ def model_balance(
     is called "". sizes: length of each of several zones. period_s: of the model's cycle, for the
     figure.
     """
-    balance = balances.get("")
     support = {state: list(model.terms(state)) for state in model.states}
     held_to = held_to or constraint(model.library, support)
-    ours = balance is not None and set(model.states) == set(model.library.variables)
-    ours = ours and set(model.states) == {IONS, NEUTRALS} and not model.library.functions
-    known = recorded_rates(balance, data) if ours and balance is not None else {}
-    processes = compared_processes(model, data, balance) if ours and balance is not None else []
-    if sizes and balances and held_to is not None and held_to.processes:
-        processes = zone_processes(model, held_to, data, balances, sizes)
+    processes: list[ComparedProcess] = []
+    named = {state.partition("@")[0] for state in model.states}
+    if balances and held_to.processes and named == {IONS, NEUTRALS}:
+        processes = compared_processes(model, held_to, data, balances, sizes)
     window, left_out = two_periods(train), {}
     free = range(len(held_to.free))
     for k in count_pieces(progress, free, "coefficient", "models without a term"):
         left_out[k] = _without(model, held_to, k, train, held, bounds, progress, window=window)
+    by_place = {place: k for k, place in enumerate(held_to.coefficients)}
+
+    def without(place: Place) -> FreeRun | None:
+        follows = np.flatnonzero(held_to.C[by_place[place]])
+        return left_out[int(follows[0])] if follows.size else None
+
     roles = []
-    for row, (state, term) in enumerate(held_to.coefficients):
-        coef = model.terms(state).get(term, 0.0)
-        follows = np.flatnonzero(held_to.C[row])
-        process, alone = _alone(model, data, state, term, known) if ours else ("", np.nan)
-        if sizes and processes:
-            ends = (_ends(each) for each in held_to.processes if (state, term) in each.factors)
-            process = "; ".join(_zone_words(*each) for each in ends)
-        run = left_out[int(follows[0])] if follows.size else None
-        roles.append(TermRole(state, term, coef, process, alone, run))
+    for each in processes:
+        for term, coef in each.coef.items():
+            place = next(_places(held_to, each.name, term))
+            beside = each.counterpart.get(term, np.nan), each.fit_r2
+            roles.append(TermRole(place[0], term, coef, each.name, *beside, without(place)))
+    if not processes:
+        for state, term in held_to.coefficients:
+            coef = model.terms(state).get(term, 0.0)
+            run = without((state, term))
+            roles.append(TermRole(state, term, coef, "", np.nan, np.nan, run))
     return ModelBalance(processes, roles, data, period_s)
 
 
-def _alone(
-    model: SparseModel, data: Trajectory, state: str, term: str, known: Mapping[str, np.ndarray]
-) -> tuple[str, float]:
-    """A term's process in words, and the coefficient that would exchange as much alone."""
-    coef = model.terms(state).get(term, 0.0)
-    names, words = PLACES.get((state, _kind(term), coef > 0.0), ((), ""))
-    if not names or not set(names) <= set(known):
-        return words, np.nan
-    column = model.library.evaluate(data.columns(model.library.variables))
-    mean = float(column[:, model.library.index(term)].mean())
-    return words, np.copysign(sum(float(known[name].mean()) for name in names) / mean, coef)
+def _places(held_to: Constraint, name: str, term: str) -> Iterator[Place]:
+    """Where a process of this name and term stands in the equations."""
+    every = [*held_to.processes, *held_to.known]
+    ends = {_ends(process) for process in every}
+    for process in every:
+        giver, taker = _ends(process)
+        words = _zone_words(giver, taker, gross=(taker, giver) in ends)
+        if words == name and process.term == term:
+            yield from process.factors
 
 
 def _without(

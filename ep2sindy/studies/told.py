@@ -63,3 +63,8 @@ def recorded_rates(balance: xr.Dataset, data: Trajectory) -> dict[str, np.ndarra
     """Terms of the balance at the samples of the trajectory."""
     there = np.isin(balance["time"].values, data.t)
     return {str(name): balance[name].values[there] for name in balance.data_vars}
+
+
+def is_constant(rate: np.ndarray) -> bool:
+    """Whether a rate varies by no more than rounding, so that no R2 can be given."""
+    return bool(np.ptp(rate) <= 1e-6 * np.abs(rate).max())
