@@ -298,3 +298,23 @@ def test_what_attracts_outdoes_a_neutral_cycle_as_an_equal_or_by_its_fit():
     assert not confirmed(1, share=1.0, waveform=0.08, loss=2.0).outdoes(resting)
     assert not confirmed(1, share=1.0, n_free=5, loss=0.96).outdoes(resting)
     assert confirmed(1, share=1.0, n_free=5, loss=0.94).outdoes(resting)
+
+
+def test_the_other_systems_that_live_are_kept() -> None:
+    """Other terms of van der Pol's equations live on its cycle, too."""
+    run = ep.systems.van_der_pol().trajectory(noise=0.05, rng=0)
+    library = ep.polynomial(["x", "v"] if "v" in run.state_names else run.state_names, degree=3)
+    search = ep.BestSubset(max_terms=4, n_best=3)
+    found = ep.discover(
+        run, library, ep.Regression(search=search, selection=ep.FreeRunScore(), depth=3)
+    )
+    size = int((found.model.coef != 0.0).sum())
+    ours = {state: tuple(found.model.terms(state)) for state in found.model.states}
+    for other in found.others:
+        assert sum(map(len, other.terms.values())) == size
+        assert other.terms != ours
+        assert other.deviation <= 1.0
+    assert [o.waveform for o in found.others] == sorted(o.waveform for o in found.others)
+    again = ep.Discovery.from_json(found.to_json())
+    assert [each.terms for each in again.others] == [each.terms for each in found.others]
+    assert found.others

@@ -29,6 +29,7 @@ from ep2sindy.regression.whitening import NEGLIGIBLE, whitened_rows
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.rule import (
     Decision,
+    OtherSystem,
     Selection,
     SystemSelection,
     best_first,
@@ -108,7 +109,8 @@ class Choice:
     refinement. note: how the rule decided; else empty. left: for each state, the residuals of the
     final fit on rows whose noise is known; None if the model was not judged by rows. n_free: for
     each state named by a relation that holds in the model, the number of free coefficients of its
-    equation. constraint: that the coefficients obey; None if they are all free.
+    equation. constraint: that the coefficients obey; None if they are all free. others: systems of
+    the same size that would do as well.
     """
 
     fronts: Sequence[ParetoFront]
@@ -118,6 +120,7 @@ class Choice:
     left: Mapping[str, LeftOver] | None = None
     n_free: Mapping[str, int] = field(default_factory=dict)
     constraint: Constraint | None = None
+    others: Sequence[OtherSystem] = ()
 
 
 def choose(
@@ -189,7 +192,8 @@ def choice_of(
     best = [front.best for front in scored]
     held = decision.constraint
     is_tied = held is not None and len(held.free) < len(held.coefficients)
-    return Choice(scored, best, model, decision.note, constraint=held if is_tied else None)
+    tied = held if is_tied else None
+    return Choice(scored, best, model, decision.note, constraint=tied, others=decision.others)
 
 
 def noise_test(

@@ -86,6 +86,7 @@ def _discovery(
         remarks=found.remarks,
         estimate=found.estimate,
         constraint=choice.constraint,
+        others=choice.others,
     )
 
 

@@ -31,6 +31,7 @@ from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
 from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
+from ep2sindy.selection.rule import OtherSystem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,7 +43,17 @@ MAX_NOTES = 6  # shown in the repr
 # What a file may hold beside the values that configs may name.
 STORED = {
     kind.__name__: kind
-    for kind in (Ambiguity, Candidate, Cloud, Constraint, LeftOver, NoiseTest, ParetoFront, Process)
+    for kind in (
+        Ambiguity,
+        Candidate,
+        Cloud,
+        Constraint,
+        LeftOver,
+        NoiseTest,
+        OtherSystem,
+        ParetoFront,
+        Process,
+    )
 }
 
 
@@ -59,7 +70,8 @@ class Discovery:
     the residuals exceed the noise; else empty. remarks: sentences on where the samples deviate from
     the assumptions (`Estimate.remarks`). estimate: of states and coefficients together, after a
     trajectory search. constraint: that the model's coefficients obey under relations or roles, to
-    be handed to `refine`; None without.
+    be handed to `refine`; None without. others: of a rule that runs whole systems, those of as many
+    free coefficients that live as well.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.discover(run)
@@ -79,6 +91,7 @@ class Discovery:
     remarks: Sequence[str] = ()
     estimate: Estimate | None = field(default=None, repr=False)
     constraint: Constraint | None = field(default=None, repr=False)
+    others: Sequence[OtherSystem] = field(default=(), repr=False)
 
     @property
     def scores(self) -> dict[str, Float[np.ndarray, " _candidates"]]:
@@ -207,6 +220,7 @@ class Discovery:
 # Fields of a Discovery that are stored beside the model.
 _PARTS = (
     "fronts", "chosen", "method", "ambiguities", "noise_test", "note", "remarks", "constraint",
+    "others",
 )  # fmt: skip
 
 
@@ -272,6 +286,8 @@ def _check_parts(found: Discovery) -> None:
         raise ValueError("noise_test or constraint of another kind")
     if not all(isinstance(each, Ambiguity) for each in found.ambiguities):
         raise ValueError("ambiguities of another kind")
+    if not all(isinstance(each, OtherSystem) for each in found.others):
+        raise ValueError("others of another kind")
     if not all(isinstance(text, str) for text in (found.note, *found.remarks)):
         raise ValueError("a note and remarks that are no texts")
     if {*found.fronts, *found.chosen} != set(found.model.states):

@@ -37,12 +37,15 @@ from ep2sindy.selection.systems import (
     Records,
     Stretch,
     Systems,
+    Trial,
     TrialSystem,
     budget,
     combined,
     demands_note,
     folds_of,
+    others_of,
     records_of,
+    simplest_of_equals,
 )
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.spectrum import samples_in_periods, steps_in
@@ -66,9 +69,6 @@ DEARER = 1
 # Largest ratio of the waveform errors of two systems that count as equals.
 ALIKE = 1.5
 
-# Largest ratio of the waveform errors of two systems of which the one of lower order comes first.
-SAME = 1.1
-
 # Smallest modulus of a repelling cycle's multipliers; a neutral cycle's is one but for errors.
 PUSH = 1.003
 
@@ -83,21 +83,6 @@ MAX_DRIFT = 1.1
 # Periods of a trial run: enough for a transient to die out. A model without inputs continues
 # beyond the end of a short stretch.
 MIN_RUN, MAX_RUN = 16.0, 30.0
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """Results of a system on the folds that it was not fitted to, the worst over all folds.
-
-    error: largest deviation from the data's cycle, in units of its bound; a system with one or less
-    lives. waveform: largest error of the waveform. loss: on the windows that the system was refined
-    on.
-    """
-
-    system: TrialSystem
-    error: float
-    waveform: float
-    loss: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +239,8 @@ class FreeRunScore:
         winner, model, note = self._winner(records, cycles, trials, progress)
         limit = max(1.0, float(errors[winner]))
         scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
-        return Decision(scores, model, f"{note}{found.left_out}", systems[winner].constraint)
+        note = f"{note}{found.left_out}"
+        return Decision(scores, model, note, systems[winner].constraint, others_of(trials, winner))
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
         """Number of samples in a window."""
@@ -357,7 +343,7 @@ class FreeRunScore:
             k for k, t in enumerate(trials) if t.error <= 1.0 and (t.loss < FLOOR or not exact)
         ]
         living.sort(key=lambda k: self._rank(trials[k]))
-        living = _simplest_of_equals(living, trials)
+        living = simplest_of_equals(living, trials)
         by_error = sorted(range(len(trials)), key=lambda k: (trials[k].error, trials[k].loss))
         window = self._window(records, cycles)
         found: list[Confirmed] = []
@@ -403,21 +389,6 @@ class FreeRunScore:
         run = free_run(model, longest, initial=start, bounds=self.bounds, judged=self.judged)
         share, repels = _attraction(run, cycles) if run.verdict is Verdict.LIVES else (0.0, False)
         return Confirmed(number, trial, run, share, trial.system.broken(model), repels)
-
-
-def _simplest_of_equals(ranked: Sequence[int], trials: Sequence[Trial]) -> list[int]:
-    """The ranked systems; of those as good as the best one left, the lowest order comes first."""
-    left, found = list(ranked), []
-    while left:
-        best = trials[left[0]]
-        size, reach = best.system.n_free, SAME * best.waveform
-        equals = [
-            k for k in left if trials[k].system.n_free == size and trials[k].waveform <= reach
-        ]
-        simplest = min(equals, key=lambda k: trials[k].system.order)
-        found.append(simplest)
-        left.remove(simplest)
-    return found
 
 
 def _attraction(run: FreeRun, cycles: Sequence[Cycle]) -> tuple[float, bool]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import islice
@@ -41,19 +41,34 @@ class Selection(Protocol):
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]: ...
 
 
+@dataclass(frozen=True)
+class OtherSystem:
+    """A system of as many free coefficients as the selected one, which lives too.
+
+    terms: state -> the terms of its equation. deviation: the largest over the folds that it was not
+    fitted to, in units of the bounds. waveform: its largest error there, in standard deviations.
+    """
+
+    terms: Mapping[str, tuple[str, ...]]
+    deviation: float
+    waveform: float
+
+
 @dataclass(frozen=True, eq=False)
 class Decision:
     """Result of a rule that judges whole systems of equations and refines the coefficients.
 
     scores: for each front, one per candidate, the winner's the least. model: the winner refined,
     with the covariance of its coefficients. note: how it was decided, in words. constraint: what
-    the winner's coefficients obey; None if the rule does not say.
+    the winner's coefficients obey; None if the rule does not say. others: systems of its size that
+    would do as well, the best first.
     """
 
     scores: Sequence[Float[np.ndarray, " _candidates"]]
     model: SparseModel
     note: str
     constraint: Constraint | None = None
+    others: Sequence[OtherSystem] = ()
 
 
 @runtime_checkable

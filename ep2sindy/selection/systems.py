@@ -17,11 +17,14 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.regression.front import ParetoFront
-from ep2sindy.selection.rule import combinations, left_out, support_of
+from ep2sindy.selection.rule import OtherSystem, combinations, left_out, support_of
 from ep2sindy.signals.kalman import KalmanSmoother
 
 # Most time steps, over windows and systems, of one refinement batch: more would not fit the cache.
 BATCH_STEPS = 6000
+
+# Largest ratio of the waveform errors of two systems of which the one of lower order comes first.
+SAME = 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +85,21 @@ class TrialSystem:
             seed=seed,
         )
         return found.model
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Results of a system on the folds that it was not fitted to, the worst over all folds.
+
+    error: largest deviation from the data's cycle, in units of its bound; a system with one or less
+    lives. waveform: largest error of the waveform. loss: on the windows that the system was refined
+    on.
+    """
+
+    system: TrialSystem
+    error: float
+    waveform: float
+    loss: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,4 +284,34 @@ def folds_of(runs: Sequence[Trajectory], n_folds: int) -> list[Fold]:
             held.append(Stretch(run, first, last))
             fitted += [Stretch(run, 0, first), Stretch(run, last, length)]
         found.append(Fold(held, [part for part in fitted if part.stop - part.start >= MIN_SAMPLES]))
+    return found
+
+
+def others_of(trials: Sequence[Trial], winner: int) -> list[OtherSystem]:
+    """The other systems of the winner's size that live in every fold, the best waveform first."""
+    size = trials[winner].system.n_free
+    alike = [t for k, t in enumerate(trials) if k != winner and t.system.n_free == size]
+    return [
+        OtherSystem(
+            {s: tuple(t.system.model.terms(s)) for s in t.system.model.states},
+            t.error,
+            t.waveform,
+        )
+        for t in sorted(alike, key=lambda t: t.waveform)
+        if t.error <= 1.0
+    ]
+
+
+def simplest_of_equals(ranked: Sequence[int], trials: Sequence[Trial]) -> list[int]:
+    """The ranked systems; of those as good as the best one left, the lowest order comes first."""
+    left, found = list(ranked), []
+    while left:
+        best = trials[left[0]]
+        size, reach = best.system.n_free, SAME * best.waveform
+        equals = [
+            k for k in left if trials[k].system.n_free == size and trials[k].waveform <= reach
+        ]
+        simplest = min(equals, key=lambda k: trials[k].system.order)
+        found.append(simplest)
+        left.remove(simplest)
     return found

@@ -36,7 +36,7 @@ from ep2sindy.regression.searches import Search
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.rule import SystemSelection
+from ep2sindy.selection.rule import OtherSystem, SystemSelection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.spectrum import samples_in_periods
@@ -58,6 +58,12 @@ CAPTIONS = {
     "starts.",
     "waveform": WAVEFORM,
 }
+MOST_OTHERS = 12  # shown on the page
+OTHERS_NOTE = (
+    "Deviation: the largest of frequency, amplitudes and waveform over the parts of the record "
+    "that a model was not fitted to, in units of the bounds of a model that lives. These models "
+    "follow this record about as well: what they have in common is what it tells."
+)
 NO_SIZES: Mapping[str, float] = MappingProxyType({})
 
 
@@ -198,8 +204,19 @@ class Living:
             Table(rows, title=run_title(self.run)),
             *(Text(text) for text in (_note(self), _by_derivatives(self))),
             *pictures(self.figures(name)),
+            *self._others(),
         ]
         return Section(f"{name}: a model that {_ending(self)}", blocks)
+
+    def _others(self) -> list[Block]:
+        """The other systems of this size that live: whether the found one is the law."""
+        others = self.discovery.others
+        if not others:
+            return []
+        table = ResultTable(others[:MOST_OTHERS], OTHERS).screen()
+        more = f"; the first {MOST_OTHERS} of {len(others)}" if len(others) > MOST_OTHERS else ""
+        title = f"other models of as many coefficients that live where not fitted{more}"
+        return [Table(table, title=title, note=OTHERS_NOTE, page_only=True)]
 
     def figures(self, name: str) -> dict[str, Captioned]:
         """Figures by name; those of a cycle only if there is one."""
@@ -255,7 +272,15 @@ LIVING: Metrics[Living] = [
     Metric("text", lambda found: _text(found), View.JSON),
     Metric("proved", lambda found: consequences(found.model), View.JSON),
     Metric("selection", lambda found: found.discovery.note, View.JSON),
+    Metric(
+        "others", lambda found: [facts(each, OTHERS) for each in found.discovery.others], View.JSON
+    ),
     Metric("by_derivatives", lambda found: facts(found.by_derivatives, REFINED), View.JSON),
+]
+OTHERS: Metrics[OtherSystem] = [
+    Metric("terms", lambda each: _structure(each), View.SHOWN),
+    Metric("deviation", lambda each: each.deviation, View.SHOWN, format="{:.2f}"),
+    Metric("waveform_error", lambda each: each.waveform, View.SHOWN, format="{:.3f}"),
 ]
 REFINED: Metrics[Refined] = [
     Metric("status", lambda refined: refined.status),
@@ -269,6 +294,8 @@ def living_tables(living: Mapping[str, Living]) -> dict[str, pd.DataFrame]:
         return {}
     found = {"living": ResultTable(living, LIVING).csv("library")}
     for name, each in living.items():
+        if each.discovery.others:
+            found[f"living_others_{name}"] = ResultTable(each.discovery.others, OTHERS).csv()
         found |= rollout_tables(each.held, {f"{name}_living": each.run})
     models = {name: each.model for name, each in living.items()}
     return found | {"coefficients_living": coefficients(models, heading="library")}
@@ -278,6 +305,11 @@ def _text(living: Living) -> str:
     """The equations in SI, as they are printed."""
     sums = grouped(living.model, living.discovery.constraint)
     return "\n".join(equation_text(state, terms) for state, terms in sums.items())
+
+
+def _structure(system: OtherSystem) -> str:
+    """Terms of every equation."""
+    return "; ".join(f"{state}': {', '.join(terms)}" for state, terms in system.terms.items())
 
 
 def _terms(model: SparseModel) -> dict[str, list[str]]:
