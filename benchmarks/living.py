@@ -345,6 +345,21 @@ def print_points(
     print(line("all", everything))
 
 
+def print_law(search: Callable) -> None:
+    """Six operating points, terms that are given: the worst of three splits, and coefficients."""
+    print(f"\n{search.__doc__} Coefficients over those of the record: medians of the splits")
+    for label in POINTS:
+        whole, ratios, cases = record(label), [], []
+        for split, seed in ONCE:
+            cases.append(case(*parts(whole.run, split), whole, seed=seed, search=search))
+            found = search(parts(whole.run, split)[0], whole, seed=seed)
+            compared = whole.processes(found.model, found.constraint)
+            pairs = [(p.coef[term], p.counterpart[term]) for p in compared for term in p.coef]
+            ratios.append([model / recorded for model, recorded in pairs])
+        medians = ", ".join(f"{ratio:.2f}" for ratio in np.median(ratios, axis=0))
+        print("\n".join([line(label, cases), balances(cases), f"    {medians}"]), flush=True)
+
+
 def print_several(n_zones: int, draws: Sequence[tuple[str, int]]) -> None:
     """Six operating points, the channel cut into zones of equal length."""
     print(f"\n{n_zones} zones, equations that conserve: median / worst of {len(draws)} draws")
@@ -425,6 +440,8 @@ def main() -> None:
     """Print every table, or those that are named."""
     tables: dict[str, Callable[[], None]] = {
         "points": print_points,
+        "law": lambda: print_law(law),
+        "law_told": lambda: print_law(law_told),
         "former": lambda: print_points("former", draws=ONCE),
         "free": lambda: print_points(search=free),
         "zones": print_zones,

@@ -1,5 +1,6 @@
 """Roles of terms: exact constraints, a search that conserves, mass action, and bad input."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -115,6 +116,8 @@ def test_mass_action_takes_terms_that_contain_what_they_lower():
     assert [term for role, term in found if role == "n_i to n_n"] == ["n_i", "n_i^2", "n_i*n_n"]
     named = replace(MASS_ACTION, outflow={"n_i": ["n_n*n_i", "n_n"]})
     assert [p.term for p in named.processes(LIBRARY, STATES) if p.role == "n_i out"] == ["n_i*n_n"]
+    births = replace(MASS_ACTION, inflow={"n_n": ["n_n", "1"]})
+    assert [p.term for p in births.processes(LIBRARY, STATES) if p.role == "n_n in"] == ["n_n", "1"]
     with pytest.raises(ValueError, match="no term of the library may play the role 'n_n out'"):
         MASS_ACTION.processes(ep.polynomial(["n_i"], degree=2), STATES)
 
@@ -170,7 +173,7 @@ def test_what_is_told_is_kept_beside_what_is_found(record):
     [
         (lambda: ep.Roles(exchange=[("x", "x")]), "joins two states"),
         (lambda: ep.Roles(exchange=["xy"]), "joins two states"),
-        (lambda: ep.Roles(inflow={"x": "some"}), "must be a number, 'known', 'free'"),
+        (lambda: ep.Roles(inflow={"x": "some"}), "must be a number in SI per second, a list"),
         (lambda: ep.Roles(outflow={"x": 3.0}), "a list of terms, 'known', 'free'"),
         (lambda: ep.Roles(outflow={"x": {"x": "fast"}}), "terms with their coefficients in SI"),
         (lambda: ep.Roles(exchange=[("x", "y"), ("x", "y")]), r"\['x to y'\] came twice"),
@@ -252,3 +255,32 @@ def test_a_known_equation_is_kept_and_its_terms_stand_in_no_other() -> None:
 def test_known_equations_that_make_no_sense_are_refused(equations, message) -> None:
     with pytest.raises(ValueError, match=message):
         ep.Roles(outflow=["n_i"], equations=equations).processes(LIBRARY, STATES)
+
+
+def test_the_default_search_keeps_roles():
+    """Prey that are born, and eaten by those whom they feed: two equations, three processes."""
+    run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
+    library = ep.polynomial(["x", "y"], degree=2)
+    roles = ep.Roles(exchange=[("x", "y")], outflow=["y"], inflow={"x": ["x"]}, nonnegative=True)
+    found = ep.discover(run, library, roles=roles)
+    assert {(p.role, p.term) for p in found.constraint.processes} == {
+        ("x to y", "x*y"), ("y out", "y"), ("x in", "x")
+    }  # fmt: skip
+    eaten = -found.model.terms("x")["x*y"]
+    assert found.model.terms("y")["x*y"] == pytest.approx(eaten, rel=1e-14)
+    assert re.search(r"x' = 0\.66.* x - 1 .* x y \[", repr(found))
+    turned = replace(run, states=run.states * [1.0, -1.0])
+    with pytest.raises(ValueError, match="nonnegative roles need states that are concentrations"):
+        ep.discover(turned, library, roles=roles)
+
+
+def test_the_default_search_keeps_what_is_known():
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    library = ep.polynomial(["x", "y"], degree=2)
+    roles = ep.Roles(
+        exchange=[("x", "y", ["x*y"])], outflow={"y": {"y": 1 / 3}}, inflow={"x": ["x"]},
+        nonnegative=True,
+    )  # fmt: skip
+    found = ep.estimate(run, library, roles=roles)
+    assert found.model.terms("y")["y"] == pytest.approx(-1 / 3, rel=1e-12)
+    assert [(p.role, p.term) for p in found.constraint.known] == [("y out", "y")]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import compress, pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -63,7 +63,8 @@ class Roles:
     A third entry of an exchange, and the values of outflow, if it is a mapping, say how: "free", as
     above; a list of the terms that may; a mapping term -> coefficient in SI, where it is known; or
     "known" and "known or free", for which an experiment puts what the record itself gives. An
-    inflow is a number in SI per second or one of these words.
+    inflow is a number in SI per second, one of these words, or a list of terms, such as births by
+    the state itself.
     sizes: state -> length or volume that it is an average over; what leaves a small place changes a
     large one by less. Absent ones are one. equations: state -> terms with their coefficients in SI,
     where the equation is known and nothing is to be found; the library need not hold these terms.
@@ -115,7 +116,7 @@ class Roles:
         ways = leaving if isinstance(leaving, Mapping) else dict.fromkeys(leaving, FREE)
         found += [Role(state, "", how) for state, how in ways.items()]
         for state, how in self.inflow.items():
-            is_number = not isinstance(how, str | bool | Mapping)
+            is_number = not isinstance(how, str | bool | Mapping | Sequence)
             found.append(Role("", state, {"1": float(how)} if is_number else how))
         return found
 
@@ -208,7 +209,8 @@ class Roles:
         were one.
         Raises ValueError for terms, which are of one zone's equations.
         """
-        if any(role.how != FREE for role in self._roles if role.giver):
+        named = [role.giver or isinstance(role.how, list | tuple) for role in self._roles]
+        if any(role.how != FREE for role in compress(self._roles, named)):
             raise ValueError(
                 "roles in several zones take terms by neighbourhood: give exchanges as (from, to), "
                 f"and outflow as a list of states; {self} came"
@@ -271,7 +273,8 @@ class Roles:
         """The processes by which a role may be played."""
         giver, taker, how = role
         if not giver:
-            yield self._process(role, "1")
+            names = ["1"] if how == FREE else [library.names[library.index(term)] for term in how]
+            yield from (self._process(role, term) for term in names)
             return
         terms = [name for name in library.names if name != "1"] if how == FREE else how
         terms = [library.names[library.index(term)] for term in terms]
@@ -342,11 +345,12 @@ def _check_how(role: Role) -> None:
         values = list(how.values())
         if all(not isinstance(v, str | bool) and np.isfinite(v) for v in values) and values:
             return
-    elif role.giver and isinstance(how, Sequence):
+    elif isinstance(how, Sequence):
         return
-    ways = "terms with their coefficients in SI, a list of terms" if role.giver else "a number"
+    ways = "terms with their coefficients in SI" if role.giver else "a number in SI per second"
     raise ValueError(
-        f"how {role.name!r} is played must be {ways}, {KNOWN!r}, {FREE!r} or {EITHER!r}: "
+        f"how {role.name!r} is played must be {ways}, a list of terms, {KNOWN!r}, {FREE!r} or "
+        f"{EITHER!r}: "
         f"{how!r} came"
     )
 

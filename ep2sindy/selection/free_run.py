@@ -24,7 +24,7 @@ from ep2sindy.model.comparison import (
 from ep2sindy.model.free_run import FreeRun, columns_of, free_run
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.stability import limit_cycle, share_reaching
+from ep2sindy.model.stability import LEAST_WAIT, limit_cycle, share_reaching
 from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
@@ -406,7 +406,8 @@ def _attraction(run: FreeRun, cycles: Sequence[Cycle]) -> tuple[float, bool]:
     largest = cycle.largest_multiplier
     if largest > PULL:
         return 0.0, largest > PUSH
-    share = share_reaching(run.model, cycle, n_starts=N_REACHING)
+    # Within forty periods: of two cycles that are reached, the one that is reached sooner is better.
+    share = share_reaching(run.model, cycle, n_starts=N_REACHING, n_periods=LEAST_WAIT)
     return max(share, 0.5 / N_REACHING), False
 
 
