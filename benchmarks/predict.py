@@ -37,7 +37,7 @@ from ep2sindy.operating.records import (
 
 CONFIG = Path(__file__).parents[1] / "conf" / "exp" / "predict.yaml"
 MODELS: dict[str, Any] = yaml.safe_load(CONFIG.read_text("utf-8"))["models"]
-BEST, OF_FEW = "leaving", "conserving"  # the study's choice, here and of a few points
+BEST, OF_FEW = "leaving", "law"  # the study's choice, here and of a few points
 MODELS["leaving, inflow free"] = {**MODELS[BEST], "known": {}}
 MODELS["leaving, all free"] = {"terms": MODELS[BEST]["terms"]}
 DOWNSTREAM = {"terms": {"n_i": ["n_i", "n_n", "n_i*n_n"], "n_n": ["1", "n_i", "n_n"]}}

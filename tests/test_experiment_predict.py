@@ -47,7 +47,7 @@ def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text())
     (name,) = summary["branches"]
     branch = summary["branches"][name]
-    assert branch["model"] == "conserving"
+    assert branch["model"] == "law"
     assert branch["structure"]["n_i"] == ["n_i", "n_n", "n_i*n_n", "n_i^2*n_n"]
     assert branch["exact"][0] == "n_i: n_n == -1 * n_n: n_n"
     assert branch["exact"][3] == "n_n: 1 == 4.58e+22 * mdot_mg_s"

@@ -406,7 +406,7 @@ def _attraction(run: FreeRun, cycles: Sequence[Cycle]) -> tuple[float, bool]:
     largest = cycle.largest_multiplier
     if largest > PULL:
         return 0.0, largest > PUSH
-    # Within forty periods: of two cycles that are reached, the one that is reached sooner is better.
+    # Within forty periods: of cycles that are reached, one that is reached sooner is better.
     share = share_reaching(run.model, cycle, n_starts=N_REACHING, n_periods=LEAST_WAIT)
     return max(share, 0.5 / N_REACHING), False
 
