@@ -27,7 +27,7 @@ from ep2sindy.estimation.problem import (
 )
 from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, error_variances, likely_errors
 from ep2sindy.model.model import SparseModel
-from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
+from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.signals.spectrum import dominant_frequency
 
@@ -186,14 +186,14 @@ def track(
     run: Trajectory,
     *,
     measured: Sequence[str] | None = None,
-    progress: Progress = SILENT,
+    progress: bool | Progress = False,
 ) -> Tracker:
     """Estimate with what errors a model follows a record, usually the one that it was fitted to.
 
     run: has the measured states and the inputs of the model. measured: states whose samples count;
     others that the run has were made from them. None means all that it has. Every state may be
     pushed, also one whose equation is known to hold, such as x' = v: the others' errors come in
-    through it.
+    through it. progress: True shows a bar.
     Raises ValueError for a run without an input or of under five samples, or measured states that
     the model lacks.
     """
@@ -225,7 +225,8 @@ def track(
         per_period=_per_period(own, names),
         noise=_noise_of(problem, rough, 0.1 * rough),
     )
-    for _ in count_pieces(progress, range(N_PASSES), "pass", "errors of the model, for forecasts"):
+    watch = as_progress(progress)
+    for _ in count_pieces(watch, range(N_PASSES), "pass", "errors of the model, for forecasts"):
         tracker, paths = _with_likely_noise(tracker, paths)
     return tracker
 
