@@ -60,9 +60,9 @@ CAPTIONS = {
 }
 MOST_OTHERS = 12  # shown on the page
 OTHERS_NOTE = (
-    "Deviation: the largest of frequency, amplitudes and waveform over the parts of the record "
-    "that a model was not fitted to, in units of the bounds of a model that lives. These models "
-    "follow this record about as well: what they have in common is what it tells."
+    "Largest errors over the parts of the record that a model was not fitted to; deviation: the "
+    "largest of the three in units of the bounds of a model that lives. These models follow this "
+    "record about as well: what they have in common is what it tells."
 )
 NO_SIZES: Mapping[str, float] = MappingProxyType({})
 
@@ -279,8 +279,10 @@ LIVING: Metrics[Living] = [
 ]
 OTHERS: Metrics[OtherSystem] = [
     Metric("terms", lambda each: _structure(each), View.SHOWN),
+    Metric("f_error", lambda each: each.f_error, View.SHOWN, "frequency", percent(2)),
+    Metric("amplitude_error", lambda each: each.amplitude, View.SHOWN, "amplitude", percent(1)),
+    Metric("waveform_error", lambda each: each.waveform, View.SHOWN, "waveform", "{:.3f}"),
     Metric("deviation", lambda each: each.deviation, View.SHOWN, format="{:.2f}"),
-    Metric("waveform_error", lambda each: each.waveform, View.SHOWN, format="{:.3f}"),
 ]
 REFINED: Metrics[Refined] = [
     Metric("status", lambda refined: refined.status),
@@ -308,8 +310,8 @@ def _text(living: Living) -> str:
 
 
 def _structure(system: OtherSystem) -> str:
-    """Terms of every equation."""
-    return "; ".join(f"{state}': {', '.join(terms)}" for state, terms in system.terms.items())
+    """Terms of every role or equation."""
+    return "; ".join(f"{part}: {', '.join(terms)}" for part, terms in system.terms.items())
 
 
 def _terms(model: SparseModel) -> dict[str, list[str]]:
