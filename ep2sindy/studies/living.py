@@ -58,6 +58,11 @@ CAPTIONS = {
     "starts.",
     "waveform": WAVEFORM,
 }
+SPREAD = "spread over windows"  # of the coefficients: no knowledge of a rate
+SPREAD_NOTE = (
+    "Spread over windows: 95 % intervals by how the windows of the refinement differ; they do not "
+    "say how far off the model itself is."
+)
 MOST_OTHERS = 12  # shown on the page
 OTHERS_NOTE = (
     "Largest errors over the parts of the record that a model was not fitted to; deviation: the "
@@ -200,7 +205,7 @@ class Living:
         rows = ResultTable([self], LIVING).screen(by_state=True)
         blocks: list[Block] = [
             *self.equations(clock),
-            *interval_table(model, clock=clock),
+            *interval_table(model, clock=clock, words=SPREAD, note=SPREAD_NOTE),
             Table(rows, title=run_title(self.run)),
             *(Text(text) for text in (_note(self), _by_derivatives(self))),
             *pictures(self.figures(name)),
@@ -334,7 +339,10 @@ def _with_intervals(model: SparseModel) -> dict[str, dict[str, Any]]:
     known = intervals(model)
     return {
         state: {
-            term: {"value": value, "ci95": None if known is None else known[state][term]}
+            term: {
+                "value": value,
+                SPREAD.replace(" ", "_"): None if known is None else known[state][term],
+            }
             for term, value in model.terms(state).items()
         }
         for state in model.states
