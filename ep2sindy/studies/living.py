@@ -66,8 +66,8 @@ SPREAD_NOTE = (
 MOST_OTHERS = 12  # shown on the page
 OTHERS_NOTE = (
     "Largest errors over the parts of the record that a model was not fitted to; deviation: the "
-    "largest of the three in units of the bounds of a model that lives. These models follow this "
-    "record about as well: what they have in common is what it tells."
+    "largest of the three in units of the bounds of a model that lives. All stay within them: what "
+    "these models have in common is what the record tells."
 )
 NO_SIZES: Mapping[str, float] = MappingProxyType({})
 
