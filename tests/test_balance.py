@@ -182,10 +182,11 @@ def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exac
     beside = model_balance(
         model, held_to, data, *parts, {"": exact}, ep.FreeRunBounds(), period_s=5e-5
     )
-    roles = {(each.process.split(",")[0], each.term): each for each in beside.terms}
+    roles = {(each.part.split(",")[0], each.term): each for each in beside.terms}
     assert [each.term for each in beside.terms] == ["1", "n_i*n_n", "n_i", "n_n"]
     entering = roles["neutrals that enter", "1"]
-    assert entering.without is None  # known: it is not left out
+    assert entering.without is None
+    assert entering.verdict == "known"  # it is not left out
     assert entering.counterpart == pytest.approx(float(exact["supply"].mean()))
     without = roles["neutrals that leave", "n_n"].without
     assert without is not None
@@ -195,6 +196,31 @@ def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exac
     figure = beside.figures("simple")["balance_simple"].draw()
     drawn = [ax for ax in figure.axes if ax.get_visible()]
     assert len(drawn) == len([each for each in beside.processes if each.recorded is not None])
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_process_left_out_leaves_those_that_share_its_coefficient(data, exact, told) -> None:
+    """Of what ions lose by n_i, what leaves goes and what comes back stays, told or found."""
+    back = ("n_i to n_n", "n_i")
+    values = {("n_n to n_i", "n_i*n_n"): 5e-14, ("n_i out", "n_i"): 4e5, ("n_n out", "n_n"): 3e3}
+    roles = replace(ROLES, exchange=[("n_n", "n_i"), ("n_i", "n_n", {"n_i": 1e5})])
+    model, held_to = under(roles, values) if told else under(ROLES, values | {back: 1e5})
+    parts = split_in_time(data, 0.25)
+    beside = model_balance(
+        model, held_to, data, *parts, {"": exact}, ep.FreeRunBounds(), period_s=None
+    )
+    found = {(each.part.split(",")[0], each.term): each for each in beside.terms}
+    returned = found["ions that become neutrals", "n_i"]
+    assert returned.is_known == told
+    without = found["ions that leave", "n_i"].without
+    assert without is not None
+    kept = {state: without.model.terms(state) for state in STATES}
+    assert kept["n_n"]["n_i"] == -kept["n_i"]["n_i"]
+    if told:
+        assert (returned.verdict, kept["n_n"]["n_i"]) == ("known", 1e5)
+    else:
+        assert returned.without is not None
+        assert "n_i" not in returned.without.model.terms("n_n")
 
 
 def test_a_model_with_functions_has_no_processes(data: ep.Trajectory, exact: xr.Dataset) -> None:
@@ -208,4 +234,4 @@ def test_a_model_with_functions_has_no_processes(data: ep.Trajectory, exact: xr.
         model, None, data, *parts, {"": exact}, ep.FreeRunBounds(), period_s=None
     )
     assert not beside.processes
-    assert {each.process for each in beside.terms} == {""}
+    assert {each.part for each in beside.terms} == {*STATES}

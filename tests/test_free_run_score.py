@@ -11,7 +11,7 @@ import ep2sindy as ep
 from ep2sindy.library.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.selection.free_run import Confirmed, Trial
-from ep2sindy.selection.systems import folds_of
+from ep2sindy.selection.systems import folds_of, living_among, others_of
 
 PREY = replace(ep.lotka_volterra(), rate_Hz=5.0)  # 69 samples a period
 THRUSTER = [
@@ -272,7 +272,7 @@ def confirmed(
     held = SimpleNamespace(n_free=n_free)
     verdict = ep.Verdict.LIVES if lives else ep.Verdict.DIES_OUT
     run = SimpleNamespace(verdict=verdict, model=SimpleNamespace(inputs=()))
-    return Confirmed(number, Trial(held, 0.3, waveform, loss), run, share, broken, repels)
+    return Confirmed(number, Trial(held, 0.3, 0.0, 0.0, waveform, loss), run, share, broken, repels)
 
 
 @pytest.mark.parametrize(
@@ -300,6 +300,22 @@ def test_what_attracts_outdoes_a_neutral_cycle_as_an_equal_or_by_its_fit():
     assert confirmed(1, share=1.0, n_free=5, loss=0.94).outdoes(resting)
 
 
+def trial(name, *, n_free=4, error=0.3, waveform=0.05, loss=1.0):
+    """The trial of a system whose only term is its name."""
+    held = SimpleNamespace(n_free=n_free, parts={"x'": (name,)})
+    return Trial(held, error, 0.0, 0.0, waveform, loss)
+
+
+@pytest.mark.parametrize(("least", "names"), [(1e-2, ["c", "b", "e"]), (1e-9, ["e"])])
+def test_where_the_truth_is_in_the_library_no_other_counts_as_equal(least, names):
+    trials = [
+        trial("a", loss=least), trial("b"), trial("c", waveform=0.04), trial("d", n_free=5),
+        trial("e", loss=least, waveform=0.06), trial("f", error=1.1),
+    ]  # fmt: skip
+    found = others_of(trials, living_among(trials), 0)
+    assert [other.terms["x'"] for other in found] == [(name,) for name in names]
+
+
 def test_the_other_systems_that_live_are_kept() -> None:
     """Other terms of van der Pol's equations live on its cycle, too."""
     oscillator = replace(ep.systems.van_der_pol(), duration_s=120.0, rate_Hz=10.0)
@@ -310,11 +326,17 @@ def test_the_other_systems_that_live_are_kept() -> None:
         run, library, ep.Regression(search=search, selection=ep.FreeRunScore(), depth=3)
     )
     size = int((found.model.coef != 0.0).sum())
-    ours = {state: tuple(found.model.terms(state)) for state in found.model.states}
+    ours = {f"{state}'": tuple(found.model.terms(state)) for state in found.model.states}
     for other in found.others:
         assert sum(map(len, other.terms.values())) == size
         assert other.terms != ours
+        bounds = ep.FreeRunBounds()
         assert other.deviation <= 1.0
+        assert other.deviation == max(
+            other.f_error / bounds.frequency,
+            other.amplitude / bounds.amplitude,
+            other.waveform / bounds.waveform,
+        )
     assert [o.waveform for o in found.others] == sorted(o.waveform for o in found.others)
     again = ep.Discovery.from_json(found.to_json())
     assert [each.terms for each in again.others] == [each.terms for each in found.others]

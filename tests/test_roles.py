@@ -10,6 +10,7 @@ import ep2sindy as ep
 from ep2sindy.data.coerce import Task
 from ep2sindy.library.roles import constraint_of, process_values
 from ep2sindy.selection.conserving import conserving_systems
+from ep2sindy.selection.systems import TrialSystem
 
 STATES = ["n_i", "n_n"]
 LIBRARY = ep.polynomial(STATES, degree=2)
@@ -63,6 +64,21 @@ def test_processes_that_no_coefficients_tell_apart_make_no_system():
     spare = ep.Roles(outflow={"n_n": ["n_i"]}).processes(LIBRARY, STATES)[:1]
     assert constraint_of(LIBRARY, STATES, twice) is not None
     assert constraint_of(LIBRARY, STATES, [*twice, *spare]) is None
+
+
+def test_systems_of_the_same_terms_differ_by_their_roles():
+    """Ions leave by n_i or by n_i^2; the terms of both equations are the same."""
+    shared = [("n_n to n_i", term) for term in ("n_i*n_n", "n_i", "n_i^2")]
+    places, parts = [], []
+    for leaving in ("n_i", "n_i^2"):
+        held = constraint_of(LIBRARY, STATES, processes(*shared, ("n_i out", leaving)), [])
+        places.append(held.coefficients)
+        empty = ep.SparseModel(LIBRARY, STATES, np.zeros((len(LIBRARY), 2)))
+        parts.append(TrialSystem(empty, held).parts)
+    assert places[0] == places[1]
+    exchanged = ("n_i*n_n", "n_i", "n_i^2")
+    assert parts[0] == {"n_n to n_i": exchanged, "n_i out": ("n_i",)}
+    assert parts[1] == {"n_n to n_i": exchanged, "n_i out": ("n_i^2",)}
 
 
 @pytest.fixture(scope="module")

@@ -259,6 +259,25 @@ def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones,
     made = balances["exit"]["ionization"].values - balances["exit"]["returned"].values
     name = "exit: neutrals that become ions, less those given back"
     assert np.array_equal(found[name].recorded, made)
+    beside = model_record(found, balances, sizes)
+    for process in compared_processes(model, held, run, beside, sizes):
+        assert process.counterpart == pytest.approx(dict(process.coef), rel=1e-6)
+
+
+def model_record(found, balances, sizes) -> dict[str, xr.Dataset]:
+    """Balances of the zones `anode` and `exit` in which every process is the model's own."""
+    rate = {each.ends: each.modelled for each in found.values()}
+    share, made = sizes["anode"] / sizes["exit"], {}
+    for zone, balance in balances.items():
+        exchanged = rate[f"n_n@{zone}", f"n_i@{zone}"]
+        made[zone] = balance.assign(ionization=balance["returned"] + exchanged)
+        for state, key in (("n_i", "exit_i"), ("n_n", "exit_n")):
+            gone = rate[f"{state}@anode", f"{state}@exit"]
+            if zone == "exit":
+                gone = rate[f"{state}@exit", ""] - share * gone
+            made[zone][key] = ("time", gone)
+    made["anode"]["supply"] = ("time", rate["", "n_n@anode"])
+    return made
 
 
 def toy(output: Path) -> list[str]:

@@ -29,7 +29,6 @@ from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
-from ep2sindy.selection.criteria import FLOOR
 from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import MAX_ERROR, Decision, combination_scores
 from ep2sindy.selection.systems import (
@@ -43,6 +42,7 @@ from ep2sindy.selection.systems import (
     combined,
     demands_note,
     folds_of,
+    living_among,
     others_of,
     records_of,
     simplest_of_equals,
@@ -236,11 +236,13 @@ class FreeRunScore:
             )
         trials = self._trials(records, cycles, systems, progress)
         errors = np.array([trial.error for trial in trials])
-        winner, model, note = self._winner(records, cycles, trials, progress)
+        living = living_among(trials)
+        winner, model, note = self._winner(records, cycles, trials, living, progress)
         limit = max(1.0, float(errors[winner]))
         scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
         note = f"{note}{found.left_out}"
-        return Decision(scores, model, note, systems[winner].constraint, others_of(trials, winner))
+        others = others_of(trials, living, winner)
+        return Decision(scores, model, note, systems[winner].constraint, others)
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
         """Number of samples in a window."""
@@ -258,7 +260,7 @@ class FreeRunScore:
         """Refine and run every system, fold by fold; one that lacks an equation cannot live."""
         whole = [k for k, system in enumerate(systems) if system.model.coef.any(axis=0).all()]
         whole.sort(key=lambda k: systems[k].n_free)  # systems in a batch then cost about the same
-        trials = [Trial(system, MAX_ERROR, np.inf, np.inf) for system in systems]
+        trials = [Trial(system, MAX_ERROR, *[np.inf] * 4) for system in systems]
         if not whole:
             return trials
         some = [systems[k] for k in whole]
@@ -275,8 +277,8 @@ class FreeRunScore:
         systems: Sequence[TrialSystem],
         fold: Fold,
         progress: Progress,
-    ) -> Float[np.ndarray, "systems 3"]:
-        """Error, waveform and loss of every system in one fold."""
+    ) -> Float[np.ndarray, "systems 5"]:
+        """The figures of a `Trial` of every system in one fold."""
         first = systems[0].model
         batch = fold.windows(
             records.runs,
@@ -316,18 +318,19 @@ class FreeRunScore:
         cycle: Cycle,
         states: Sequence[str],
         densities: Sequence[int],
-    ) -> Float[np.ndarray, "systems 2"]:
-        """Error and waveform of every system over one stretch, its first half left out."""
+    ) -> Float[np.ndarray, "systems 4"]:
+        """The figures of a `Trial` but the loss, over one stretch, its first half left out."""
         half, columns = len(t) // 2, columns_of(states, self.judged)
         std = zero_to_one(cycle.std)
         ours = replace(cycle, mean=cycle.mean[columns], harmonics=cycle.harmonics[:, columns])
-        found = np.full((len(paths), 2), [MAX_ERROR, np.inf])
+        found = np.full((len(paths), 4), [MAX_ERROR, np.inf, np.inf, np.inf])
         for row, path in zip(found, paths, strict=True):
             if np.isfinite(path).all() and not turns_negative(path[half:], densities, std):
-                likeness = compare_cycles(ours, t[half:], path[half:, columns])
-                error = deviation(*likeness, self.bounds)
+                f_error, ratio, waveform = compare_cycles(ours, t[half:], path[half:, columns])
+                error = deviation(f_error, ratio, waveform, self.bounds)
                 if not np.isnan(error):
-                    row[:] = min(error, MAX_ERROR), likeness[2].max()
+                    amplitude = np.abs(ratio - 1.0).max()
+                    row[:] = min(error, MAX_ERROR), abs(f_error), amplitude, waveform.max()
         return found
 
     def _winner(
@@ -335,19 +338,16 @@ class FreeRunScore:
         records: Records,
         cycles: Sequence[Cycle],
         trials: Sequence[Trial],
+        living: Sequence[int],
         progress: Progress,
     ) -> tuple[int, SparseModel, str]:
         """Index of the winning system, the system refined on all data, and how it won."""
-        exact = min(trial.loss for trial in trials) < FLOOR
-        living = [
-            k for k, t in enumerate(trials) if t.error <= 1.0 and (t.loss < FLOOR or not exact)
-        ]
-        living.sort(key=lambda k: self._rank(trials[k]))
-        living = simplest_of_equals(living, trials)
+        ranked = sorted(living, key=lambda k: self._rank(trials[k]))
+        ranked = simplest_of_equals(ranked, trials)
         by_error = sorted(range(len(trials)), key=lambda k: (trials[k].error, trials[k].loss))
         window = self._window(records, cycles)
         found: list[Confirmed] = []
-        best = (living or by_error)[: self.n_confirmed]
+        best = (ranked or by_error)[: self.n_confirmed]
         for k in count_pieces(progress, best, "system", "refined on all data"):
             attracting = [each for each in found if each.share]
             if attracting and trials[k].system.n_free > attracting[0].trial.system.n_free + DEARER:

@@ -45,12 +45,16 @@ class Selection(Protocol):
 class OtherSystem:
     """A system of as many free coefficients as the selected one, which lives too.
 
-    terms: state -> the terms of its equation. deviation: the largest over the folds that it was not
-    fitted to, in units of the bounds. waveform: its largest error there, in standard deviations.
+    terms: by equation, such as `n_i'`, or under roles by role, such as `n_n to n_i`. Figures are
+    the worst over the folds that the system was not fitted to. deviation: of frequency, amplitudes
+    and waveform, in units of the bounds. f_error, amplitude: relative errors. waveform: in standard
+    deviations.
     """
 
     terms: Mapping[str, tuple[str, ...]]
     deviation: float
+    f_error: float
+    amplitude: float
     waveform: float
 
 

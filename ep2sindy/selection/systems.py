@@ -17,6 +17,7 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.regression.front import ParetoFront
+from ep2sindy.selection.criteria import FLOOR
 from ep2sindy.selection.rule import OtherSystem, combinations, left_out, support_of
 from ep2sindy.signals.kalman import KalmanSmoother
 
@@ -48,6 +49,19 @@ class TrialSystem:
         """Number of factors of the terms of all processes; zero without processes."""
         library = self.model.library
         return sum(int(library.degrees[library.index(p.term)]) for p in self.constraint.processes)
+
+    @property
+    def parts(self) -> dict[str, tuple[str, ...]]:
+        """The terms of every role to be found; of every equation, if there are no processes.
+
+        Two systems with the same terms in every equation may differ in what becomes of them.
+        """
+        if not self.constraint.processes:
+            return {f"{s}'": tuple(self.model.terms(s)) for s in self.model.states}
+        found: dict[str, tuple[str, ...]] = {}
+        for process in self.constraint.processes:
+            found[process.role] = (*found.get(process.role, ()), process.term)
+        return found
 
     def broken(self, model: SparseModel) -> list[str]:
         """The demands on processes that a refined model does not meet."""
@@ -92,12 +106,14 @@ class Trial:
     """Results of a system on the folds that it was not fitted to, the worst over all folds.
 
     error: largest deviation from the data's cycle, in units of its bound; a system with one or less
-    lives. waveform: largest error of the waveform. loss: on the windows that the system was refined
-    on.
+    lives. f_error, amplitude: largest relative errors of the frequency and of an amplitude.
+    waveform: largest error of the waveform. loss: on the windows that the system was refined on.
     """
 
     system: TrialSystem
     error: float
+    f_error: float
+    amplitude: float
     waveform: float
     loss: float
 
@@ -287,18 +303,22 @@ def folds_of(runs: Sequence[Trajectory], n_folds: int) -> list[Fold]:
     return found
 
 
-def others_of(trials: Sequence[Trial], winner: int) -> list[OtherSystem]:
-    """The other systems of the winner's size that live in every fold, the best waveform first."""
+def living_among(trials: Sequence[Trial]) -> list[int]:
+    """The systems that live in every fold.
+
+    If some follow the windows to rounding, because the truth is in the library, these alone.
+    """
+    exact = min(trial.loss for trial in trials) < FLOOR
+    return [k for k, t in enumerate(trials) if t.error <= 1.0 and (t.loss < FLOOR or not exact)]
+
+
+def others_of(trials: Sequence[Trial], living: Sequence[int], winner: int) -> list[OtherSystem]:
+    """The other living systems of the winner's size, the best waveform first."""
     size = trials[winner].system.n_free
-    alike = [t for k, t in enumerate(trials) if k != winner and t.system.n_free == size]
+    alike = [trials[k] for k in living if k != winner and trials[k].system.n_free == size]
     return [
-        OtherSystem(
-            {s: tuple(t.system.model.terms(s)) for s in t.system.model.states},
-            t.error,
-            t.waveform,
-        )
+        OtherSystem(t.system.parts, t.error, t.f_error, t.amplitude, t.waveform)
         for t in sorted(alike, key=lambda t: t.waveform)
-        if t.error <= 1.0
     ]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
@@ -15,8 +15,8 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.living import balance_figure
-from ep2sindy.library.relations import Constraint, Place, Process, constraint
-from ep2sindy.library.roles import process_values
+from ep2sindy.library.relations import Constraint, Process, constraint
+from ep2sindy.library.roles import constraint_of, process_values
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
@@ -42,12 +42,13 @@ NOTE = (
 class ComparedProcess:
     """A process of the zone: in the record and by the model's terms, in m^-3/s at every sample.
 
-    recorded: None if the record does not give it. coef: of the model's terms. counterpart: of the
-    same terms, by least squares on the record; empty if it does not give the process. fit_r2: of
-    these, at each instant.
+    ends: the state that gives, and the one that takes; "" is the outside. recorded: None if the
+    record does not give it. coef: of the model's terms. counterpart: of the same terms, by least
+    squares on the record; empty if it does not give the process. fit_r2: of these, at each instant.
     """
 
     name: str
+    ends: tuple[str, str]
     recorded: Float[np.ndarray, " samples"] | None
     modelled: Float[np.ndarray, " samples"]
     coef: Mapping[str, float]
@@ -114,9 +115,8 @@ def compared_processes(
         rate = _zone_rate(*ends, known, gone, gross=gross)
         modelled = columns @ np.array([*terms.values()])
         beside = _counterpart(rate, columns, list(terms))
-        compared.append(
-            ComparedProcess(_zone_words(*ends, gross=gross), rate, modelled, terms, *beside)
-        )
+        words = _zone_words(*ends, gross=gross)
+        compared.append(ComparedProcess(words, ends, rate, modelled, terms, *beside))
     return compared
 
 
@@ -208,27 +208,39 @@ def _difference(known: Mapping[str, np.ndarray], first: str, second: str) -> np.
 class TermRole:
     """One term of the model.
 
-    process: what the term stands for in the balance; empty if the model was not found under roles.
-    coef: in the process, or in the equation of the state. counterpart: the coefficient by least
-    squares of the recorded process on all of the model's terms for it, with fit_r2; NaN if the
-    record does not give it. without: free run of the model refined without the term, and without
-    those that share its coefficient; None if it cannot be refined.
+    part: what it is a term of: a process in words, or the state whose equation holds it. is_known:
+    whether nothing was fitted, so that it is not left out. without: free run of the model refined
+    without the process, or without the coefficient in all of its equations; None if it is known or
+    cannot be refined. counterpart: the coefficient by least squares of the recorded process on all
+    of the model's terms for it, with fit_r2; NaN if the record does not give it.
     """
 
-    state: str
+    part: str
     term: str
     coef: float
-    process: str
-    counterpart: float
-    fit_r2: float
+    is_known: bool
     without: FreeRun | None
+    counterpart: float = float("nan")
+    fit_r2: float = float("nan")
+
+    @property
+    def ratio(self) -> float:
+        return self.coef / self.counterpart if self.counterpart else float("nan")
+
+    @property
+    def verdict(self) -> str:
+        """What becomes of the model without the term, in words."""
+        if self.is_known:
+            return "known"
+        return self.without.text if self.without else "cannot be refined"
 
 
-# Metrics of a refined model without one term; None if it cannot be refined.
+COEFFICIENT: Metrics[TermRole] = [
+    Metric("term", lambda role: role.term, View.SHOWN),
+    Metric("coefficient", lambda role: role.coef, View.SHOWN),
+]
+# Metrics of a refined model without one term; None if there is none.
 WITHOUT: Metrics[FreeRun | None] = [
-    Metric(
-        "verdict", lambda run: run.text if run else "cannot be refined", View.SHOWN, "without it"
-    ),
     Metric("f_error", lambda run: run.f_error if run else np.nan),
     Metric(
         "waveform_error",
@@ -236,21 +248,23 @@ WITHOUT: Metrics[FreeRun | None] = [
         View.SHOWN, "waveform", "{:.3f}",
     ),
 ]  # fmt: skip
-ROLES: Metrics[TermRole] = [
-    Metric("state", lambda role: role.state),
-    Metric("equation", lambda role: f"{role.state}'", View.SCREEN),
-    Metric("term", lambda role: role.term, View.SHOWN),
-    Metric("coefficient", lambda role: role.coef, View.SHOWN),
-    Metric("process", lambda role: role.process, View.SHOWN),
-    Metric("counterpart", lambda role: role.counterpart, View.SHOWN, "by the record"),
-    Metric(
-        "ratio",
-        lambda role: role.coef / role.counterpart if role.counterpart else np.nan,
-        View.SHOWN,
-        format="{:.2f}",
-    ),
-    Metric("fit_r2", lambda role: role.fit_r2, View.SHOWN, "its R2", "{:.3f}"),
+LEFT_OUT: Metrics[TermRole] = [
+    Metric("without_verdict", lambda role: role.verdict, View.SHOWN, "without it"),
     *(metric.of(lambda role: role.without, "without_{}") for metric in WITHOUT),
+]
+BY_PROCESS: Metrics[TermRole] = [
+    Metric("process", lambda role: role.part, View.SHOWN),
+    *COEFFICIENT,
+    Metric("counterpart", lambda role: role.counterpart, View.SHOWN, "by the record"),
+    Metric("ratio", lambda role: role.ratio, View.SHOWN, format="{:.2f}"),
+    Metric("fit_r2", lambda role: role.fit_r2, View.SHOWN, "its R2", "{:.3f}"),
+    *LEFT_OUT,
+]
+BY_EQUATION: Metrics[TermRole] = [
+    Metric("state", lambda role: role.part),
+    Metric("equation", lambda role: f"{role.part}'", View.SCREEN),
+    *COEFFICIENT,
+    *LEFT_OUT,
 ]
 
 
@@ -267,8 +281,12 @@ class ModelBalance:
     data: Trajectory = field(repr=False)
     period_s: float | None = None
 
+    @property
+    def _of_terms(self) -> Metrics[TermRole]:
+        return BY_PROCESS if self.processes else BY_EQUATION
+
     def tables(self, name: str) -> dict[str, pd.DataFrame]:
-        found = {f"terms_{name}": ResultTable(self.terms, ROLES).csv()}
+        found = {f"terms_{name}": ResultTable(self.terms, self._of_terms).csv()}
         if self.processes:
             found[f"balance_{name}"] = ResultTable(self.processes, PROCESSES).csv()
         return found
@@ -288,7 +306,7 @@ class ModelBalance:
         if self.processes:
             rows = ResultTable(self.processes, PROCESSES).screen()
             blocks.append(Table(rows, title="what is exchanged, in record and model", note=NOTE))
-        rows = ResultTable(self.terms, ROLES).screen()
+        rows = ResultTable(self.terms, self._of_terms).screen()
         blocks.append(Table(rows, title="each term by its process, and left out"))
         if any(np.isfinite(each.counterpart) for each in self.terms):
             blocks.append(Text(
@@ -303,7 +321,7 @@ class ModelBalance:
         """The entry in `summary.json`."""
         return {
             "processes": [facts(each, PROCESSES) for each in self.processes],
-            "terms": [facts(role, ROLES) for role in self.terms],
+            "terms": [facts(role, self._of_terms) for role in self.terms],
         }
 
 
@@ -333,45 +351,42 @@ def model_balance(
     named = {state.partition("@")[0] for state in model.states}
     if balances and held_to.processes and named == {IONS, NEUTRALS}:
         processes = compared_processes(model, held_to, data, balances, sizes)
-    window, left_out = two_periods(train), {}
-    free = range(len(held_to.free))
-    for k in count_pieces(progress, free, "coefficient", "models without a term"):
-        left_out[k] = _without(model, held_to, k, train, held, bounds, progress, window=window)
-    by_place = {place: k for k, place in enumerate(held_to.coefficients)}
+    lesser = _each_left_out(model, held_to, by_process=bool(processes))
+    window = two_periods(train)
+    left_out = [
+        _without(model, less, train, held, bounds, progress, window=window)
+        for less in count_pieces(progress, lesser, "coefficient", "models without a term")
+    ]
+    return ModelBalance(processes, _roles(model, held_to, processes, left_out), data, period_s)
 
-    def without(place: Place) -> FreeRun | None:
-        follows = np.flatnonzero(held_to.C[by_place[place]])
-        return left_out[int(follows[0])] if follows.size else None
 
-    roles = []
+def _roles(
+    model: SparseModel,
+    held_to: Constraint,
+    processes: Sequence[ComparedProcess],
+    left_out: Sequence[FreeRun | None],
+) -> list[TermRole]:
+    """The terms of all processes, or of all equations if there are none."""
+    if not processes:
+        found = []
+        for (state, term), follows in zip(held_to.coefficients, held_to.C, strict=True):
+            run = left_out[int(follows.argmax())] if follows.any() else None
+            coef = model.terms(state).get(term, 0.0)
+            found.append(TermRole(state, term, coef, not follows.any(), run))
+        return found
+    by_process = {(_ends(p), p.term): k for k, p in enumerate(held_to.processes)}
+    found = []
     for each in processes:
         for term, coef in each.coef.items():
-            place = next(_places(held_to, each.name, term))
-            beside = each.counterpart.get(term, np.nan), each.fit_r2
-            roles.append(TermRole(place[0], term, coef, each.name, *beside, without(place)))
-    if not processes:
-        for state, term in held_to.coefficients:
-            coef = model.terms(state).get(term, 0.0)
-            run = without((state, term))
-            roles.append(TermRole(state, term, coef, "", np.nan, np.nan, run))
-    return ModelBalance(processes, roles, data, period_s)
-
-
-def _places(held_to: Constraint, name: str, term: str) -> Iterator[Place]:
-    """Where a process of this name and term stands in the equations."""
-    every = [*held_to.processes, *held_to.known]
-    ends = {_ends(process) for process in every}
-    for process in every:
-        giver, taker = _ends(process)
-        words = _zone_words(giver, taker, gross=(taker, giver) in ends)
-        if words == name and process.term == term:
-            yield from process.factors
+            k = by_process.get((each.ends, term))
+            run, beside = None if k is None else left_out[k], each.counterpart.get(term, np.nan)
+            found.append(TermRole(each.name, term, coef, k is None, run, beside, each.fit_r2))
+    return found
 
 
 def _without(
     model: SparseModel,
-    held_to: Constraint,
-    free: int,
+    less: Constraint,
     train: Trajectory,
     held: Trajectory,
     bounds: FreeRunBounds,
@@ -379,10 +394,9 @@ def _without(
     *,
     window: int | None,
 ) -> FreeRun | None:
-    """The model without one free coefficient, refined and run; None if it is not finite."""
+    """The model refined under a constraint with fewer terms, and run; None if it is not finite."""
     from ep2sindy.refinement.refine import refine, with_coef  # loads torch, only for a refinement
 
-    less = _less(held_to, free)
     if {state for state, _ in less.coefficients} != set(model.states):
         return None
     values = np.array([model.terms(s).get(term, 0.0) for s, term in less.coefficients])
@@ -393,6 +407,25 @@ def _without(
     if found.status == "non_finite":
         return None
     return free_run(found.model, held, initial=start_of(held, found.model), bounds=bounds)
+
+
+def _each_left_out(
+    model: SparseModel, held_to: Constraint, *, by_process: bool
+) -> list[Constraint]:
+    """The constraint without one process, or without one free coefficient, in turn.
+
+    A coefficient may be the sum of what a state loses by several processes, of which one is left
+    out, or be known in part; so it is not put to zero where processes are known.
+    """
+    if not by_process:
+        return [_less(held_to, free) for free in range(len(held_to.free))]
+    found = []
+    for process in held_to.processes:
+        others = [each for each in held_to.processes if each is not process]
+        less = constraint_of(model.library, model.states, others, held_to.known)
+        assert less is not None, "fewer processes are told apart as well"
+        found.append(less)
+    return found
 
 
 def _less(held_to: Constraint, free: int) -> Constraint:

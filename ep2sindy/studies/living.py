@@ -58,11 +58,16 @@ CAPTIONS = {
     "starts.",
     "waveform": WAVEFORM,
 }
+SPREAD = "spread over windows"  # of the coefficients: no knowledge of a rate
+SPREAD_NOTE = (
+    "Spread over windows: 95 % intervals by how the windows of the refinement differ; they do not "
+    "say how far off the model itself is."
+)
 MOST_OTHERS = 12  # shown on the page
 OTHERS_NOTE = (
-    "Deviation: the largest of frequency, amplitudes and waveform over the parts of the record "
-    "that a model was not fitted to, in units of the bounds of a model that lives. These models "
-    "follow this record about as well: what they have in common is what it tells."
+    "Largest errors over the parts of the record that a model was not fitted to; deviation: the "
+    "largest of the three in units of the bounds of a model that lives. All stay within them: what "
+    "these models have in common is what the record tells."
 )
 NO_SIZES: Mapping[str, float] = MappingProxyType({})
 
@@ -200,7 +205,7 @@ class Living:
         rows = ResultTable([self], LIVING).screen(by_state=True)
         blocks: list[Block] = [
             *self.equations(clock),
-            *interval_table(model, clock=clock),
+            *interval_table(model, clock=clock, words=SPREAD, note=SPREAD_NOTE),
             Table(rows, title=run_title(self.run)),
             *(Text(text) for text in (_note(self), _by_derivatives(self))),
             *pictures(self.figures(name)),
@@ -279,8 +284,10 @@ LIVING: Metrics[Living] = [
 ]
 OTHERS: Metrics[OtherSystem] = [
     Metric("terms", lambda each: _structure(each), View.SHOWN),
+    Metric("f_error", lambda each: each.f_error, View.SHOWN, "frequency", percent(2)),
+    Metric("amplitude_error", lambda each: each.amplitude, View.SHOWN, "amplitude", percent(1)),
+    Metric("waveform_error", lambda each: each.waveform, View.SHOWN, "waveform", "{:.3f}"),
     Metric("deviation", lambda each: each.deviation, View.SHOWN, format="{:.2f}"),
-    Metric("waveform_error", lambda each: each.waveform, View.SHOWN, format="{:.3f}"),
 ]
 REFINED: Metrics[Refined] = [
     Metric("status", lambda refined: refined.status),
@@ -308,8 +315,8 @@ def _text(living: Living) -> str:
 
 
 def _structure(system: OtherSystem) -> str:
-    """Terms of every equation."""
-    return "; ".join(f"{state}': {', '.join(terms)}" for state, terms in system.terms.items())
+    """Terms of every role or equation."""
+    return "; ".join(f"{part}: {', '.join(terms)}" for part, terms in system.terms.items())
 
 
 def _terms(model: SparseModel) -> dict[str, list[str]]:
@@ -332,7 +339,10 @@ def _with_intervals(model: SparseModel) -> dict[str, dict[str, Any]]:
     known = intervals(model)
     return {
         state: {
-            term: {"value": value, "ci95": None if known is None else known[state][term]}
+            term: {
+                "value": value,
+                SPREAD.replace(" ", "_"): None if known is None else known[state][term],
+            }
             for term, value in model.terms(state).items()
         }
         for state in model.states

@@ -174,8 +174,13 @@ def interval_table(
     clock: Clock = SECONDS,
     *,
     page_only: bool = False,
+    words: str = "95 %",
+    note: str = "",
 ) -> list[Block]:
-    """Coefficients of some or all equations with 95 % intervals; empty if these are not known."""
+    """Coefficients of some or all equations with 95 % intervals; empty if these are not known.
+
+    words: what the intervals are called. note: what they mean.
+    """
     if model.covariance is None:
         return []
     units = {term.name: term.unit(model.units) for term in model.library.terms}
@@ -188,8 +193,9 @@ def interval_table(
             shown = [f"{clock.seconds * number:.4g}" for number in numbers]
             row += shown if ends[0] < ends[1] else [shown[0], "exact", ""]  # known, or a relation
             rows.append([*row, clock.rate_unit(unit)])
-    columns = ["equation", "term", "coefficient", "95 % from", "to", "unit"]
-    return [Table(pd.DataFrame(rows, columns=columns), page_only=page_only)] if rows else []
+    columns = ["equation", "term", "coefficient", f"{words} from", "to", "unit"]
+    table = pd.DataFrame(rows, columns=columns)
+    return [Table(table, note=note, page_only=page_only)] if rows else []
 
 
 def equation_sections(
