@@ -48,7 +48,7 @@ from ep2sindy.studies.library_result import (
     run_refitted,
 )  # fmt: skip
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
-from ep2sindy.studies.source import Sampling, Source, balances_of, data_summary, zone_sizes_of
+from ep2sindy.studies.source import Sampling, Source, Zones, data_summary
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
 from ep2sindy.studies.views import (
     FROM_DERIVATIVES,
@@ -115,21 +115,6 @@ class LibraryCase:
         if self.n_norm is None or not isinstance(method.selection, Knee):
             return method
         return replace(method, selection=replace(method.selection, n_norm=self.n_norm))
-
-
-@dataclass(frozen=True)
-class Zones:
-    """The zones of a record: balances of ions and neutrals, and lengths in m if there are several.
-
-    balances: by name, see `balances_of`.
-    """
-
-    balances: Mapping[str, xr.Dataset] = field(default_factory=dict)
-    sizes: Mapping[str, float] = field(default_factory=dict)
-
-    @staticmethod
-    def of(source: Source, data: xr.Dataset, run: Run) -> Zones:
-        return Zones(balances_of(source, data, run), zone_sizes_of(source, data))
 
 
 @dataclass(frozen=True)
