@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
+from tests import programs
 from tests.models import model_of
 
 ASSOCIATION = {
@@ -100,3 +101,19 @@ def test_a_state_that_starts_at_zero_is_estimated_on_the_model_s_path():
     assert path.min() == path[0, 2] == 0.0
     again = found.model.simulate(run.t, path[0]).states
     np.testing.assert_allclose(again, path, atol=1e-3 * found.noise_std.min())
+
+
+def test_a_config_tells_roles(tmp_path):
+    record(ASSOCIATION, (1.0, 0.6, 0.0), 6.0, 0.01, 0).to_dataframe().to_csv(tmp_path / "run.csv")
+    given = (
+        "+exp=discover", "data=recognised", f"data.path={tmp_path / 'run.csv'}",
+        "trajectory.states=[A,B,C]", "forecasts=0", f"output={tmp_path}",
+    )  # fmt: skip
+    told = "roles={_target_: ep2sindy.Roles, exchange: [['A + B', C]], nonnegative: true}"
+    found = programs.computed(programs.composed(*given, told))
+    (result,) = found.outcome.results.values()
+    assert [(p.role, p.term) for p in result.discovery.constraint.processes] == [
+        ("A + B to C", "A*B"), ("C to A + B", "C")
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match=r"must name states: \['Q'\] came"):
+        programs.computed(programs.composed(*given, told.replace("A + B", "A + Q")))
