@@ -290,13 +290,15 @@ SAME = 1e-12  # residual of an exact copy due to rounding, as a fraction of the 
 MIN_SHARED = 8  # consecutive samples; shorter matches of rounded samples can occur by chance
 
 
-def check_repeats(runs: Sequence[Trajectory]) -> None:
+def check_repeats(runs: Sequence[Trajectory], *, tied: bool = False) -> None:
     """Raise ValueError for repeated states or samples.
 
-    A state that equals another one up to scale and offset makes the coefficients arbitrary. Runs
-    that share samples make the confidence intervals too small.
+    A state that equals another one up to scale and offset makes the coefficients arbitrary, unless
+    they are tied: two species of a closed reaction have a constant sum. Runs that share samples
+    make the confidence intervals too small.
     """
-    _check_states(runs)
+    if not tied:
+        _check_states(runs)
     begin = np.array([run.states[0, 0] for run in runs])
     for i, run in enumerate(runs):
         for start in np.flatnonzero(np.isin(run.states[:, 0], np.delete(begin, i))).tolist():
@@ -379,7 +381,7 @@ class Task:
         self._check_hidden()
         seen = [name for name in self.library.variables if name not in self.hidden]
         check_agreement(self.runs, seen)
-        check_repeats(self.runs)
+        check_repeats(self.runs, tied=self.roles is not None)
         self._check_known()
 
     @property

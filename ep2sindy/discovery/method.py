@@ -147,7 +147,7 @@ class TrajectorySearch:
             )
         found = self._estimate(task, progress)
         library = found.model.library  # with the terms of known equations
-        task = replace(task, runs=found.runs, hidden=(), roles=None, library=library)
+        task = replace(task, runs=found.runs, hidden=(), library=library)
         choice = self._choose(found, task, progress)
         return IdentifiedEquations(choice, _ambiguities_of_samples(task), found.remarks, found)
 

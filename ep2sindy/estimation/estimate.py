@@ -305,7 +305,9 @@ def _report(
             watch, list(enumerate(problem.states)), "equation", "rivals"
         )
     }
-    fitted, paths = zip(*by_run(problem, fit.paths, runs), strict=True)
+    # A fit follows the flow but for a little, which must not take a nonnegative state below zero.
+    paths = [np.where(problem.nonnegative, np.maximum(path, 0.0), path) for path in fit.paths]
+    fitted, paths = zip(*by_run(problem, paths, runs), strict=True)
     return Estimate(
         model=model,
         paths=paths,

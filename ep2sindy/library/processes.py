@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -31,6 +32,7 @@ class Group:
 
 
 Equations = Mapping[str, Mapping[str, float]]  # state -> term -> number
+Part = tuple[str, float, float, float]  # a process in an equation: term, factor, amount, half-width
 
 
 def groups_of(
@@ -40,30 +42,50 @@ def groups_of(
 
     held: from a search under `Roles`. coef: coefficients of the model in SI. reach: half-widths of
     their intervals. per: time unit of the numbers, in s. What states exchange has the same terms
-    and digits in both of their equations.
+    and digits in both of their equations. A process has an interval if one of the equations tells
+    it apart from others by the same term.
     """
     values = np.array([coef[state].get(term, 0.0) for state, term in held.coefficients])
     amounts = [*process_values(held, values), *(p.value or 0.0 for p in held.known)]
+    widths = [*_process_widths(held, reach or {}), *(0.0 for _ in held.known)]
     found: dict[str, list[Group]] = {}
     for state in held.states:
-        parts: dict[str, list[tuple[str, float, float]]] = {}  # by role: term, factor, amount
-        for process, amount in zip([*held.processes, *held.known], amounts, strict=True):
+        parts: dict[str, list[Part]] = {}  # by role
+        for process, *number in zip([*held.processes, *held.known], amounts, widths, strict=True):
             role = process.role
             key = f"{role} {process.term}" if role.endswith(SEPARATE) else role
             for (there, term), factor in process.factors.items():
                 if there == state:
-                    parts.setdefault(key, []).append((term, factor, per * float(amount)))
+                    amount, width = (per * abs(factor) * float(each) for each in number)
+                    parts.setdefault(key, []).append((term, factor, amount, width))
         order = sorted(parts, key=lambda key: (key.endswith(OUT)) - (IN in key))
-        widths = (reach or {}).get(state, {})
-        known = {term: per * width for term, width in widths.items() if width > 0.0}
-        found[state] = [_group(parts[key], known) for key in order]
+        found[state] = [_group(parts[key]) for key in order]
     return found
 
 
-def _group(parts: Sequence[tuple[str, float, float]], reach: Mapping[str, float]) -> Group:
+def _process_widths(held: Constraint, reach: Equations) -> list[float]:
+    """Half-width of the interval of every process; zero if no equation gives it alone.
+
+    Where two processes have one term in an equation, its interval is that of their sum.
+    """
+    fitted = Counter(place for process in held.processes for place in process.factors)
+    return [
+        next(
+            (
+                reach.get(state, {}).get(term, 0.0) / abs(factor)
+                for (state, term), factor in process.factors.items()
+                if fitted[state, term] == 1
+            ),
+            0.0,
+        )
+        for process in held.processes
+    ]
+
+
+def _group(parts: Sequence[Part]) -> Group:
     """One process in one equation, with a sign such that not all of its terms are negative."""
     sign = 1 if parts[0][1] > 0.0 else -1
-    terms = {term: abs(factor) * amount for term, factor, amount in parts}
+    terms = {term: amount for term, _, amount, _ in parts}
     if all(value < 0.0 for value in terms.values()):
         sign, terms = -sign, {term: -value for term, value in terms.items()}
     powers = {term: factors_of(term) for term in terms}
@@ -80,5 +102,5 @@ def _group(parts: Sequence[tuple[str, float, float]], reach: Mapping[str, float]
         sign,
         product_of(common),
         {left[term]: value for term, value in terms.items()},
-        {left[term]: reach[term] for term in terms if term in reach},
+        {left[term]: width for term, _, _, width in parts if width > 0.0},
     )

@@ -49,15 +49,18 @@ class Roles:
     """Roles that terms have, for a search that conserves what states exchange.
 
     exchange: pairs (from, to); a term in this role leaves the first equation and enters the second
-    with the same coefficient. outflow: states that lose something to the outside. inflow: state ->
-    what it is supplied with, a constant. A state without a role has an equation of free terms.
+    with the same coefficient. Where several bodies take part, a side names them all, as a reaction
+    does: ("E + S", "ES"), or ("A + X", "X + X"). outflow: states that lose something to the
+    outside. inflow: state -> what it is supplied with, a constant. A state without a role has an
+    equation of free terms.
 
     Any term of the library may be exchanged, with a coefficient of either sign, and the powers of a
     state may flow out, each of which takes away. With `nonnegative`, states are numbers of bodies,
     or densities, and terms obey mass action: what lowers a state contains it as a factor. An
     exchange then takes terms that contain its first state, and moves them forward; terms that
     contain the second state, but not the first, go back, unless that way is an exchange of its own.
-    Terms that are named for a role must contain its first state, too. All coefficients are
+    Terms that are named for a role must contain its first state, too. Terms of a reaction contain
+    every body that reacts, as often as it does. All coefficients are
     positive, and so no state can turn negative.
 
     A third entry of an exchange, and the values of outflow, if it is a mapping, say how: "free", as
@@ -70,7 +73,7 @@ class Roles:
     where the equation is known and nothing is to be found; the library need not hold these terms.
     forward: True if in the mean over the records every role must move more forward than back, as
     in several zones.
-    Raises ValueError for an exchange of a state with itself, a size that is not positive, or a role
+    Raises ValueError for an exchange of a side with itself, a size that is not positive, or a role
     of a state whose equation is known.
 
     >>> roles = ep.Roles(exchange=[("prey", "predator")], outflow=["predator"], nonnegative=True)
@@ -90,10 +93,10 @@ class Roles:
     def __post_init__(self) -> None:
         check_list("exchange", self.exchange)
         for entry in self.exchange:
-            if isinstance(entry, str) or len(entry) not in (2, 3) or entry[0] == entry[1]:
+            if isinstance(entry, str) or len(entry) not in (2, 3) or _is_same(*entry[:2]):
                 raise ValueError(
-                    "an exchange joins two states, (from, to), by any term, or by those that a "
-                    f"third entry names: {entry!r} came"
+                    "an exchange joins two states, (from, to), or sides such as 'A + B', by any "
+                    f"term, or by those that a third entry names: {entry!r} came"
                 )
         if not isinstance(self.outflow, Mapping):
             check_list("outflow", self.outflow)
@@ -133,7 +136,7 @@ class Roles:
     @property
     def balanced(self) -> set[str]:
         """The states whose equations the roles make."""
-        return {state for role in self._roles for state in role[:2] if state}
+        return {state for role in self._roles for side in role[:2] for state in _bodies(side)}
 
     @property
     def positive(self) -> list[str]:
@@ -143,7 +146,7 @@ class Roles:
     @property
     def states(self) -> tuple[str, ...]:
         """Every state that is named, once."""
-        named = [state for role in self._roles for state in role[:2] if state]
+        named = [state for role in self._roles for side in role[:2] for state in _bodies(side)]
         return tuple(dict.fromkeys([*named, *self.sizes, *self.equations]))
 
     @property
@@ -210,7 +213,8 @@ class Roles:
         Raises ValueError for terms, which are of one zone's equations.
         """
         named = [role.giver or isinstance(role.how, list | tuple) for role in self._roles]
-        if any(role.how != FREE for role in compress(self._roles, named)):
+        several = any("+" in role.name for role in self._roles)
+        if several or any(role.how != FREE for role in compress(self._roles, named)):
             raise ValueError(
                 "roles in several zones take terms by neighbourhood: give exchanges as (from, to), "
                 f"and outflow as a list of states; {self} came"
@@ -279,25 +283,27 @@ class Roles:
         terms = [name for name in library.names if name != "1"] if how == FREE else how
         terms = [library.names[library.index(term)] for term in terms]
         if how == FREE and not taker:
-            terms = [term for term in terms if set(factors_of(term)) == {giver}]
+            terms = [term for term in terms if set(factors_of(term)) == set(_bodies(giver))]
         if not self.nonnegative:
             yield from (self._process(role, term) for term in terms)
             return
-        yield from (self._process(role, term) for term in terms if giver in factors_of(term))
+        yield from (self._process(role, term) for term in terms if _holds(term, giver))
         back = Role(taker, giver, how)
         if how == FREE and taker and back.name not in self.names:
             for term in terms:
-                if taker in factors_of(term) and giver not in factors_of(term):
+                if _holds(term, taker) and not _holds(term, giver):
                     yield self._process(back, term)
 
     def _process(self, role: Role, term: str) -> Process:
         """A term in a role; without `nonnegative` only the powers that flow out have a sign."""
-        factors = {}
-        if role.giver:
-            factors[role.giver, term] = -1.0
-        if role.taker:
-            gain = self.sizes.get(role.giver, 1.0) / self.sizes.get(role.taker, 1.0)
-            factors[role.taker, term] = gain if role.giver else 1.0
+        factors: dict[Place, float] = {}
+        moved = [(state, -n) for state, n in _bodies(role.giver).items()]
+        moved += _bodies(role.taker).items()
+        first = self.sizes.get(moved[0][0], 1.0)
+        for state, n in moved:
+            share = n * first / self.sizes.get(state, 1.0)
+            factors[state, term] = factors.get((state, term), 0.0) + share
+        factors = {place: factor for place, factor in factors.items() if factor}
         signed = self.nonnegative or (not role.taker and role.how == FREE)
         return Process(role.name, term, MappingProxyType(factors), one_sign=signed)
 
@@ -353,6 +359,21 @@ def _check_how(role: Role) -> None:
         f"{EITHER!r}: "
         f"{how!r} came"
     )
+
+
+def _bodies(side: str) -> Counter[str]:
+    """The states on a side, such as A + B, and how often each stands there; none outside."""
+    return Counter(state.strip() for state in side.split("+") if side)
+
+
+def _is_same(*sides: str) -> bool:
+    """Whether the same bodies stand on all sides."""
+    return len({frozenset(_bodies(side).items()) for side in sides}) == 1
+
+
+def _holds(term: str, side: str) -> bool:
+    """Whether all bodies of a side are factors of a term."""
+    return _bodies(side) <= Counter(factors_of(term))
 
 
 def _beside(zones: Sequence[str], k: int) -> list[str]:

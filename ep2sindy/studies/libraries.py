@@ -19,6 +19,7 @@ from ep2sindy.figures.fronts import front_figure
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.roles import Roles
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.bootstraps import Bootstraps
@@ -48,7 +49,7 @@ from ep2sindy.studies.library_result import (
     run_refitted,
 )  # fmt: skip
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
-from ep2sindy.studies.source import Sampling, Source, balances_of, data_summary, zone_sizes_of
+from ep2sindy.studies.source import Sampling, Source, Zones, data_summary
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
 from ep2sindy.studies.views import (
     FROM_DERIVATIVES,
@@ -118,21 +119,6 @@ class LibraryCase:
 
 
 @dataclass(frozen=True)
-class Zones:
-    """The zones of a record: balances of ions and neutrals, and lengths in m if there are several.
-
-    balances: by name, see `balances_of`.
-    """
-
-    balances: Mapping[str, xr.Dataset] = field(default_factory=dict)
-    sizes: Mapping[str, float] = field(default_factory=dict)
-
-    @staticmethod
-    def of(source: Source, data: xr.Dataset, run: Run) -> Zones:
-        return Zones(balances_of(source, data, run), zone_sizes_of(source, data))
-
-
-@dataclass(frozen=True)
 class Study:
     """Discover a model with every library, integrate it from the first sample, and compare.
 
@@ -144,7 +130,7 @@ class Study:
     share of the record, on which such a model is tested; None means a quarter. forecasts: number of
     starts of forecasts, over the held-out part of a living model, or else over the last quarter of
     the record; zero leaves them out. hidden: states that nobody measured, relations between
-    coefficients, and terms that an equation may not have (exclude), as for `discover`.
+    coefficients, terms that an equation may not have (exclude), and roles, as for `discover`.
     Raises ValueError for held_out without living, as it would do nothing, and for hidden states
     with several libraries or with living, which need samples of all states.
     """
@@ -163,6 +149,7 @@ class Study:
     hidden: Sequence[str] = ()
     relations: Sequence[str] = ()
     exclude: Terms | None = None
+    roles: Roles | None = None
 
     def __post_init__(self) -> None:
         if self.hidden and (self.living is not None or len(self.libraries) > 1):
@@ -274,7 +261,13 @@ class Study:
     @property
     def _ask(self) -> partial[Discovery]:
         barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
-        return partial(discover, hidden=self.hidden, relations=self.relations, exclude=barred)
+        return partial(
+            discover,
+            hidden=self.hidden,
+            relations=self.relations,
+            exclude=barred,
+            roles=self.roles,
+        )
 
     def _lives(
         self,

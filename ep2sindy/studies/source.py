@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import xarray as xr
@@ -203,3 +203,18 @@ def data_summary(data: Trajectory) -> dict[str, Any]:
         "variables": list(data.names),
         "units": dict(data.units),
     }
+
+
+@dataclass(frozen=True)
+class Zones:
+    """The zones of a record: balances of ions and neutrals, and lengths in m if there are several.
+
+    balances: by name, see `balances_of`.
+    """
+
+    balances: Mapping[str, xr.Dataset] = field(default_factory=dict)
+    sizes: Mapping[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def of(source: Source, data: xr.Dataset, run: Run) -> Zones:
+        return Zones(balances_of(source, data, run), zone_sizes_of(source, data))
