@@ -8,7 +8,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.coerce import Task
-from ep2sindy.library.roles import constraint_of, process_values
+from ep2sindy.library.roles import constraint_of, process_amounts
 from ep2sindy.selection.conserving import conserving_systems
 from ep2sindy.selection.systems import TrialSystem
 
@@ -130,8 +130,10 @@ def test_mass_action_takes_terms_that_contain_what_they_lower():
     found = [(p.role, p.term) for p in apart.processes(LIBRARY, STATES)]
     assert [term for role, term in found if role == "n_n to n_i"] == ahead
     assert [term for role, term in found if role == "n_i to n_n"] == ["n_i", "n_i^2", "n_i*n_n"]
-    named = replace(MASS_ACTION, outflow={"n_i": ["n_n*n_i", "n_n"]})
+    named = replace(MASS_ACTION, outflow={"n_i": ["n_n*n_i"]})
     assert [p.term for p in named.processes(LIBRARY, STATES) if p.role == "n_i out"] == ["n_i*n_n"]
+    with pytest.raises(ValueError, match=r"what lowers 'n_i' contains it: \['n_n'\] came"):
+        replace(MASS_ACTION, outflow={"n_i": ["n_i", "n_n"]}).processes(LIBRARY, STATES)
     births = replace(MASS_ACTION, inflow={"n_n": ["n_n", "1"]})
     assert [p.term for p in births.processes(LIBRARY, STATES) if p.role == "n_n in"] == ["n_n", "1"]
     with pytest.raises(ValueError, match="no term of the library may play the role 'n_n out'"):
@@ -150,12 +152,12 @@ def test_a_search_by_mass_action_proposes_positive_processes_alone(record):
     assert len(systems) > 4
     assert not any(system.broken(system.model) for system in systems)
     free = conserving_systems(rows, task, ROLES, method.search, depth=50).systems
-    values = [process_values(s.constraint, coef_of(s)) for s in free]
-    assert any((value < 0.0).any() for value in values)  # without mass action some are negative
+    amounts = [amount for system in free for _, amount in amounts_of(system)]
+    assert min(amounts) < 0.0  # without mass action some are negative
 
 
-def coef_of(system) -> np.ndarray:
-    return np.array([system.model.terms(s).get(t, 0.0) for s, t in system.constraint.coefficients])
+def amounts_of(found) -> list:
+    return process_amounts(found.constraint, {s: found.model.terms(s) for s in STATES})
 
 
 def test_what_is_told_is_kept_beside_what_is_found(record):
@@ -173,8 +175,10 @@ def test_what_is_told_is_kept_beside_what_is_found(record):
     assert {(p.role, p.term) for p in found.constraint.processes} == {
         ("n_n to n_i", "n_n"), ("n_n to n_i", "n_i*n_n")
     }  # fmt: skip
-    values = process_values(found.constraint, coef_of(found))
-    assert values == pytest.approx([S, R], rel=2e-3)
+    assert [amount for _, amount in amounts_of(found)][:2] == pytest.approx([S, R], rel=2e-3)
+    assert [(p.role, amount) for p, amount in amounts_of(found)][2:] == [
+        ("n_n out", B), ("n_i out", A), ("n_n in", M)
+    ]  # fmt: skip
     assert found.model.terms("n_n")["n_n"] == pytest.approx(-S - B, rel=1e-3)
     assert found.model.terms("n_i")["n_i"] == -A
     with pytest.raises(ValueError, match="'n_n out' is not known of this record"):

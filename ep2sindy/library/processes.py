@@ -6,11 +6,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from ep2sindy.library.names import factors_of, product_of
 from ep2sindy.library.relations import Constraint
-from ep2sindy.library.roles import process_values
+from ep2sindy.library.roles import process_amounts
 
 IN, OUT = " in", " out"  # what enters is written first, and what leaves last
 SEPARATE = (IN, " free", " known")  # roles whose terms are written one by one
@@ -45,18 +43,17 @@ def groups_of(
     and digits in both of their equations. A process has an interval if one of the equations tells
     it apart from others by the same term.
     """
-    values = np.array([coef[state].get(term, 0.0) for state, term in held.coefficients])
-    amounts = [*process_values(held, values), *(p.value or 0.0 for p in held.known)]
+    amounts = process_amounts(held, coef)
     widths = [*_process_widths(held, reach or {}), *(0.0 for _ in held.known)]
     found: dict[str, list[Group]] = {}
     for state in held.states:
         parts: dict[str, list[Part]] = {}  # by role
-        for process, *number in zip([*held.processes, *held.known], amounts, widths, strict=True):
+        for (process, value), reached in zip(amounts, widths, strict=True):
             role = process.role
             key = f"{role} {process.term}" if role.endswith(SEPARATE) else role
             for (there, term), factor in process.factors.items():
                 if there == state:
-                    amount, width = (per * abs(factor) * float(each) for each in number)
+                    amount, width = (per * abs(factor) * each for each in (value, reached))
                     parts.setdefault(key, []).append((term, factor, amount, width))
         order = sorted(parts, key=lambda key: (key.endswith(OUT)) - (IN in key))
         found[state] = [_group(parts[key]) for key in order]

@@ -212,7 +212,7 @@ class Roles:
         were one.
         Raises ValueError for terms, which are of one zone's equations.
         """
-        named = [role.giver or isinstance(role.how, list | tuple) for role in self._roles]
+        named = [role.giver or not isinstance(role.how, str | Mapping) for role in self._roles]
         several = any("+" in role.name for role in self._roles)
         if several or any(role.how != FREE for role in compress(self._roles, named)):
             raise ValueError(
@@ -287,6 +287,11 @@ class Roles:
         if not self.nonnegative:
             yield from (self._process(role, term) for term in terms)
             return
+        if how != FREE and (wrong := [term for term in terms if not _holds(term, giver)]):
+            raise ValueError(
+                f"by mass action what lowers {giver!r} contains it: {wrong} came for the role "
+                f"{role.name!r}; name other terms, or leave nonnegative out"
+            )
         yield from (self._process(role, term) for term in terms if _holds(term, giver))
         back = Role(taker, giver, how)
         if how == FREE and taker and back.name not in self.names:
@@ -434,14 +439,16 @@ def shares_of(held: Constraint) -> Float[np.ndarray, "free processes"]:
     return np.array([[p.factors.get(at, 0.0) for p in held.processes] for at in places])
 
 
-def process_values(
-    held: Constraint, coef: Float[np.ndarray, " coefs"]
-) -> Float[np.ndarray, " processes"]:
-    """The coefficient of every process to be found, from all coefficients of the constraint."""
+def process_amounts(
+    held: Constraint, terms: Mapping[str, Mapping[str, float]]
+) -> list[tuple[Process, float]]:
+    """Every process with its coefficient, those to be found first; terms of a model by state."""
     known = summed(held.known)
-    found = coef[held.free] - [known.get(held.coefficients[k], 0.0) for k in held.free]
-    values: Float[np.ndarray, " processes"] = np.linalg.solve(shares_of(held), found)
-    return values
+    places = [held.coefficients[k] for k in held.free]
+    found = [terms[s].get(term, 0.0) - known.get((s, term), 0.0) for s, term in places]
+    values = np.linalg.solve(shares_of(held), found).tolist()
+    told = [(process, process.value or 0.0) for process in held.known]
+    return [*zip(held.processes, values, strict=True), *told]
 
 
 def _independent_rows(matrix: Float[np.ndarray, "rows columns"]) -> np.ndarray:

@@ -143,8 +143,9 @@ def _system(
         return None
     empty = np.zeros((len(task.library), len(task.states)))
     model = SparseModel(task.library, task.states, empty, task.runs[0].units)
-    known = np.array([roles.known.get(held.coefficients[k], 0.0) for k in held.free])
-    coef = held.coef(shares_of(held) @ values + known)
+    known = roles.known
+    told = np.array([known.get(held.coefficients[k], 0.0) for k in held.free])
+    coef = held.coef(shares_of(held) @ values + told)
     return TrialSystem(with_coef(model, held, coef)[0], held)
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Process, Relation, binding, constraint
-from ep2sindy.library.roles import process_values
+from ep2sindy.library.roles import process_amounts
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
@@ -68,9 +68,9 @@ class TrialSystem:
         processes = self.constraint.processes
         if self.means is None and not any(process.one_sign for process in processes):
             return []
-        terms = {state: model.terms(state) for state in model.states}
-        coef = np.array([terms[s].get(term, 0.0) for s, term in self.constraint.coefficients])
-        return broken_demands(processes, process_values(self.constraint, coef), self.means)
+        amounts = process_amounts(self.constraint, {s: model.terms(s) for s in model.states})
+        values = np.array([amount for _, amount in amounts[: len(processes)]])
+        return broken_demands(processes, values, self.means)
 
     def refined_on_all(
         self,

@@ -16,16 +16,22 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.living import balance_figure
 from ep2sindy.library.relations import Constraint, Process, constraint
-from ep2sindy.library.roles import constraint_of, process_values
+from ep2sindy.library.roles import constraint_of, process_amounts
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.scores import r2
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
-from ep2sindy.studies.told import IONS, NEUTRALS, is_constant, recorded_rates
+from ep2sindy.studies.told import (
+    IONS,
+    NEUTRALS,
+    FittedRate,
+    fitted_rate,
+    rate_r2,
+    recorded_rates,
+)
 
 NO_SIZES: Mapping[str, float] = MappingProxyType({})
 CAPTION = (
@@ -65,9 +71,7 @@ class ComparedProcess:
     @property
     def r2(self) -> float:
         """R2 at each instant; NaN for a rate that is constant or not recorded."""
-        if self.recorded is None or is_constant(self.recorded):
-            return float("nan")
-        return float(r2(truth=self.recorded, prediction=self.modelled[None])[0])
+        return float("nan") if self.recorded is None else rate_r2(self.recorded, self.modelled)
 
 
 PROCESSES: Metrics[ComparedProcess] = [
@@ -101,10 +105,8 @@ def compared_processes(
     it; else what is given back is subtracted, as the model's terms are net of it.
     """
     theta = model.library.evaluate(data.columns(model.library.variables))
-    coef = np.array([model.terms(s).get(term, 0.0) for s, term in held_to.coefficients])
     found: dict[tuple[str, str], dict[str, float]] = {}
-    amounts = [*process_values(held_to, coef).tolist(), *(p.value or 0.0 for p in held_to.known)]
-    for process, amount in zip([*held_to.processes, *held_to.known], amounts, strict=True):
+    for process, amount in process_amounts(held_to, {s: model.terms(s) for s in model.states}):
         found.setdefault(_ends(process), {})[process.term] = amount
     known = {zone: recorded_rates(balance, data) for zone, balance in balances.items()}
     gone = _through_ends(known, sizes or dict.fromkeys(balances, 1.0))
@@ -114,29 +116,17 @@ def compared_processes(
         gross = ends[::-1] in found
         rate = _zone_rate(*ends, known, gone, gross=gross)
         modelled = columns @ np.array([*terms.values()])
-        beside = _counterpart(rate, columns, list(terms))
+        beside = fitted_rate(rate, columns, list(terms)) if rate is not None else FittedRate({})
         words = _zone_words(*ends, gross=gross)
-        compared.append(ComparedProcess(words, ends, rate, modelled, terms, *beside))
+        compared.append(
+            ComparedProcess(words, ends, rate, modelled, terms, beside.terms, beside.r2)
+        )
     return compared
 
 
 def _order(giver: str, taker: str) -> int:
     """What enters first, what leaves last."""
     return 0 if not giver else 2 if not taker else 1
-
-
-def _counterpart(
-    rate: np.ndarray | None, columns: np.ndarray, terms: Sequence[str]
-) -> tuple[dict[str, float], float]:
-    """Coefficients of these terms by least squares on the recorded rate, and R2."""
-    if rate is None:
-        return {}, float("nan")
-    size = np.abs(columns).max(axis=0)
-    coef = np.linalg.lstsq(columns / size, rate, rcond=None)[0] / size
-    if is_constant(rate):
-        return dict(zip(terms, coef.tolist(), strict=True)), float("nan")
-    score = float(r2(truth=rate, prediction=(columns @ coef)[None])[0])
-    return dict(zip(terms, coef.tolist(), strict=True)), score
 
 
 def _ends(process: Process) -> tuple[str, str]:

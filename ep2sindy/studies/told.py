@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
@@ -23,14 +24,14 @@ TELLING: Mapping[str, tuple[str, Sequence[str]]] = {
 
 
 @dataclass(frozen=True)
-class ToldRole:
-    """A role as the record gives it: its terms with coefficients in SI, and R2 at each instant."""
+class FittedRate:
+    """A recorded rate by terms, their coefficients in SI, with R2 at each instant."""
 
     terms: Mapping[str, float]
-    r2: float
+    r2: float = float("nan")
 
 
-def told_roles(balances: Mapping[str, xr.Dataset], run: Trajectory) -> dict[str, ToldRole]:
+def told_roles(balances: Mapping[str, xr.Dataset], run: Trajectory) -> dict[str, FittedRate]:
     """What the balances of zones tell about roles, over the samples of a run.
 
     balances: by zone, from `ep.thruster.zone_balance`; a single one is called "". The inflow is the
@@ -41,30 +42,38 @@ def told_roles(balances: Mapping[str, xr.Dataset], run: Trajectory) -> dict[str,
     for zone, balance in balances.items():
         if "supply" in balance:
             name = f"{NEUTRALS}@{zone} in" if zone else f"{NEUTRALS} in"
-            found[name] = ToldRole({"1": float(balance["supply"].mean())}, 1.0)
-    known = recorded_rates(balances[""], run) if "" in balances else {}
+            found[name] = FittedRate({"1": float(balance["supply"].mean())})
+    if "" not in balances or not {IONS, NEUTRALS} <= set(run.state_names):
+        return found
+    known, library = recorded_rates(balances[""], run), polynomial(run.state_names, degree=2)
     for role, (rate, terms) in TELLING.items():
-        if rate in known and {IONS, NEUTRALS} <= set(run.state_names):
-            found[role] = fitted_rate(known[rate], run, terms)
+        if rate in known:
+            columns = library.evaluate(run.states)[:, [library.index(term) for term in terms]]
+            found[role] = fitted_rate(known[rate], columns, terms)
     return found
 
 
-def fitted_rate(rate: np.ndarray, run: Trajectory, terms: Sequence[str]) -> ToldRole:
-    """A rate at every sample of a run by least squares on terms of its states."""
-    library = polynomial(run.state_names, degree=3)
-    theta = library.evaluate(run.states)[:, [library.index(term) for term in terms]]
-    size = np.abs(theta).max(axis=0)
-    coef = np.linalg.lstsq(theta / size, rate, rcond=None)[0] / size
-    score = float(r2(truth=rate, prediction=(theta @ coef)[None])[0])
-    return ToldRole(dict(zip(terms, coef.tolist(), strict=True)), score)
+def fitted_rate(
+    rate: Float[np.ndarray, " samples"],
+    columns: Float[np.ndarray, "samples terms"],
+    terms: Sequence[str],
+) -> FittedRate:
+    """A rate by least squares on terms, whose values are the columns."""
+    size = np.abs(columns).max(axis=0)
+    coef = np.linalg.lstsq(columns / size, rate, rcond=None)[0] / size
+    return FittedRate(dict(zip(terms, coef.tolist(), strict=True)), rate_r2(rate, columns @ coef))
+
+
+def rate_r2(
+    recorded: Float[np.ndarray, " samples"], modelled: Float[np.ndarray, " samples"]
+) -> float:
+    """R2 at each instant; NaN for a recorded rate that varies by no more than rounding."""
+    if np.ptp(recorded) <= 1e-6 * np.abs(recorded).max():
+        return float("nan")
+    return float(r2(truth=recorded, prediction=modelled[None])[0])
 
 
 def recorded_rates(balance: xr.Dataset, data: Trajectory) -> dict[str, np.ndarray]:
     """Terms of the balance at the samples of the trajectory."""
     there = np.isin(balance["time"].values, data.t)
     return {str(name): balance[name].values[there] for name in balance.data_vars}
-
-
-def is_constant(rate: np.ndarray) -> bool:
-    """Whether a rate varies by no more than rounding, so that no R2 can be given."""
-    return bool(np.ptp(rate) <= 1e-6 * np.abs(rate).max())
