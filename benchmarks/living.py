@@ -31,7 +31,7 @@ from ep2sindy.library.relations import Constraint
 from ep2sindy.model.free_run import cycle_of
 from ep2sindy.studies.balance import ComparedProcess, compared_processes
 from ep2sindy.studies.living import start_of
-from ep2sindy.studies.told import told_roles
+from ep2sindy.studies.told import fitted_rate, recorded_rates, told_roles
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 CHANNEL, DOWNSTREAM = "channel", "downstream"
@@ -360,6 +360,20 @@ def print_law(search: Callable) -> None:
         print("\n".join([line(label, cases), balances(cases), f"    {medians}"]), flush=True)
 
 
+def print_profiles() -> None:
+    """Ionization in the channel by the product of the means: least squares, and R2.
+
+    The mean of a product is not the product of the means: the factor is that of the profiles.
+    """
+    print("\nionization = eps <n_i> <n_n> <R_ion> over the whole channel")
+    for label in POINTS:
+        zone = ep.Zone(z=CHANNEL)
+        run = ep.zone_average(field(label), zone, states=(*STATES, "R_ion"), label=label)
+        rate = recorded_rates(record(label).balances[""], run)["ionization"]
+        found = fitted_rate(rate, run.states.prod(axis=1)[:, None], ["n_i*n_n*R_ion"])
+        print(f"{label:24s} eps {found.terms['n_i*n_n*R_ion']:.2f}, R2 {found.r2:.3f}", flush=True)
+
+
 def print_several(n_zones: int, draws: Sequence[tuple[str, int]]) -> None:
     """Six operating points, the channel cut into zones of equal length."""
     print(f"\n{n_zones} zones, equations that conserve: median / worst of {len(draws)} draws")
@@ -442,6 +456,7 @@ def main() -> None:
         "points": print_points,
         "law": lambda: print_law(law),
         "law_told": lambda: print_law(law_told),
+        "profiles": print_profiles,
         "former": lambda: print_points("former", draws=ONCE),
         "free": lambda: print_points(search=free),
         "zones": print_zones,

@@ -192,7 +192,7 @@ def test_points_of_a_thruster_are_proposed_to_both_studies_of_points(
     assert re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out) == [
         "+exp=parametric data=recognised 'points.files=V{V_D_V}_m5.csv' thesis=null 'trends=[]'",
         "+exp=predict data=recognised 'points.files=V{V_D_V}_m5.csv' '~models.inflow' "
-        "'~models.law' '~models.leaving'",
+        "'~models.conserving' '~models.leaving'",
     ]
 
 

@@ -38,7 +38,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "discover": (),
 }
 
-WITH_INFLOW = ("inflow", "law", "leaving")  # models of +exp=predict that need mdot_mg_s
+WITH_INFLOW = ("inflow", "conserving", "leaving")  # models of +exp=predict that need mdot_mg_s
 NOT_STATES = ("R_ion", "V_d")  # what drives a model
 
 

@@ -361,7 +361,8 @@ def run_title(run: FreeRun) -> str:
 
 def _note(living: Living) -> str:
     """Note on the selection, the stability, and the columns of the table."""
-    found = [f"By its terms: {words}." for words in consequences(living.model)]
+    proved = consequences(living.model)
+    found = [f"By its terms {'; '.join(proved)}."] if proved else []
     found.append(f"Selection: {living.discovery.note}.")
     found += [living.free.text] if living.free.text else []
     found += [f"Misfit: {living.discovery.misfit}."] if living.discovery.misfit else []
