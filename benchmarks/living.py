@@ -28,8 +28,10 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
+from ep2sindy.library.roles import shares_of, summed
 from ep2sindy.model.free_run import cycle_of
-from ep2sindy.studies.balance import ComparedProcess, compared_processes
+from ep2sindy.refinement.refine import with_coef
+from ep2sindy.studies.balance import ComparedProcess, compared_processes, ends_of
 from ep2sindy.studies.living import start_of
 from ep2sindy.studies.told import fitted_rate, recorded_rates, told_roles
 
@@ -349,15 +351,33 @@ def print_law(search: Callable) -> None:
     """Six operating points, terms that are given: the worst of three splits, and coefficients."""
     print(f"\n{search.__doc__} Coefficients over those of the record: medians of the splits")
     for label in POINTS:
-        whole, ratios, cases = record(label), [], []
+        whole, ratios, cases, verdicts = record(label), [], [], []
         for split, seed in ONCE:
             cases.append(case(*parts(whole.run, split), whole, seed=seed, search=search))
             found = search(parts(whole.run, split)[0], whole, seed=seed)
             compared = whole.processes(found.model, found.constraint)
             pairs = [(p.coef[term], p.counterpart[term]) for p in compared for term in p.coef]
             ratios.append([model / recorded for model, recorded in pairs])
+            run = by_the_record(found, compared, parts(whole.run, split)[1])
+            verdicts.append(f"{run.verdict}, f {run.f_error:+.0%}")
         medians = ", ".join(f"{ratio:.2f}" for ratio in np.median(ratios, axis=0))
         print("\n".join([line(label, cases), balances(cases), f"    {medians}"]), flush=True)
+        print(f"    with the record's own coefficients: {verdicts[0]}", flush=True)
+
+
+def by_the_record(
+    found: ep.Discovery, compared: Sequence[ComparedProcess], judged: ep.Trajectory
+) -> ep.FreeRun:
+    """The terms of a model with the coefficients of the record, run freely."""
+    held, model = found.constraint, found.model
+    assert held is not None
+    recorded = {(p.ends, term): value for p in compared for term, value in p.counterpart.items()}
+    values = [recorded[ends_of(process), process.term] for process in held.processes]
+    known = summed(held.known)
+    told = [known.get(held.coefficients[k], 0.0) for k in held.free]
+    coef = held.coef(shares_of(held) @ np.array(values) + told)
+    changed = with_coef(model, held, coef)[0]
+    return ep.free_run(changed, judged, initial=start_of(judged, model))
 
 
 def print_profiles() -> None:

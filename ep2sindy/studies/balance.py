@@ -107,7 +107,7 @@ def compared_processes(
     theta = model.library.evaluate(data.columns(model.library.variables))
     found: dict[tuple[str, str], dict[str, float]] = {}
     for process, amount in process_amounts(held_to, {s: model.terms(s) for s in model.states}):
-        found.setdefault(_ends(process), {})[process.term] = amount
+        found.setdefault(ends_of(process), {})[process.term] = amount
     known = {zone: recorded_rates(balance, data) for zone, balance in balances.items()}
     gone = _through_ends(known, sizes or dict.fromkeys(balances, 1.0))
     compared = []
@@ -129,7 +129,7 @@ def _order(giver: str, taker: str) -> int:
     return 0 if not giver else 2 if not taker else 1
 
 
-def _ends(process: Process) -> tuple[str, str]:
+def ends_of(process: Process) -> tuple[str, str]:
     """The state that a process takes from, and the one that it gives to; "" is the outside."""
     giver, taker = (
         next((state for (state, _), f in process.factors.items() if sign * f > 0.0), "")
@@ -364,7 +364,7 @@ def _roles(
             coef = model.terms(state).get(term, 0.0)
             found.append(TermRole(state, term, coef, not follows.any(), run))
         return found
-    by_process = {(_ends(p), p.term): k for k, p in enumerate(held_to.processes)}
+    by_process = {(ends_of(p), p.term): k for k, p in enumerate(held_to.processes)}
     found = []
     for each in processes:
         for term, coef in each.coef.items():
