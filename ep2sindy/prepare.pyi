@@ -8,5 +8,6 @@ from ep2sindy.data.in_time import detrend as detrend  # for configs
 from ep2sindy.data.in_time import derivative as derivative  # for configs
 from ep2sindy.data.in_time import delay as delay  # for configs
 from ep2sindy.data.prepare import derive as derive  # for configs
+from ep2sindy.data.prepare import gradient as gradient  # for configs
 from ep2sindy.data.prepare import keep_where as keep_where  # for configs
 from ep2sindy.data.prepare import radial_from_middle as radial_from_middle  # for configs

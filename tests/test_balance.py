@@ -40,6 +40,15 @@ def test_the_balance_of_the_whole_channel_closes_term_by_term(exact: xr.Dataset)
     assert float(np.abs(neutrals).max()) < 1e-6 * largest
 
 
+def test_continuity_closes_in_every_cell_with_gradients_by_faces(field: xr.Dataset) -> None:
+    ions = ep.prepare.gradient(field, of="n_i*u_iz", name="div")
+    neutrals = ep.prepare.gradient(field, of="face_flux_n", name="div")
+    born = field["ionization"] - field["wall_loss"]
+    for density, side, sign in (("n_i", ions, 1.0), ("n_n", neutrals, -1.0)):
+        left = field[f"d{density}_dt"] - sign * born + side["div"]
+        assert float(np.abs(left).isel(z=slice(-1)).max()) < 2e-5 * float(born.max())  # float32
+
+
 def test_the_supply_is_the_mass_flow(field: xr.Dataset, exact: xr.Dataset) -> None:
     thruster = ep.thruster.Thruster()
     particles = 1e-6 * 5.0 / (thruster.propellant.mass * thruster.area)

@@ -282,3 +282,18 @@ def test_a_killed_run_ends_with_the_same_file(grid: Path, tmp_path: Path) -> Non
     (other,) = broken.rglob("pointwise.nc")
     assert one.read_bytes() == other.read_bytes()
     assert "going on with 5 of 30 points" in (other.parent / "run.log").read_text()
+
+
+def test_continuity_is_found_at_every_point_of_a_simulated_channel(tmp_path: Path) -> None:
+    small = ["data.n_cells=40", "data.duration_s=6e-4", "data.warm_up_s=2e-4", "data.cache=null"]
+    folders = [f"output={tmp_path}/outputs", f"keep={tmp_path}/kept", "parallel=serial"]
+    found = programs.computed(composed("pointwise=continuity", "bootstraps.n=4", *small, *folders))
+    with xr.open_dataset(found.folder / "pointwise.nc") as result:
+        inside = result.where((result["z"] > 0.003) & (result["z"] < 0.022), drop=True)["coef"]
+        ions, neutrals = inside.sel(equation="n_i"), inside.sel(equation="n_n")
+        ionized = ions.sel(term="ionization")
+        np.testing.assert_array_equal(ionized, -neutrals.sel(term="ionization"))
+        np.testing.assert_allclose(ionized, 1.0, rtol=0.05)
+        np.testing.assert_allclose(ions.sel(term="div_i"), -1.0, rtol=0.05)
+        speeds = -neutrals.sel(term="grad_n")
+        assert float(speeds.median()) == pytest.approx(338.0, rel=0.03)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from ep2sindy.data.prepare import gradient
 from ep2sindy.data.sampling import point_samples
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
@@ -17,11 +18,13 @@ from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
 from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak
 from ep2sindy.runtime import parallel
 from ep2sindy.runtime.parallel import Dask, Loky, Serial
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.refined import RefinedScore
+from ep2sindy.signals.smoothers import NoSmoothing
 
 T = np.linspace(0.0, 2.0, 201)
 Z, R = np.array([0.01, 0.02, 0.03, 0.04]), np.array([0.035, 0.04, 0.05])
@@ -339,3 +342,84 @@ def test_rules_that_refine_all_equations_serve_every_point() -> None:
     field = parabolas(Z[:1], R[:1])
     result = pointwise(field, searching(selection=RefinedScore()), workers=Serial())
     assert result["n_terms"].item() == 2
+
+
+EXACT = [
+    Differential(smoother=NoSmoothing()),
+    Weak(Bumps(half_width_s=0.1), NoSmoothing(), smooth_library=False, errors_in_variables=False),
+]
+
+
+@pytest.mark.parametrize("formulation", EXACT, ids=["differential", "weak"])
+def test_a_travelling_wave_has_its_speed_at_every_point(formulation: object) -> None:
+    z, speed = np.array([0.0, 0.1, 0.3, 0.35]), 0.7
+    wave = (z - speed * T[:, None] + 2.0) ** 2  # whose differences are exact
+    axes = {"time": ("time", T, {"units": "s"}), "z": ("z", z)}
+    field = xr.Dataset({"x": (("time", "z"), wave, {"units": "m^-3"})}, coords=axes)
+    field = gradient(field, of="x", name="dx_dz")
+    library = named_terms(["x", "dx_dz"], ["1", "x", "dx_dz"])
+    found = searching(library=library, formulation=formulation, bootstraps=Bootstraps(n_culled=0))
+    result = pointwise(field, found, workers=Serial()).sel(equation="x")
+    np.testing.assert_allclose(result["coef"].sel(term="dx_dz"), -speed, rtol=1e-8)
+    assert (result["coef"].sel(term=["1", "x"]) == 0.0).all()
+    assert result["coef_units"].sel(term="dx_dz").item() == "m s^-1"
+
+
+SHARED = "x: u == -1 * y: u"
+
+
+def exchanging(noise: float) -> xr.Dataset:
+    """x' = 2 u - w and y' = -2 u + 3 w at every point, for u = 1 + t and w = 1 - t^2."""
+    x, y = 2.0 * T + T**2 - (T - T**3 / 3.0), -2.0 * T - T**2 + 3.0 * (T - T**3 / 3.0)
+    rng = np.random.default_rng(0)
+    arrays = {
+        "x": x[:, None] + noise * rng.standard_normal((len(T), 2)),
+        "y": y[:, None] + noise * rng.standard_normal((len(T), 2)),
+        "u": 1.0 + T[:, None] + np.zeros(2),
+        "w": 1.0 - T[:, None] ** 2 + np.zeros(2),
+    }
+    data = {name: (("time", "z"), a, {"units": "1"}) for name, a in arrays.items()}
+    return xr.Dataset(data, coords={"time": ("time", T, {"units": "s"}), "z": ("z", Z[:2])})
+
+
+def sharing(**changes: object) -> PointSearch:
+    settings = {"states": ["x", "y"], "formulation": EXACT[1], "relations": [SHARED]} | changes
+    library = named_terms(["x", "y", "u", "w"], ["u", "w"])
+    draws = Bootstraps(n=4, n_culled=0)
+    return searching(**{"library": library, "bootstraps": draws, **settings})
+
+
+def test_relations_tie_equations_at_every_point_and_in_every_draw() -> None:
+    exact = pointwise(exchanging(0.0), sharing(), workers=Serial())
+    expected = np.array([[2.0, -1.0], [-2.0, 3.0]])[:, :, None] + np.zeros(2)
+    for name in ("coef", "coef_draws"):
+        np.testing.assert_allclose(*np.broadcast_arrays(exact[name], expected), rtol=1e-6)
+    np.testing.assert_allclose(exact["r2_test"], 1.0, rtol=1e-9)
+    noisy, free = (
+        pointwise(exchanging(0.05), sharing(relations=tied), workers=Serial())
+        for tied in ([SHARED], [])
+    )
+    for name in ("coef", "coef_draws"):
+        x, y = (noisy[name].sel(term="u", equation=e) for e in ("x", "y"))
+        np.testing.assert_allclose(x, -y, rtol=1e-12)
+        assert not np.allclose(*(free[name].sel(term="u", equation=e) for e in ("x", "y")))
+    weights = np.abs(noisy["weight_draws"]).sum("term")
+    np.testing.assert_allclose(weights, 1.0, rtol=1e-12)
+    assert (noisy["r2_train"] < free["r2_train"]).all()
+
+
+def test_a_draw_of_all_rows_is_the_fit_of_all_rows() -> None:
+    """Blocks as long as the rows draw each of them once."""
+    whole = Bootstraps(n=2, n_culled=0, smallest=1.0, largest=1.0, block=len(T))
+    form = Differential(smoother=NoSmoothing(), split=RandomSplit(test_fraction=0.0))
+    search = sharing(formulation=form, bootstraps=whole)
+    result = pointwise(exchanging(0.05), search, workers=Serial())
+    same = np.broadcast_arrays(result["coef_draws"], result["coef"])
+    np.testing.assert_allclose(*same, rtol=1e-9)
+
+
+def test_relations_that_cannot_hold_are_refused_at_once() -> None:
+    with pytest.raises(ValueError, match="n_culled must be 0, 1 came"):
+        sharing(bootstraps=Bootstraps(n=4, n_culled=1))
+    with pytest.raises(ValueError, match="'v'"):
+        sharing(relations=["x: v == -1 * y: v"])

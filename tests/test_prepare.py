@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 from ep2sindy.data.in_time import crop, decimate, low_pass
-from ep2sindy.data.prepare import derive, keep_where, radial_from_middle
+from ep2sindy.data.prepare import derive, gradient, keep_where, radial_from_middle
 from ep2sindy.thruster import propellants
 from ep2sindy.thruster.ionization import ionization_rate, read_rate_table
 from ep2sindy.thruster.propellant_files import propellant
@@ -274,3 +274,88 @@ def test_a_gas_has_its_range_and_its_own_table(tmp_path: Path) -> None:
         ionization_rate(warm(), gas="neon")
     with pytest.raises(ValueError, match="gas='argon' came beside"):
         ionization_rate(warm(), gas="argon", table=tmp_path / "rates.csv")
+
+
+Z_UNEVEN = np.array([0.0, 1.0, 3.0, 3.5])
+
+
+def uneven(values: np.ndarray, **more: np.ndarray) -> xr.Dataset:
+    """Field of two samples on uneven cells along z: n_i, twice as large at the second sample."""
+    arrays = {"n_i": values} | more
+    return xr.Dataset(
+        {
+            name: (("time", "z"), np.stack([array, 2.0 * array]), {"units": "m^-3"})
+            for name, array in arrays.items()
+        },
+        coords={"time": [0.0, 1.0], "z": Z_UNEVEN},
+    )
+
+
+def test_the_gradient_of_a_parabola_is_exact_on_uneven_cells() -> None:
+    found = gradient(uneven(5.0 + Z_UNEVEN + 3.0 * Z_UNEVEN**2), of="n_i", name="slope")["slope"]
+    np.testing.assert_allclose(found[0], 1.0 + 6.0 * Z_UNEVEN, rtol=1e-13)
+    np.testing.assert_allclose(found[1], 2.0 * found[0], rtol=1e-13)
+    assert found.attrs["units"] == "m^-4"
+
+
+def test_two_cells_have_the_gradient_of_a_straight_line() -> None:
+    found = gradient(uneven(7.0 * Z_UNEVEN).isel(z=[1, 2]), of="n_i", name="slope")["slope"]
+    np.testing.assert_allclose(found[0], 7.0, rtol=1e-13)
+
+
+def test_the_gradient_of_a_product_goes_along_r_and_keeps_units() -> None:
+    z, r = np.array([0.0, 1.0, 2.0]), np.array([1.0, 2.0])
+    both = field(
+        n_i=(("time", "z", "r"), np.ones((N, 1, 1)) * (z[:, None] * r), "m^-3"),
+        u_ir=(("r",), 3.0 * r, "m/s"),
+    )
+    found = gradient(both, of="n_i*u_ir", axis="r", name="slope")["slope"]
+    np.testing.assert_allclose(found[0], 9.0 * z[:, None] * np.ones(2))
+    assert found.attrs["units"] == "m^-3 s^-1"
+    assert found.dims == ("time", "z", "r")
+
+
+def test_by_faces_the_divergence_telescopes() -> None:
+    faces = np.array([0.0, 1.0, 3.0, 3.5, 6.0])
+    flux = np.array([2.0, 7.0, -1.0, 4.0])
+    cells = uneven(np.ones(4), u_iz=np.array([0.0, 9.0, 1.0, 5.0]), face_flux_i=flux)
+    cells = cells.assign_coords(z=0.5 * (faces[:-1] + faces[1:]))
+    cells = cells.assign(dz=("z", np.diff(faces), {"units": "m"}))
+    cells["face_flux_i"].attrs |= {"face_average_of": "n_i*u_iz"}
+    for of in ("n_i*u_iz", "u_iz*n_i", "face_flux_i"):
+        slope = gradient(cells, of=of, name="slope")["slope"]
+        total = (slope * cells["dz"]).isel(z=slice(3)).sum("z")
+        np.testing.assert_allclose(total, [4.0 - 2.0, 2.0 * (4.0 - 2.0)], rtol=1e-13)
+        assert np.isnan(slope[:, 3]).all()  # its far face is not recorded
+    with pytest.raises(ValueError, match="cells that touch each other"):
+        gradient(cells.isel(z=[0, 2, 3]), of="n_i*u_iz", name="slope")
+
+
+def test_a_gradient_without_faces_takes_the_average_of_the_product() -> None:
+    line = uneven(np.ones(4), u_iz=np.zeros(4), flux_i=4.0 * Z_UNEVEN)
+    line["flux_i"].attrs["average_of"] = "n_i*u_iz"
+    found = gradient(line, of="n_i*u_iz", name="slope")["slope"]
+    np.testing.assert_allclose(found[0], 4.0, rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"of": "n_i", "axis": "r"}, r"two or more cells along z or r: .*'z': 4.* came"),
+        ({"of": "n_i", "axis": "time"}, "two or more cells along z or r"),
+        ({"of": "I_d"}, r"gradient of 'I_d' along 'z' needs .*sizes \{'time': 2\} came"),
+        ({"of": "n_n*u_n"}, "unknown variable 'n_n'; this field has"),
+        ({"of": "n_i+2"}, "a product is variables joined by"),
+        ({"of": "n_i", "name": "n_i"}, "already has 'n_i'"),
+        ({"of": "n_i", "name": "d n/dz"}, "d n/dz"),
+    ],
+)
+def test_a_gradient_that_cannot_be_taken_says_why(settings: dict[str, str], message: str) -> None:
+    line = uneven(np.ones(4)).assign(I_d=("time", [1.0, 2.0], {"units": "A"}))
+    with pytest.raises(ValueError, match=message):
+        gradient(line, **{"name": "slope", **settings})
+
+
+def test_one_cell_has_no_gradient() -> None:
+    with pytest.raises(ValueError, match=r"two or more cells along z or r: .*'z': 1.* came"):
+        gradient(uneven(np.ones(4)).isel(z=[0]), of="n_i", name="slope")

@@ -14,7 +14,9 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.fields import SPACE, check_field, grid_points, mask_outside
-from ep2sindy.library.names import check_variable
+from ep2sindy.data.zones import FACES, average_of
+from ep2sindy.library.names import check_variable, split_factors
+from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.screen import cut
 
 OPERATORS: Mapping[type, Callable] = {
@@ -55,6 +57,56 @@ def derive(field: xr.Dataset, *, name: str, expression: str, units: str) -> xr.D
     derived = field.assign({name: array.drop_attrs(deep=False).assign_attrs(units=units)})
     check_field(derived)
     return derived
+
+
+def gradient(field: xr.Dataset, *, of: str, name: str, axis: str = "z") -> xr.Dataset:
+    """Add the variable `name`, the derivative along z or r of a variable or a product of variables.
+
+    of: such as "n_n", or "n_i*u_iz" for the flux of ions. If the record has that product at the
+    faces between its cells (attribute `face_average_of`, with the lengths `dz` of the cells, as in
+    the axial simulator's averages), the difference of a cell's two faces is taken: the divergence
+    that moved the simulator's density. The last cell, whose far face is not recorded, is then NaN.
+    Otherwise differences over the neighbouring cells are taken, of second order on uneven grids,
+    from the record's time average of the product (attribute `average_of`) if it has one; they are
+    one-sided at the ends, and NaN beside a masked cell. Computed in float64.
+    It is the slope alone: the divergence of a radial flux q in a cylinder is (1/r) d(r q)/dr, and
+    that of an axial one through a cross-section A that widens is (1/A) d(A q)/dz.
+    Raises ValueError for an axis that the field or the variables lack, a single cell, an unknown
+    variable, or a name that is taken.
+    """
+    check_variable(name)
+    if name in field:
+        raise ValueError(f"a gradient needs a new name: the field already has {name!r}")
+    _check_axis(field, axis, f"a gradient along {axis!r}")
+    at_faces = axis == "z" and "dz" in field
+    factors = average_of(field, split_factors(of), faces=at_faces)
+    array = evaluate(field, "*".join(f"{variable}^{power}" for variable, power in factors))
+    _check_axis(array, axis, f"the gradient of {of!r} along {axis!r}")
+    if at_faces and FACES in field[factors[0][0]].attrs:
+        slope = (array.shift({axis: -1}) - array) / _touching(field)
+    else:
+        slope = array.differentiate(axis, edge_order=2 if field.sizes[axis] > 2 else 1)
+    units = unit_product([*((field[v].attrs["units"], power) for v, power in factors), ("m", -1)])
+    return field.assign({name: slope.drop_attrs(deep=False).assign_attrs(units=units)})
+
+
+def _check_axis(data: xr.Dataset | xr.DataArray, axis: str, what: str) -> None:
+    if axis not in SPACE or data.sizes.get(axis, 1) < 2:
+        raise ValueError(
+            f"{what} needs two or more cells along z or r: sizes {dict(data.sizes)} came; name an "
+            "axis of several cells, or take the step before the cells are averaged"
+        )
+
+
+def _touching(field: xr.Dataset) -> xr.DataArray:
+    """Lengths of cells that touch each other: the face of the next one is then a cell's own."""
+    dz, z = field["dz"].astype(np.float64), grid_points(field, "z")
+    if not np.allclose(np.diff(z), 0.5 * (dz.values[1:] + dz.values[:-1]), rtol=1e-3, atol=0.0):
+        raise ValueError(
+            "values at faces need cells that touch each other: the distances of z are not those of "
+            "the lengths dz; take the gradient before cells are left out"
+        )
+    return dz
 
 
 def radial_from_middle(field: xr.Dataset, *, middle_m: float | None = None) -> xr.Dataset:

@@ -59,7 +59,7 @@ def zone_average(
     """
     check_field(field)
     columns = {name: [(name, 1)] for name in (*states, *inputs)}
-    columns |= {f"<{p.replace(' ', '')}>": _average_of(field, split_factors(p)) for p in products}
+    columns |= {f"<{p.replace(' ', '')}>": average_of(field, split_factors(p)) for p in products}
     used = list(dict.fromkeys(name for factors in columns.values() for name, _ in factors))
     _check_names(field, used, [*states, *inputs, *products])
     slices = zone_slices(field, resolve_zone(zone, field))
@@ -85,13 +85,20 @@ def zone_average(
 
 Factors = list[tuple[str, int]]
 
+# Attribute: the product whose average over a cell's face, towards the anode, the variable holds.
+FACES = "face_average_of"
 
-def _average_of(field: xr.Dataset, factors: Factors) -> Factors:
-    """Factors of a product, or the variable that holds its time average if the field has one."""
-    for name, variable in field.data_vars.items():
-        kept = variable.attrs.get("average_of")
-        if kept is not None and sorted(split_factors(kept)) == sorted(factors):
-            return [(str(name), 1)]
+
+def average_of(field: xr.Dataset, factors: Factors, *, faces: bool = False) -> Factors:
+    """Factors of a product, or the variable that holds its time average if the field has one.
+
+    faces: prefer the variable that holds it at the faces of the cells.
+    """
+    for attribute in (FACES, "average_of")[not faces :]:
+        for name, variable in field.data_vars.items():
+            kept = variable.attrs.get(attribute)
+            if kept is not None and sorted(split_factors(kept)) == sorted(factors):
+                return [(str(name), 1)]
     return factors
 
 

@@ -18,7 +18,7 @@ from scipy.sparse import csr_array
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import LEAST
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.method import Regression
+from ep2sindy.discovery.method import Regression, SearchedEquation
 from ep2sindy.discovery.point_kernels import (
     add_steps,
     alike,
@@ -34,7 +34,10 @@ from ep2sindy.discovery.point_kernels import (
     supports_of_draws,
 )
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Constraint, Relation, constraint, relations_of
+from ep2sindy.model.scores import r2
 from ep2sindy.regression.ambiguity import SAME, row_limit, simplest_first
+from ep2sindy.regression.constrained import constrained_draws
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.front import REFINED, front_order
 from ep2sindy.regression.gram_kernels import all_usable
@@ -71,6 +74,8 @@ LAYOUT: Mapping[str, tuple[str, ...]] = {
 class PointSearch:
     """Settings of the search at every point, whose spread is taken over the bootstraps.
 
+    relations: between coefficients, such as "n_i: S == -1 * n_n: S" for ionization S, which makes
+    of a neutral an ion; the same at every point.
     least_variation: standard deviation of every state, as a share of its root mean square, below
     which a point counts as having no dynamics. seed: every point has the same split and the same
     draws, so that results differ by place alone.
@@ -81,6 +86,7 @@ class PointSearch:
     method: Regression
     least_variation: float = 1e-3
     seed: int = 0
+    relations: Sequence[Relation | str] = ()
 
     def __post_init__(self) -> None:
         check_list("states", self.states)
@@ -93,6 +99,14 @@ class PointSearch:
         check_kind("method", self.method, Regression, "ep.Regression(bootstraps=ep.Bootstraps())")
         if not (n := self.method.bootstraps.n):
             raise ValueError(f"a pointwise study needs bootstraps for its spread: n={n} came")
+        object.__setattr__(self, "relations", relations_of(self.relations))
+        every_term = dict.fromkeys(self.states, self.library.names)
+        constraint(self.library, every_term, self.relations)  # refuses those that cannot hold
+        if self.relations and (n_culled := self.method.bootstraps.n_culled):
+            raise ValueError(
+                "relations need all their terms in every bootstrap: n_culled must be 0, "
+                f"{n_culled} came"
+            )
 
     @cached_property
     def variables(self) -> tuple[str, ...]:
@@ -110,7 +124,7 @@ def nothing(search: PointSearch) -> dict[str, np.ndarray]:
 def search_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
     """Search, select and fit at one point, and the spread over the bootstraps."""
     rng = np.random.default_rng(search.seed)
-    task = Task([run], search.library)
+    task = Task([run], search.library, relations_of(search.relations))
     equations = search.method.search_equations(task, rng=rng)
     fronts = [equation.front for equation in equations]
     choice = search.method.choose(fronts, task)
@@ -126,7 +140,32 @@ def search_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
         point["weight_draws"][:, row] = shares(fits)
         point["r2_train"][row], point["r2_test"][row] = chosen.r2_train, chosen.r2_test
         point["n_terms"][row] = chosen.n_terms
-    return point
+    return point if choice.constraint is None else _constrained(point, equations, choice.constraint)
+
+
+def _constrained(
+    point: Mapping[str, np.ndarray], equations: Sequence[SearchedEquation], held: Constraint
+) -> dict[str, np.ndarray]:
+    """A point's results with draws and R2 of coefficients that obey the constraint."""
+    problems = list(dict.fromkeys(equation.front.rows for equation in equations))
+    draws = {equation.front.equation: equation.draws for equation in equations}
+    found = constrained_draws(problems, draws, held)
+    drawn, weights = np.zeros((2, *point["coef_draws"].shape))
+    scores = np.full((2, len(equations)), np.nan)
+    for row, equation in enumerate(equations):
+        problem, target = equation.front.rows, equation.front.rows.target[:, equation.number]
+        for k, (state, term) in enumerate(held.coefficients):
+            if state == equation.front.equation:
+                drawn[:, row, problem.library.index(term)] = found[:, k]
+        weights[:, row] = shares(drawn[:, row] * problem.theta_scale)
+        for held_out in sorted({False, bool(problem.test.any())}):
+            at = problem.test == held_out
+            fitted = problem.theta[at] @ point["coef"][row]
+            scores[int(held_out), row] = r2(truth=target[at], prediction=fitted[None])[0]
+    return {
+        **point, "coef_draws": drawn, "weight_draws": weights,
+        "r2_train": scores[0], "r2_test": scores[1],
+    }  # fmt: skip
 
 
 def shares(contributions: Float[np.ndarray, "*draws terms"]) -> Float[np.ndarray, "*draws terms"]:
@@ -343,7 +382,7 @@ def compiled_points(search: PointSearch, t: Float[np.ndarray, " samples"]) -> Co
     """The compiled search, or None for settings and times that it does not serve."""
     method, library = search.method, search.library
     form, proposer, rule = method.formulation, method.search, method.selection
-    if library.functions or len(library) > MOST_TERMS or method.depth > 1:
+    if library.functions or len(library) > MOST_TERMS or method.depth > 1 or search.relations:
         return None
     if not isinstance(form, Differential) or not isinstance(rule, Knee | EBIC | AICc):
         return None

@@ -25,6 +25,7 @@ from ep2sindy.discovery.point_search import (
     nothing,
     search_point,
 )
+from ep2sindy.library.relations import relations_of
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.files import fingerprint
 from ep2sindy.runtime.kept import Kept
@@ -88,6 +89,7 @@ def search_key(field: xr.Dataset, search: PointSearch) -> str:
         "states": list(search.states),
         "terms": list(search.library.names),
         "functions": repr(search.library.functions),
+        "relations": [relation.text for relation in relations_of(search.relations)],
         "method": repr(search.method),
         "least_variation": search.least_variation,
         "seed": search.seed,

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.relations import ROUNDING, Constraint, place_of
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.regression.bootstraps import Resamples
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.whitening import WhitenedRows, whitened_rows
 
@@ -73,6 +74,32 @@ def constrained_fit(
         provenance=provenance,
         covariance=covariance[np.ix_(used, used)],
     )
+
+
+def constrained_draws(
+    problems: Sequence[RegressionRows], draws: Mapping[str, Resamples], constraint: Constraint
+) -> Float[np.ndarray, "draws coefs"]:
+    """Fit the free coefficients to all equations at once, in every bootstrap of their rows.
+
+    draws: of every equation's rows, as many for each. Equations weigh as in `constrained_fit`, by
+    their residuals on all rows; the noise of samples is not corrected. A coefficient whose terms
+    are zero in a draw is zero there. Returns all coefficients, in SI.
+    """
+    normal, right = 0.0, 0.0
+    for equation in weighted_equations(problems, constraint):
+        own, number = equation.terms, equation.number
+        drawn = draws[equation.problem.equations[number]]
+        scale = drawn.scale[:, own] * equation.problem.coef_scale(number)[own]
+        inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale != 0.0)[:, :, None]
+        gram, known = drawn.xx[:, own[:, None], own], inverse * constraint.d[equation.at, None]
+        weighted = (inverse * constraint.C[equation.at]).transpose(0, 2, 1) / equation.std**2
+        normal = normal + weighted @ gram @ (inverse * constraint.C[equation.at])
+        right = right + weighted @ (drawn.xy[:, number, own, None] - gram @ known)
+    size = np.sqrt(np.diagonal(normal, axis1=1, axis2=2))[:, :, None]
+    size = np.where(size > 0.0, size, 1.0)
+    inverted = np.linalg.pinv(normal / size / size.transpose(0, 2, 1), hermitian=True)
+    free = inverted @ (right / size) / size
+    return free[:, :, 0] @ constraint.C.T + constraint.d
 
 
 def _bounds(

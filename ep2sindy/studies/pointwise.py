@@ -71,7 +71,8 @@ LINE_CAPTIONS = CAPTIONS | {
 class Study:
     """Search an equation at every grid point, and group the points into regimes.
 
-    terms: those of variables_if_present are left out if the field lacks their variables. keep: the
+    terms: those of variables_if_present are left out if the field lacks their variables.
+    relations: between coefficients of the equations at a point. keep: the
     folder of finished blocks, from which a run continues a broken one. outline: the thruster whose
     channel is drawn into the maps.
     """
@@ -82,6 +83,7 @@ class Study:
     parallel: Workers
     states: Names
     terms: Annotated[Sequence[str | int], A_LIST]  # 1, the constant, is a number to YAML
+    relations: Sequence[str]
     variables_if_present: Sequence[str]
     least_variation: float
     max_regimes: Count
@@ -101,7 +103,7 @@ class Study:
 
     def search(self, library: Library, *, seed: int) -> PointSearch:
         method = regression_of(self.method)
-        return PointSearch(self.states, library, method, self.least_variation, seed)
+        return PointSearch(self.states, library, method, self.least_variation, seed, self.relations)
 
     def compute(self, run: Run) -> Outcome:
         with run.progress(None, "", "data"):

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
+from ep2sindy.data.zones import FACES
 from ep2sindy.thruster.axial import state_kernels as recorded
 from ep2sindy.thruster.axial.state_kernels import AxialModel
 from ep2sindy.thruster.constants import E_CHARGE
@@ -38,6 +39,8 @@ SPREAD = {"area": (recorded.SPREAD, "1", "cross-section of the plasma over the c
 OF_CHARGE = ("n_i", "u_iz", "flux_i", "face_flux_i", "dn_i_dt")
 # Variable -> the product it averages; a second charge state has its own ionisation rates.
 PRODUCTS = {"ionization": "n_i*n_n*R_ion", "flux_i": "n_i*u_iz"}
+FACE_PRODUCTS = {f"face_flux_i{k}": f"n_i{k}*u_iz{k}" for k in ("", "2", "3")}
+FACE_PRODUCTS |= {"face_flux_n": "n_n*u_n"}  # whose velocity is set, and not recorded
 
 SERIES = {  # variable -> unit, long name
     "I_d": ("A", "discharge current"),
@@ -121,6 +124,8 @@ def labelled(
         data[name] = (("time", "z"), values, notes(unit, text))
         if name in PRODUCTS and (name != "ionization" or "n_i2" not in fields):
             data[name][-1]["average_of"] = PRODUCTS[name]
+        if name in FACE_PRODUCTS:
+            data[name][-1][FACES] = FACE_PRODUCTS[name]
     for name, column in series.items():
         data[name] = (("time",), column, notes(*SERIES[name]))
     for name, (profile, unit) in end.items():
