@@ -327,6 +327,11 @@ def test_by_faces_the_divergence_telescopes() -> None:
         total = (slope * cells["dz"]).isel(z=slice(3)).sum("z")
         np.testing.assert_allclose(total, [4.0 - 2.0, 2.0 * (4.0 - 2.0)], rtol=1e-13)
         assert np.isnan(slope[:, 3]).all()  # its far face is not recorded
+    for of in ("face_flux_i*u_iz", "u_iz*face_flux_i", "face_flux_i^2"):
+        with pytest.raises(ValueError, match="mixes values in cells with 'face_flux_i'"):
+            gradient(cells, of=of, name="slope")
+    with pytest.raises(ValueError, match="keep the variable dz"):
+        gradient(cells.drop_vars("dz"), of="face_flux_i", name="slope")
     with pytest.raises(ValueError, match="cells that touch each other"):
         gradient(cells.isel(z=[0, 2, 3]), of="n_i*u_iz", name="slope")
 

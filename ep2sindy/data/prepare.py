@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.fields import SPACE, check_field, grid_points, mask_outside
-from ep2sindy.data.zones import FACES, average_of
+from ep2sindy.data.zones import FACES, Factors, average_of
 from ep2sindy.library.names import check_variable, split_factors
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.screen import cut
@@ -78,11 +78,10 @@ def gradient(field: xr.Dataset, *, of: str, name: str, axis: str = "z") -> xr.Da
     if name in field:
         raise ValueError(f"a gradient needs a new name: the field already has {name!r}")
     _check_axis(field, axis, f"a gradient along {axis!r}")
-    at_faces = axis == "z" and "dz" in field
-    factors = average_of(field, split_factors(of), faces=at_faces)
+    factors = average_of(field, split_factors(of), faces=axis == "z" and "dz" in field)
     array = evaluate(field, "*".join(f"{variable}^{power}" for variable, power in factors))
     _check_axis(array, axis, f"the gradient of {of!r} along {axis!r}")
-    if at_faces and FACES in field[factors[0][0]].attrs:
+    if _holds_faces(field, factors, of):
         slope = (array.shift({axis: -1}) - array) / _touching(field)
     else:
         slope = array.differentiate(axis, edge_order=2 if field.sizes[axis] > 2 else 1)
@@ -96,6 +95,22 @@ def _check_axis(data: xr.Dataset | xr.DataArray, axis: str, what: str) -> None:
             f"{what} needs two or more cells along z or r: sizes {dict(data.sizes)} came; name an "
             "axis of several cells, or take the step before the cells are averaged"
         )
+
+
+def _holds_faces(field: xr.Dataset, factors: Factors, of: str) -> bool:
+    """Whether a product is one variable that holds averages at the faces between cells."""
+    at_faces = [name for name, _ in factors if FACES in field[name].attrs]
+    if at_faces and factors != [(at_faces[0], 1)]:
+        raise ValueError(
+            f"the gradient of {of!r} mixes values in cells with {at_faces[0]!r}, which is at the "
+            "faces between them: give that variable alone, or averages in cells"
+        )
+    if at_faces and "dz" not in field:
+        raise ValueError(
+            f"the gradient of {of!r}, whose values are at faces, needs the lengths of the cells: "
+            "keep the variable dz in the field"
+        )
+    return bool(at_faces)
 
 
 def _touching(field: xr.Dataset) -> xr.DataArray:
