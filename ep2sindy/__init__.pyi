@@ -88,6 +88,9 @@ from ep2sindy.systems.systems import lorenz as lorenz  # for configs
 from ep2sindy.systems.systems import lotka_volterra as lotka_volterra  # for configs
 from ep2sindy.systems.systems import pendulum as pendulum  # for configs
 
+# Figures
+from ep2sindy.figures.plots import plot as plot
+
 # Your own code
 from ep2sindy.library.functions import register_function as register_function
 from ep2sindy.trust.user_code import for_configs as for_configs

@@ -35,7 +35,7 @@ def record(w: float = 3.0, mu: float = 0.4, *, n: int = 1500) -> ep.Trajectory:
 
 def test_a_record_is_drawn_with_its_units_and_its_frequency() -> None:
     run = record()
-    figure = run.plot()
+    figure = ep.plot(run)
     assert labels(figure)[0] == "$x$ (A)"
     assert figure.axes[2].get_xlabel() == "time (s)"
     shown = figure.axes[0].lines[0]
@@ -44,11 +44,11 @@ def test_a_record_is_drawn_with_its_units_and_its_frequency() -> None:
     assert shown.get_xdata()[-1] == pytest.approx(min(20.0 / frequency, run.t[-1]), rel=0.01)
     assert figure.axes[3].get_xlabel() == "frequency (Hz)"
     assert figure.axes[1].lines[1].get_xdata()[0] == pytest.approx(frequency)
-    part = run.plot(duration_s=1.0, f_max_Hz=2.0)
+    part = ep.plot(run, duration_s=1.0, f_max_Hz=2.0)
     assert part.axes[0].lines[0].get_xdata()[-1] == pytest.approx(1.0)
     for setting in ({"duration_s": 0.0}, {"duration_s": -1.0}, {"f_max_Hz": -2.0}):
         with pytest.raises(ValueError, match=f"{next(iter(setting))} must be positive and finite"):
-            run.plot(**setting)
+            ep.plot(run, **setting)
 
 
 @pytest.mark.parametrize(
@@ -60,9 +60,9 @@ def test_a_discovery_is_drawn_with_its_selected_candidates(
 ) -> None:
     found = ep.discover(ep.lotka_volterra().trajectory(noise=0.02, rng=0), method=method)
     for each, n in ((found, 2), (ep.Discovery.from_json(found.to_json()), 2)):
-        figure = each.plot()
+        figure = ep.plot(each)
         assert [text[: len(label)] for text in labels(figure)] == [label] * n
-    (ax,) = found.fronts["x"].plot().axes
+    (ax,) = ep.plot(found.fronts["x"]).axes
     (star,) = (line for line in ax.lines if line.get_label() == "selected")
     assert star.get_xdata() == found.chosen["x"].n_terms
 
@@ -70,7 +70,7 @@ def test_a_discovery_is_drawn_with_its_selected_candidates(
 def test_a_front_that_no_rule_has_scored_marks_no_candidate() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     front = ep.discover(run, method=ep.Regression()).fronts["x"]
-    (ax,) = front.with_scores(np.full(len(front.candidates), np.nan)).plot().axes
+    (ax,) = ep.plot(front.with_scores(np.full(len(front.candidates), np.nan))).axes
     assert "selected" not in [line.get_label() for line in ax.lines]
     assert ax.get_title() == r"$\dot{x}$"
 
@@ -78,7 +78,7 @@ def test_a_front_that_no_rule_has_scored_marks_no_candidate() -> None:
 def test_a_free_run_is_drawn_over_its_record_whatever_their_order() -> None:
     run = record()
     turned = replace(run, states=run.states[:, ::-1], state_names=["y", "x"])
-    figure = ep.free_run(oscillator(3.0, 0.4), turned).plot()
+    figure = ep.plot(ep.free_run(oscillator(3.0, 0.4), turned))
     assert labels(figure) == ["$x$ (A)", "$y$ (m)"]
     data, model = figure.axes[0].lines
     n = len(data.get_ydata())
@@ -88,7 +88,7 @@ def test_a_free_run_is_drawn_over_its_record_whatever_their_order() -> None:
 
 def test_a_free_run_that_diverges_leaves_the_panels_as_the_data_are() -> None:
     away = model_of({"x": {"x": 5.0}, "y": {"y": 5.0}})
-    figure = ep.free_run(away, record()).plot()
+    figure = ep.plot(ep.free_run(away, record()))
     labels(figure)
     low, high = figure.axes[0].get_ylim()
     assert high - low < 3.0 * np.ptp(record().states[:, 0])
@@ -97,12 +97,12 @@ def test_a_free_run_that_diverges_leaves_the_panels_as_the_data_are() -> None:
 def test_a_cycle_is_drawn_closed_with_runs_that_reach_it() -> None:
     cycle = ep.limit_cycle(oscillator(3.0, 0.4), np.array([2.0, 0.0]), period_s=2.1)
     assert cycle is not None
-    (ax,) = cycle.plot(record()).axes
+    (ax,) = ep.plot(cycle, record()).axes
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("$x$ (A)", "$y$ (m)")
     curve = ax.lines[-1].get_xydata()
     assert np.array_equal(curve[0], curve[-1])
     assert np.array_equal(curve[:-1], cycle.states)
-    assert len(cycle.plot().axes[0].lines) == len(ax.lines) - 1  # without the data
+    assert len(ep.plot(cycle).axes[0].lines) == len(ax.lines) - 1  # without the data
     runs = [line.get_xydata() for line in ax.lines[1:-1] if len(line.get_xdata()) > 1]
     assert len(runs) == 5
     for run in runs:  # none stops before it has come near
@@ -129,7 +129,7 @@ def point(*values: float) -> ep.operating.OperatingRecord:
 
 def test_a_law_of_one_parameter_is_drawn_as_a_line_of_its_frequency() -> None:
     records = [point(3.0), point(3.5)]
-    figure = law(["w"], [[3.0], [3.5]]).plot_map(records, n_points=3, labels={"w": "w (rad/s)"})
+    figure = ep.plot(law(["w"], [[3.0], [3.5]]), records, n_points=3, labels={"w": "w (rad/s)"})
     assert labels(figure)[0].startswith("frequency (")
     assert figure.axes[0].get_xlabel() == "w (rad/s)"
     line, dots = figure.axes[0].lines[:2]
@@ -138,10 +138,15 @@ def test_a_law_of_one_parameter_is_drawn_as_a_line_of_its_frequency() -> None:
 
 def test_a_law_of_two_parameters_is_drawn_as_a_map_and_of_three_not_at_all() -> None:
     places = [[3.0, 0.0], [3.5, 0.0], [3.0, 1.0]]
-    figure = law(["w", "b"], places).plot_map([point(*place) for place in places], n_points=2)
+    figure = ep.plot(law(["w", "b"], places), [point(*place) for place in places], n_points=2)
     labels(figure)
     assert figure.axes[0].get_ylabel() == "$b$"
     (grid,) = [each for each in figure.axes[0].collections if each.get_array() is not None][:1]
     assert grid.get_array().size == 4
     with pytest.raises(ValueError, match="one or two parameters: this law has"):
-        law(["w", "b", "c"], [[3.0, 0.0, 0.0]]).plot_map([point(3.0, 0.0, 0.0)])
+        ep.plot(law(["w", "b", "c"], [[3.0, 0.0, 0.0]]), [point(3.0, 0.0, 0.0)])
+
+
+def test_what_cannot_be_drawn_says_what_can() -> None:
+    with pytest.raises(TypeError, match=r"plot draws a Discovery, FreeRun, .*: list came"):
+        ep.plot([1.0])

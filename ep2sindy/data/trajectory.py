@@ -21,14 +21,12 @@ from ep2sindy.data.gaps import LONGEST_STEP, MIN_STRETCH, between_gaps, mean_ste
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.names import check_state
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_list, locked, read_only
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
-    from matplotlib.figure import Figure
 
 
 def read_only_mapping(values: dict) -> MappingProxyType:
@@ -244,15 +242,6 @@ class Trajectory:
     def __repr__(self) -> str:
         table = text_table(["", "", "unit", "from", "to"], self._ranges())
         return one_screen([self._headline(), *table])
-
-    def plot(self, *, duration_s: float | None = None, f_max_Hz: float | None = None) -> Figure:
-        """Figure of the states, a row each: their first `duration_s`, and their power spectra.
-
-        duration_s: None shows twenty periods of the fastest state, or all. f_max_Hz: the end of
-        the spectra; None for ten times its frequency.
-        Raises ValueError for a number that is not positive.
-        """
-        return draw("run_plot", self, duration_s=duration_s, f_max_Hz=f_max_Hz)
 
     def _repr_html_(self) -> str:
         rows = [list(map(html.escape, row)) for row in self._ranges()]

@@ -28,13 +28,12 @@ from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.storage import read_stored
 from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
-from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
 from ep2sindy.selection.rule import OtherSystem
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 FORMAT = "ep2sindy.Discovery/1"
 
@@ -142,13 +141,6 @@ class Discovery:
             self.model, history, horizon, fitted_to=fitted_to, inputs=inputs, n_draws=n_draws,
             seed=seed,
         )  # fmt: skip
-
-    def plot(self) -> Figure:
-        """Figure of the candidates of every equation, the selected one marked.
-
-        Error against number of terms after a regression; after a search of trajectories, score.
-        """
-        return draw("discovery_plot", self)
 
     def to_json(self) -> str:
         """JSON text of all but the samples; floats in their shortest exact form.

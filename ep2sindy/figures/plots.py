@@ -1,14 +1,12 @@
-"""One figure of one result: what `run.plot()`, `found.plot()` and their like draw.
-
-They are called by name, by `draw` of `runtime/drawing.py`, and drawn by the functions that draw the
-figures of the experiments.
-"""
+"""One figure of one value: `ep.plot`, by the functions that draw the figures of the experiments."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import singledispatch
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -49,8 +47,32 @@ def _show_in_notebooks() -> None:
 _show_in_notebooks()
 
 
-def run_plot(run: Trajectory, *, duration_s: float | None, f_max_Hz: float | None) -> Figure:
-    """The states of a record and their spectra; see `Trajectory.plot`."""
+@singledispatch
+def plot(value: object, *rest: object, **settings: object) -> Figure:
+    """Draw one value as a matplotlib figure, as the pages of the experiments show it.
+
+    plot(run, duration_s=None, f_max_Hz=None): the states of a `Trajectory`, a row each, and their
+    power spectra. duration_s: how much of the record is shown; None for twenty periods of the
+    fastest state, or all. f_max_Hz: the end of the spectra; None for ten times its frequency.
+    plot(found): the candidates of every equation of a `Discovery`, the selected ones marked: error
+    against number of terms after a regression, score after a search of trajectories.
+    plot(found.fronts["x"]): the same for one equation.
+    plot(free): the model of a `FreeRun` over its record, the first periods and the last.
+    plot(cycle, run=None): a `LimitCycle` in the plane of the first two states, with runs from other
+    starts. run: samples to draw behind it, of at least these two states.
+    plot(law, records, n_points=25, labels={}): frequency and amplitude of the cycle of an
+    `OperatingLaw` over its one or two parameters. records: `OperatingRecord`s of the points, from
+    whose cycles the law's models are started, and which are drawn as well. n_points: along each
+    parameter. labels: names of the parameters on the axes.
+    Raises TypeError for another value, ValueError for a number that is not positive and for a law
+    of more than two parameters.
+    """
+    kinds = ", ".join(sorted(kind.__name__ for kind in plot.registry if kind is not object))
+    raise TypeError(f"plot draws a {kinds}: {type(value).__name__} came")
+
+
+@plot.register
+def _(run: Trajectory, *, duration_s: float | None = None, f_max_Hz: float | None = None) -> Figure:
     for name, value in (("duration_s", duration_s), ("f_max_Hz", f_max_Hz)):
         if value is not None:
             check_positive(name, value)
@@ -62,18 +84,18 @@ def run_plot(run: Trajectory, *, duration_s: float | None, f_max_Hz: float | Non
     return data_figure(run, duration_s=duration_s or whole_s, f_max_Hz=f_max_Hz or highest_Hz)
 
 
-def discovery_plot(found: Discovery) -> Figure:
-    """The candidates of every equation; see `Discovery.plot`."""
+@plot.register
+def _(found: Discovery) -> Figure:
     return front_figure(found.fronts, label=found.method.selection.label)
 
 
-def front_plot(front: ParetoFront) -> Figure:
-    """The candidates of one equation; see `ParetoFront.plot`."""
+@plot.register
+def _(front: ParetoFront) -> Figure:
     return front_figure({front.equation: front}, label="score")
 
 
-def free_run_plot(run: FreeRun) -> Figure:
-    """The run over its record; see `FreeRun.plot`."""
+@plot.register
+def _(run: FreeRun) -> Figure:
     states = run.record.columns(run.model.states)
     record = replace(run.record, states=states, state_names=run.model.states, missing=None)
     slowest_Hz = min(dominant_frequency(record.t, column) for column in record.states.T)
@@ -81,19 +103,19 @@ def free_run_plot(run: FreeRun) -> Figure:
     return free_run_figure(record, run.rollout, period_s=period_s)
 
 
-def cycle_plot(cycle: LimitCycle, run: Trajectory | None) -> Figure:
-    """The cycle in the plane of two states; see `LimitCycle.plot`."""
+@plot.register
+def _(cycle: LimitCycle, run: Trajectory | None = None) -> Figure:
     return cycle_figure(run, cycle, paths_off(cycle), plane=cycle.model.states[:2])
 
 
-def law_plot(
+@plot.register
+def _(
     law: OperatingLaw,
     records: Sequence[OperatingRecord],
     *,
-    n_points: int,
-    labels: Mapping[str, str],
+    n_points: int = 25,
+    labels: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
-    """The cycle of a law over its parameters; see `OperatingLaw.plot_map`."""
     grid = map_points([record.parameters for record in records], n_points)
     if not grid:
         raise ValueError(

@@ -25,14 +25,13 @@ from ep2sindy.model.stability import (
     periods_to_reach,
     share_reaching,
 )
-from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.attractor import phase_along
 from ep2sindy.signals.oscillation import DIED_OUT
 from ep2sindy.signals.spectrum import dominant_frequency
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +84,6 @@ class FreeRun:
         does |= {Verdict.ALIKE: "keeps the statistics of"}
         is_kept = seen and self.verdict in does
         return f"{does[self.verdict]} the record it was fitted to" if is_kept else self.text
-
-    def plot(self) -> Figure:
-        """Figure of the model over the record: its first periods and its last, a row per state."""
-        return draw("free_run_plot", self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,13 +15,10 @@ from ep2sindy.model.many import rk4_step
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import start_scale
 from ep2sindy.model.scaled import ScaledModel
-from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.values import check_positive, read_only
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from ep2sindy.data.trajectory import Trajectory
+    pass
 
 # A multiplier whose modulus is this close to one counts as neutral: a departure then takes at least
 # a thousand periods to change e-fold, longer than any record. The multipliers themselves are exact
@@ -94,13 +91,6 @@ class LimitCycle:
         if abs(largest - 1.0) <= NEUTRAL_WITHIN:
             return CycleStability.NEUTRAL
         return CycleStability.ATTRACTING if largest < 1.0 else CycleStability.REPELLING
-
-    def plot(self, run: Trajectory | None = None) -> Figure:
-        """Figure of the cycle in the plane of the first two states, with runs from other starts.
-
-        run: samples to draw behind it, of at least these two states.
-        """
-        return draw("cycle_plot", self, run)
 
 
 def limit_cycle(

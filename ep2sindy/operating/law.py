@@ -23,18 +23,17 @@ from ep2sindy.library.library import Library, named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
-from ep2sindy.operating.records import OperatingRecord, check_varying, point_label
+from ep2sindy.operating.records import check_varying, point_label
 from ep2sindy.operating.shared_support import SharedDiscovery, SharedFront
 from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.whitening import whitened_rows
-from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.values import read_only
 from ep2sindy.selection.criteria import FLOOR
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 FORMAT = "ep2sindy.OperatingLaw/1"
 
@@ -177,21 +176,6 @@ class OperatingLaw:
             f"{self.coef.size} numbers, {len(self.points)} points"
         )
         return f"{head}\n{self.text()}"
-
-    def plot_map(
-        self,
-        records: Sequence[OperatingRecord],
-        *,
-        n_points: int = 25,
-        labels: Mapping[str, str] = MappingProxyType({}),
-    ) -> Figure:
-        """Figure of frequency and amplitude of the law's cycle over its one or two parameters.
-
-        records: of the points, from whose cycles the law's models are started, and which are drawn
-        as well. n_points: along each parameter. labels: names of the parameters on the axes.
-        Raises ValueError for a law of more than two parameters.
-        """
-        return draw("law_plot", self, records, n_points=n_points, labels=labels)
 
     def to_json(self) -> str:
         """The complete law as JSON; floats in their shortest exact form."""

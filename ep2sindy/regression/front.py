@@ -16,12 +16,11 @@ from ep2sindy.regression.bootstraps import Supports
 from ep2sindy.regression.gram_kernels import fit_masks, rank_masks, solve_masks
 from ep2sindy.regression.row_kernels import TILE, add_residuals, spread
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.runtime.drawing import draw
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 # Correction of coefficients, as a share of them, after which another one would be rounding.
 REFINED = 1e-9
@@ -150,10 +149,6 @@ class ParetoFront:
     def leading(self) -> Bool[np.ndarray, " candidates"]:
         """True for the best candidate of each size."""
         return np.diff(self.sizes, prepend=-1.0) > 0
-
-    def plot(self) -> Figure:
-        """Figure of the candidates' errors, or scores if there are none, by number of terms."""
-        return draw("front_plot", self)
 
     def __repr__(self) -> str:
         rows = [
