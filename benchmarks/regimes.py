@@ -19,7 +19,7 @@ from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Loky
-from ep2sindy.selection.criteria import EBIC, Knee, Stability
+from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.rule import Selection
 from ep2sindy.systems.regions import REGIONS, STATES, RegionField, three_regions
 
@@ -27,7 +27,6 @@ NOISES = (0.0, 0.02, 0.05, 0.1)
 RULES: dict[str, Selection] = {
     "ebic": EBIC(),
     "log_knee": Knee(scale="log"),
-    "stability": Stability(),
     "knee": Knee(),
 }
 

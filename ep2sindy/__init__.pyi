@@ -37,7 +37,6 @@ from ep2sindy.regression.searches import BestSubset as BestSubset  # for configs
 from ep2sindy.regression.searches import AdaptiveLasso as AdaptiveLasso  # for configs
 from ep2sindy.regression.searches import STLSQ as STLSQ  # for configs
 from ep2sindy.regression.bootstraps import Bootstraps as Bootstraps  # for configs
-from ep2sindy.regression.estimators import AdaptiveLassoRegressor as AdaptiveLassoRegressor
 
 # Regressions
 from ep2sindy.regression.differential import Differential as Differential  # for configs
@@ -50,7 +49,6 @@ from ep2sindy.regression.splits import BlockSplit as BlockSplit  # for configs
 
 # Selection
 from ep2sindy.selection.criteria import EBIC as EBIC  # for configs
-from ep2sindy.selection.criteria import AICc as AICc  # for configs
 from ep2sindy.selection.criteria import Knee as Knee  # for configs
 from ep2sindy.selection.criteria import Evidence as Evidence  # for configs
 from ep2sindy.selection.refined import RefinedScore as RefinedScore  # for configs
@@ -101,7 +99,6 @@ from ep2sindy import prepare as prepare
 from ep2sindy import library as library
 from ep2sindy import discovery as discovery
 from ep2sindy import regression as regression
-from ep2sindy import selection as selection
 from ep2sindy import model as model
 from ep2sindy import forecasting as forecasting
 from ep2sindy import refinement as refinement

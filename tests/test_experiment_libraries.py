@@ -336,7 +336,6 @@ def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_pa
         ("kalman", "log_knee"),
         ("kalman", "ebic"),
         ("weak", "knee"),
-        ("weak", "bic"),
         ("weak", "ebic"),
         ("weighted_weak", "ebic"),
         ("weak_boxes", "knee"),

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from sklearn.base import clone
 
 import ep2sindy as ep
 from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
@@ -18,7 +17,7 @@ from ep2sindy.regression.searches import Search
 FEW = settings(max_examples=15, deadline=None, derandomize=True)
 SEARCHES = [ep.AdaptiveLasso(), ep.STLSQ(), ep.BestSubset(max_terms=4)]
 BIC = ep.EBIC(gamma=0.0, coarsening=None)
-RULES = [ep.AICc(), BIC, ep.EBIC(), ep.Knee(), ep.Knee(scale="log")]
+RULES = [BIC, ep.EBIC(), ep.Knee(), ep.Knee(scale="log")]
 NAMES = ["a", "b", "c", "d", "e"]
 SIZES = st.sampled_from([1e-18, 1e-3, 1.0, 7.0, 1e19])
 COEF = st.sampled_from([-3.0, -0.5, 0.7, 2.0])
@@ -143,15 +142,3 @@ def test_a_number_that_is_none_is_named(exact: Rows, row: int, column: int, valu
     said = f"'{NAMES[column]}' is not on row {row}"
     with pytest.raises(ValueError, match=said):
         Rows(theta, exact.target, exact.coef).problem()
-
-
-@FEW
-@given(rows(), st.sampled_from(["F", "C"]), st.booleans())
-def test_a_regressor_and_its_clone_find_the_same(exact: Rows, order: Any, writeable: bool) -> None:
-    theta = np.array(exact.theta, order=order)
-    theta.setflags(write=writeable)
-    first = ep.AdaptiveLassoRegressor().fit(theta, exact.target)
-    again = clone(first).fit(exact.theta, exact.target)
-    assert clone(first).get_params() == first.get_params()
-    np.testing.assert_allclose(first.coef_, exact.coef, atol=1e-6)
-    np.testing.assert_array_equal(first.coef_, again.coef_)

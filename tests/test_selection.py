@@ -6,14 +6,14 @@ from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
+from ep2sindy.selection.criteria import EBIC, Knee, log_supports
 from ep2sindy.selection.rule import Selection
 from ep2sindy.systems.systems import lorenz
 from tests.models import plain_rows
 
 BIC, LOG_KNEE = EBIC(gamma=0.0, coarsening=None), Knee(scale="log")
-RULES = [Knee(), LOG_KNEE, AICc(), BIC, EBIC(), EBIC(coarsening=None)]
-CRITERIA = [AICc(), BIC, EBIC(), EBIC(coarsening=None)]
+RULES = [Knee(), LOG_KNEE, BIC, EBIC(), EBIC(coarsening=None)]
+CRITERIA = [BIC, EBIC(), EBIC(coarsening=None)]
 
 
 def front_of(errors: list[float], n_library: int) -> ParetoFront:
@@ -67,8 +67,8 @@ def test_nothing_is_selected_when_nothing_helps() -> None:
 
 
 def test_a_score_is_called_by_its_own_name() -> None:
-    """Tables of runs with selection=bic and selection=log_knee keep their columns."""
-    assert [rule.label for rule in RULES] == ["d_pareto", "d_log", "AICc", "BIC", "EBIC", "EBIC"]
+    """Tables of runs keep their columns."""
+    assert [rule.label for rule in RULES] == ["d_pareto", "d_log", "BIC", "EBIC", "EBIC"]
     assert BIC.shared_by(6) == BIC
 
 
@@ -120,7 +120,6 @@ def test_criteria_are_their_formulas() -> None:
     k = front.sizes
     ways = np.array([log_supports(front.problem.library, c.terms) for c in front.candidates])
     for rule, penalty in (
-        (AICc(), 2 * k + 2 * k * (k + 1) / (60 - k - 1)),
         (BIC, k * np.log(60)),
         (EBIC(gamma=0.5, coarsening=None), k * np.log(60) + ways),
     ):
@@ -137,12 +136,6 @@ def test_coarsening_counts_fewer_rows() -> None:
     (scores,) = EBIC(coarsening=40.0).scores([front])
     expected = n / 60 * misfit(front) + front.sizes * np.log(n) + 2 * ways
     assert np.diff(scores) == pytest.approx(np.diff(expected), rel=1e-9)
-
-
-def test_aicc_refuses_more_terms_than_the_rows_can_bear() -> None:
-    (scores,) = AICc().scores([noisy_front(n_rows=6)])
-    assert np.isfinite(scores[:5]).all()  # up to four terms: n - k - 1 is above zero
-    assert np.isinf(scores[5:]).all()
 
 
 @pytest.mark.parametrize("rule", [BIC, EBIC(), EBIC(coarsening=None)], ids=repr)

@@ -1,7 +1,7 @@
 """The whole search as a scikit-learn estimator, for grids of settings and cross-validation.
 
 scikit-learn requires a class that inherits, and that must be fitted before it predicts; the rest of
-the package avoids both (see also `regression/estimators.py`).
+the package avoids both.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ from ep2sindy.regression.gram_kernels import all_usable
 from ep2sindy.regression.row_kernels import fill_products, scale_draws
 from ep2sindy.regression.searches import MOST_WORK, BestSubset
 from ep2sindy.runtime.values import check_kind, check_list
-from ep2sindy.selection.criteria import EBIC, AICc, Fits, Knee
+from ep2sindy.selection.criteria import EBIC, Fits, Knee
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay, Smoother, difference
 from ep2sindy.signals.spectrum import is_uniform
 
@@ -195,7 +195,7 @@ class CompiledPoints:
     """
 
     search: PointSearch
-    rule: Knee | EBIC | AICc
+    rule: Knee | EBIC
     max_terms: int
     smooth_library: bool
     filter: Filter
@@ -384,7 +384,7 @@ def compiled_points(search: PointSearch, t: Float[np.ndarray, " samples"]) -> Co
     form, proposer, rule = method.formulation, method.search, method.selection
     if library.functions or len(library) > MOST_TERMS or method.depth > 1 or search.relations:
         return None
-    if not isinstance(form, Differential) or not isinstance(rule, Knee | EBIC | AICc):
+    if not isinstance(form, Differential) or not isinstance(rule, Knee | EBIC):
         return None
     if not isinstance(proposer, BestSubset) or proposer.n_best > 1:
         return None

@@ -69,7 +69,7 @@ def discover_shared(
     The rows of each point are assembled separately, with its own sampling, noise and scale. The
     search finds the supports whose product of residuals over the points is least: a term is in or
     out everywhere. The method's rule scores the fits at each point, and the scores are added: for
-    AICc, BIC and EBIC the sum is the criterion of the joint likelihood, with the number of supports
+    EBIC the sum is the criterion of the joint likelihood, with the number of supports
     counted once. A term may vanish at some points, if it shows at others. For a single point the
     result is that of `discover` by the same `Regression`.
     points: name -> trajectories. Points are assembled in the order of their names. method: None

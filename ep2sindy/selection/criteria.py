@@ -1,4 +1,4 @@
-"""Rules that score candidates one by one: information criteria, evidence, knee, stability."""
+"""Rules that score candidates one by one: information criteria, evidence, knee."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.library.library import Library
-from ep2sindy.regression.front import Candidate, ParetoFront
+from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.whitening import whitened_rows
 
 # Least residual squares, as a share of the target's squares: below this value a criterion would
@@ -41,38 +41,15 @@ class Fits(NamedTuple):
 
 
 @dataclass(frozen=True)
-class AICc:
-    """Akaike's criterion for small samples, which selects the model expected to predict best.
-
-    Assumes Gaussian residuals. Where the rows' covariance is known (`Weak`), the residuals must be
-    white after weighting by it. Where it is not (`Differential`), they must be independent from row
-    to row; neighbouring rows of a smoothed series are not, so AICc then keeps too many terms. Not
-    consistent: even with endless data it keeps a needless term now and then.
-    Source: Hurvich & Tsai 1989, doi:10.1093/biomet/76.2.297.
-    """
-
-    label: ClassVar[str] = "AICc"
-
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        return [_criterion(front, self._penalty) for front in fronts]
-
-    def score(self, fits: Fits) -> Float[np.ndarray, " candidates"]:
-        """Scores of candidates from their fits alone."""
-        return _criterion_of(fits, self._penalty)
-
-    def _penalty(self, terms: Sequence[str], n_rows: float, library: Library) -> float:
-        k = len(terms)
-        return 2.0 * k + 2.0 * k * (k + 1) / (n_rows - k - 1) if n_rows > k + 1 else np.inf
-
-
-@dataclass(frozen=True)
 class EBIC:
     """The extended Bayesian criterion: a priori all sizes of support are equally likely.
 
     score = n log(RSS / n) + k log n + 2 gamma log(number of supports of k terms). Libraries are
     nested by degree, and the supports are counted in the smallest one that holds the candidate's
-    terms, so that simple terms do not pay for the many terms of high degree. The assumptions on the
-    residuals are those of `AICc`.
+    terms, so that simple terms do not pay for the many terms of high degree.
+    Assumes Gaussian residuals. Where the rows' covariance is known (`Weak`), the residuals must be
+    white after weighting by it. Where it is not (`Differential`), they must be independent from row
+    to row; neighbouring rows of a smoothed series are not, and too many terms are then kept.
     coarsening: no model is exact, and with enough rows any discrepancy becomes significant. The
     likelihood is therefore raised to the power 1 / (1 + n/coarsening), so that evidence stops
     growing at about that many rows. None uses the full likelihood.
@@ -244,44 +221,3 @@ class Knee:
         height = np.log(np.maximum(errors, FLOOR))
         height = (height - height.min()) / max(float(np.ptp(height)), np.finfo(float).tiny)
         return np.hypot(height, sizes / norm)
-
-
-@dataclass(frozen=True)
-class Stability:
-    """Selects the largest candidate whose terms were each chosen in enough of the bootstraps.
-
-    A term counts as chosen in a bootstrap if it was available there and stood in a support of the
-    candidate's size. A candidate is stable if each of its terms was chosen in at least the share
-    `threshold` of the bootstraps. score = -n_terms for a stable candidate, otherwise the share of
-    bootstraps that lacked its least stable term.
-    Assumes that false terms are chosen by chance, a different one each time. A false term that
-    corrects the same error of the rows in every bootstrap is as stable as a true one, and then too
-    many terms are kept. Bootstraps that leave a true term out of the library also disturb the
-    choice of the others, which lowers their shares in a small library. The source bounds the number
-    of false terms for thresholds above a half.
-    Source: Meinshausen & Buehlmann 2010, doi:10.1111/j.1467-9868.2010.00740.x.
-    """
-
-    threshold: float = 0.7
-    label: ClassVar[str] = "instability"
-
-    def __post_init__(self) -> None:
-        if not 0.5 < self.threshold <= 1.0:
-            raise ValueError(f"threshold must lie in (0.5, 1]: {self.threshold} came")
-
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        """Scores as described above. Raises ValueError for fronts without bootstraps."""
-        _check_bootstraps([c for front in fronts for c in front.candidates])
-        return [np.array([self._score(c) for c in front.candidates]) for front in fronts]
-
-    def _score(self, candidate: Candidate) -> float:
-        least = float(min(candidate.inclusion, default=1.0))
-        return -float(candidate.n_terms) if least >= self.threshold else 1.0 - least
-
-
-def _check_bootstraps(candidates: Sequence[Candidate]) -> None:
-    if any(np.isnan(c.inclusion).any() for c in candidates):
-        raise ValueError(
-            "stability needs bootstraps: none stands behind a candidate; search with "
-            "Bootstraps(n=32), or select with another rule"
-        )
