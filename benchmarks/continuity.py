@@ -45,7 +45,7 @@ def line(name: str, overrides: Sequence[str], speed: float) -> str:
             *overrides,
             f"data.cache={CACHE}",
             f"output={folder}",
-            f"keep={folder}/kept",
+            "keep=false",
         ]
         subprocess.run([*program, *given], check=True, capture_output=True)
         with xr.open_dataset(next(Path(folder).rglob("pointwise.nc"))) as file:

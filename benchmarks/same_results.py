@@ -72,7 +72,7 @@ TOYS: dict[str, list[str]] = {
     ],
     "pointwise": [
         "+exp=pointwise", *ON_FILE, GRID, "data.r.name=r", "data.variables.u_ir.name=u_ir",
-        "keep={cache}/kept", "parallel=serial", "bootstraps.n=6", "block_points=5", "max_regimes=3",
+        "keep=false", "parallel=serial", "bootstraps.n=6", "block_points=5", "max_regimes=3",
     ],
     "trace": [
         "+exp=trace", "data=file", "data.path={signal}", "signal=I", "unit=A", "search.n_best=2",

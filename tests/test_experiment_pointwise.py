@@ -4,7 +4,6 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from omegaconf import DictConfig, OmegaConf
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
-from ep2sindy.discovery.pointwise import Block, Kept
 from ep2sindy.studies import pointwise
 from ep2sindy.studies.resume import pieces_key
 from ep2sindy.systems.regions import TERMS, three_regions
@@ -49,7 +47,7 @@ def on_file(path: Path, folder: Path) -> list[str]:
         "data.r.name=r",
         *(f"data.variables.{name}.name={name}" for name in ("u_iz", "u_ir", "R_ion")),
         f"output={folder}/outputs",
-        f"keep={folder}/kept",
+        "keep=false",
         "parallel=serial",
         "bootstraps.n=6",
         "block_points=5",
@@ -100,10 +98,6 @@ def test_tables_figures_and_page_are_there(toy_run: Path) -> None:
     events = EventAccumulator(str(toy_run / "tensorboard")).Reload()
     assert [e.value for e in events.Scalars("points/done")][-1] == 30.0
     assert {"coefficients", "regimes", "quality"} <= set(events.Tags()["images"])
-
-
-def test_finished_blocks_are_gone_once_the_result_is_written(toy_run: Path) -> None:
-    assert list((toy_run.parents[2] / "kept").iterdir()) == []
 
 
 def test_a_line_of_points_without_an_optional_variable(grid: Path, tmp_path: Path) -> None:
@@ -227,66 +221,49 @@ def test_other_settings_have_other_blocks(grid: Path, tmp_path: Path) -> None:
     assert key() not in same
 
 
-def test_an_interrupted_run_says_how_to_go_on(
-    grid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    write, config = Kept.write, composed(*on_file(grid, tmp_path))
-
-    def interrupted(self: Kept, block: Block, done: dict) -> None:
-        if len(list(self.folder.glob("z*"))) == 2:
-            raise KeyboardInterrupt
-        write(self, block, done)
-
-    monkeypatch.setattr(Kept, "write", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        programs.computed(config)
-    assert "the same command goes on" in " ".join(capsys.readouterr().out.split())
-    monkeypatch.undo()
-    found = programs.computed(config)
-    assert "going on with 10 of 30 points" in found.log
-    assert found.outcome.points_per_s == pytest.approx(20 / found.outcome.wall_s)
-
-
 KILLED = """
 import os, signal
-from ep2sindy.discovery.pointwise import Kept
+from ep2sindy.runtime import parallel
 from ep2sindy.app.main import main
 
-write = Kept.write
+read_or_do, begun = parallel.kept, []
 
-def last(self, block, done):
-    write(self, block, done)
-    if len(list(self.folder.glob("z*.npz"))) == 5:
+def last(folder, piece, function, value):
+    if len(begun) == 5:
         os.kill(os.getpid(), signal.SIGKILL)
+    begun.append(piece)
+    return read_or_do(folder, piece, function, value)
 
-Kept.write = last
+parallel.kept = last
 main()
 """
 
 
 @pytest.mark.slow
-def test_a_killed_run_ends_with_the_same_file(grid: Path, tmp_path: Path) -> None:
-    def command(folder: Path, program: Sequence[str]) -> list[str]:
-        overrides = [*on_file(grid, folder), "block_points=1", "bootstraps.n=20"]
-        return [sys.executable, *program, "+exp=pointwise", *overrides]
+def test_a_killed_run_ends_with_the_same_file(
+    grid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
-    whole = ["-m", "experiments.run"]
-    undisturbed = tmp_path / "undisturbed"
-    subprocess.run(command(undisturbed, whole), cwd=ROOT, check=True, capture_output=True)
-    broken = tmp_path / "broken"
-    killed = subprocess.run(command(broken, ["-c", KILLED]), cwd=ROOT, stdout=subprocess.DEVNULL)
-    assert killed.returncode == -signal.SIGKILL
-    assert len(list((broken / "kept").rglob("z*.npz"))) == 5
-    subprocess.run(command(broken, whole), cwd=ROOT, check=True, capture_output=True)
-    (one,) = undisturbed.rglob("pointwise.nc")
-    (other,) = broken.rglob("pointwise.nc")
+    def run(folder: Path, *program: str) -> int:
+        overrides = [*on_file(grid, folder), "block_points=1", "bootstraps.n=20", "keep=true"]
+        command = [sys.executable, *program, "+exp=pointwise", *overrides]
+        return subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL).returncode
+
+    undisturbed, broken = tmp_path / "undisturbed", tmp_path / "broken"
+    assert run(undisturbed, "-m", "experiments.run") == 0
+    assert run(broken, "-c", KILLED) == -signal.SIGKILL
+    assert len(list((tmp_path / "cache" / "ep2sindy").rglob("output.pkl"))) == 5
+    assert run(broken, "-m", "experiments.run") == 0
+    (one,), (other,) = (place.rglob("pointwise.nc") for place in (undisturbed, broken))
     assert one.read_bytes() == other.read_bytes()
-    assert "going on with 5 of 30 points" in (other.parent / "run.log").read_text()
+    assert "going on with the pieces" in (other.parent / "run.log").read_text()
+    assert not list((tmp_path / "cache" / "ep2sindy").rglob("output.pkl"))
 
 
 def test_continuity_is_found_at_every_point_of_a_simulated_channel(tmp_path: Path) -> None:
     small = ["data.n_cells=40", "data.duration_s=6e-4", "data.warm_up_s=2e-4", "data.cache=null"]
-    folders = [f"output={tmp_path}/outputs", f"keep={tmp_path}/kept", "parallel=serial"]
+    folders = [f"output={tmp_path}/outputs", "keep=false", "parallel=serial"]
     found = programs.computed(composed("pointwise=continuity", "bootstraps.n=4", *small, *folders))
     with xr.open_dataset(found.folder / "pointwise.nc") as result:
         inside = result.where((result["z"] > 0.003) & (result["z"] < 0.022), drop=True)["coef"]

@@ -1,7 +1,5 @@
-import errno
 import os
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from ep2sindy.data.sampling import point_samples
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.point_search import PointSearch
-from ep2sindy.discovery.pointwise import STATUSES, Kept, blocks_of, pointwise
+from ep2sindy.discovery.pointwise import STATUSES, blocks_of, pointwise
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
@@ -197,12 +195,10 @@ def test_masked_inputs_mask_the_point() -> None:
     assert (status.isel(z=slice(1, None)) == 0).all()
 
 
-def test_a_setting_that_fits_nowhere_is_an_error(tmp_path: Path) -> None:
+def test_a_setting_that_fits_nowhere_is_an_error() -> None:
     short = parabolas().isel(time=slice(0, 8))
-    kept = Kept(tmp_path)
-    for _ in range(2):  # the second time from kept blocks
-        with pytest.raises(ValueError, match="could be fitted: smoothing needs at least 11"):
-            pointwise(short, searching(), workers=Serial(), kept=kept)
+    with pytest.raises(ValueError, match="could be fitted: smoothing needs at least 11"):
+        pointwise(short, searching(), workers=Serial())
 
 
 def test_a_field_without_plasma_is_an_error() -> None:
@@ -215,101 +211,6 @@ def test_a_field_without_plasma_is_an_error() -> None:
 def test_units_of_coefficients_follow_the_field(exact: xr.Dataset) -> None:
     assert exact["coef_units"].sel(equation="x", term="u").item() == "m^-4"
     assert exact["coef_units"].sel(equation="x", term="x").item() == "s^-1"
-
-
-def test_a_broken_run_goes_on_with_its_finished_blocks(
-    tmp_path: Path, noisy_bytes: dict[str, bytes]
-) -> None:
-    kept, done = Kept(tmp_path / "blocks"), []
-
-    def stop_after_three(n_points: int) -> None:
-        done.append(n_points)
-        if len(done) == 3:
-            raise KeyboardInterrupt
-
-    def run(progress: object) -> xr.Dataset:
-        return pointwise(
-            noisy(), searching(), workers=Serial(), kept=kept, block_points=2, progress=progress
-        )
-
-    with pytest.raises(KeyboardInterrupt):
-        run(stop_after_three)
-    finished = {path: path.stat().st_mtime_ns for path in kept.folder.iterdir()}
-    assert len(finished) == 3
-    result = run(lambda n_points: None)
-    assert {path: path.stat().st_mtime_ns for path in finished} == finished
-    assert bytes_of(result) == noisy_bytes
-    (kept.folder / "of_another_run").touch()
-    kept.clear()
-    assert [path.name for path in kept.folder.iterdir()] == ["of_another_run"]
-    (kept.folder / "of_another_run").unlink()
-    kept.clear()
-    assert not kept.folder.exists()
-
-
-OTHERS = [
-    {"search": BestSubset(max_terms=1)},
-    {"seed": 1},
-    {"least_variation": 0.01},
-    {"library": named_terms(["x", "u", "w"], ["1", "x", "u", "w", "x*w"])},
-    {"bootstraps": Bootstraps(n=8, n_culled=0, block=11)},
-]
-
-
-@pytest.mark.parametrize("changes", OTHERS, ids=lambda changes: next(iter(changes)))
-def test_blocks_of_another_search_are_not_taken_up(
-    tmp_path: Path, changes: dict[str, object]
-) -> None:
-    field, kept = noisy().isel(z=slice(2)), Kept(tmp_path)
-    pointwise(field, searching(), workers=Serial(), kept=kept)
-    alone = pointwise(field, searching(**changes), workers=Serial())
-    among = pointwise(field, searching(**changes), workers=Serial(), kept=kept)
-    assert bytes_of(among) == bytes_of(alone)
-
-
-def test_blocks_on_other_axes_are_not_taken_up(tmp_path: Path) -> None:
-    kept = Kept(tmp_path)
-    pointwise(parabolas(), searching(), workers=Serial(), kept=kept)
-    slower = parabolas().assign_coords(time=("time", 2.0 * T, {"units": "s"}))
-    result = pointwise(slower, searching(), workers=Serial(), kept=kept)
-    np.testing.assert_allclose(result["coef"].sel(term="u")[0, 0], -25.0 * R, rtol=1e-9)
-
-
-def test_a_block_is_held_under_its_own_key_alone(tmp_path: Path) -> None:
-    (block,) = blocks_of(parabolas(), 12)
-    Kept(tmp_path, "one").write(block, {"coef": np.ones(3)})
-    assert Kept(tmp_path, "one").holds(block)
-    assert list(Kept(tmp_path, "one").read(block)) == ["coef"]
-    assert not Kept(tmp_path, "two").holds(block)
-    assert Kept(tmp_path, "two").read(block) is None
-
-
-def test_a_damaged_block_is_computed_again(tmp_path: Path) -> None:
-    kept = Kept(tmp_path)
-    first = pointwise(noisy(), searching(), workers=Serial(), kept=kept, block_points=6)
-    paths = sorted(tmp_path.iterdir())
-    paths[0].write_bytes(paths[0].read_bytes()[:1000])
-    paths[1].write_bytes(b"")
-    again = pointwise(noisy(), searching(), workers=Serial(), kept=kept, block_points=6)
-    assert bytes_of(again) == bytes_of(first)
-
-
-def test_a_full_disk_keeps_the_blocks_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write, n_written = np.savez, []
-
-    def full_after_two(path: Path, **arrays: np.ndarray) -> None:
-        if len(n_written) == 2:
-            path.write_bytes(b"half of the b")
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        n_written.append(path)
-        write(path, **arrays)
-
-    monkeypatch.setattr(np, "savez", full_after_two)
-    with pytest.raises(OSError, match=r"No space left on device.*pieces before it are kept"):
-        pointwise(noisy(), searching(), workers=Serial(), kept=Kept(tmp_path), block_points=2)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["z0-1_r0-2.npz", "z0-1_r2-3.npz"]
 
 
 def test_blocks_cover_the_grid_once() -> None:

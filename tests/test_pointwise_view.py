@@ -57,7 +57,7 @@ def study() -> xr.Dataset:
 
 def outcome(result: xr.Dataset, *, max_regimes: int = 4) -> Outcome:
     found = find_regimes(result, rng=np.random.default_rng(0), max_regimes=max_regimes)
-    return Outcome(result, found, None, wall_s=1.0, n_before=0)
+    return Outcome(result, found, None, wall_s=1.0)
 
 
 @pytest.fixture(scope="module")

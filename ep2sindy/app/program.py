@@ -68,7 +68,7 @@ def run() -> None:
     except OSError as error:
         where = (
             "where a run writes is chosen with output=PATH, and where it keeps what it can use "
-            "again with data.cache=PATH or keep=PATH"
+            "again with data.cache=PATH"
         )
         sys.exit(plain(f"error: {error}; {where}"))
     except KeyboardInterrupt:

@@ -6,6 +6,5 @@ from ep2sindy.discovery.choice import Choice as Choice
 from ep2sindy.estimation.estimate import Estimate as Estimate
 from ep2sindy.discovery.one_signal import SignalDiscovery as SignalDiscovery
 from ep2sindy.discovery.point_search import PointSearch as PointSearch
-from ep2sindy.runtime.kept import Kept as Kept
 from ep2sindy.discovery.regimes import find_regimes as find_regimes
 from ep2sindy.discovery.regimes import Regimes as Regimes

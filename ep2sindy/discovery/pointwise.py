@@ -1,14 +1,12 @@
 """Discovery at every grid point of a field: the active terms and their coefficients by place.
 
-The grid is cut into blocks of points. Finished blocks are kept on disk, so that an interrupted run
-can be continued.
+The grid is cut into blocks of points, which are read and searched one after the other.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -25,13 +23,9 @@ from ep2sindy.discovery.point_search import (
     nothing,
     search_point,
 )
-from ep2sindy.library.relations import relations_of
 from ep2sindy.library.units import unit_product
-from ep2sindy.runtime.files import fingerprint
-from ep2sindy.runtime.kept import Kept
 from ep2sindy.runtime.parallel import Workers, run_alike
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
-from ep2sindy.trust.user_code import PACKAGE
 
 NO_FIT = "no_fit"
 
@@ -46,7 +40,6 @@ def pointwise(
     search: PointSearch,
     *,
     workers: Workers,
-    kept: Kept | None = None,
     block_points: int = 256,
     progress: Progress | Advance | bool = False,
 ) -> xr.Dataset:
@@ -60,7 +53,6 @@ def pointwise(
     equation; status per point. If the status is not 0, the others are NaN. The attribute no_fit
     holds a reason why a fit failed, if one did.
     If the field is opened lazily, only the current block is in memory.
-    kept: store of finished blocks, from which an interrupted run of the same search is continued.
     progress: True shows a bar; a function is called with the number of points of every finished
     block; see `Progress`.
     Raises ValueError for a field without space, a variable it lacks, or, with the first reason, if
@@ -68,13 +60,11 @@ def pointwise(
     """
     _check(field, search)
     part = field[list(search.variables)]
-    if kept and kept.key is None:
-        kept = replace(kept, key=search_key(part, search))
     blocks = blocks_of(part, block_points)
     result = _empty(part, search)
     n_points = sum(block.n_points for block in blocks)
     with as_progress(progress).stage(n_points, "point") as advance:
-        for block, done in _search_blocks(part, search, blocks, workers, kept):
+        for block, done in _search_blocks(part, search, blocks, workers):
             _place(result, block, done)
             advance(block.n_points)
     if not (result["status"] == 0).any():
@@ -82,43 +72,17 @@ def pointwise(
     return result
 
 
-def search_key(field: xr.Dataset, search: PointSearch) -> str:
-    """Hash of the search, the axes of the field, and the code of the package."""
-    axes = [axis for axis in ("time", *SPACE) if axis in field.dims]
-    decisive = {
-        "states": list(search.states),
-        "terms": list(search.library.names),
-        "functions": repr(search.library.functions),
-        "relations": [relation.text for relation in relations_of(search.relations)],
-        "method": repr(search.method),
-        "least_variation": search.least_variation,
-        "seed": search.seed,
-        "axes": {axis: grid_points(field, axis).tolist() for axis in axes},
-    }
-    return fingerprint(json.dumps(decisive), sources=PACKAGE)
-
-
 def _search_blocks(
     part: xr.Dataset,
     search: PointSearch,
     blocks: Sequence[Block],
     workers: Workers,
-    kept: Kept | None,
 ) -> Iterator[tuple[Block, Mapping[str, np.ndarray]]]:
-    """Every block with its results: first the kept ones, then those searched and kept now."""
-    waiting: list[Block] = []
-    for block in blocks:
-        done = kept.read(block) if kept else None
-        if done is None:
-            waiting.append(block)
-        else:
-            yield block, done
+    """Every block with its results, as they come."""
     function = partial(_search_block, search)
-    pieces = (part.isel(block.slices) for block in waiting)  # once read, none is held
-    for number, done in run_alike(workers, function, pieces, len(waiting)):
-        if kept:
-            kept.write(waiting[number], done)
-        yield waiting[number], done
+    pieces = (part.isel(block.slices) for block in blocks)  # once read, none is held
+    for number, done in run_alike(workers, function, pieces, len(blocks)):
+        yield blocks[number], done
 
 
 def _why_none(result: xr.Dataset) -> str:
@@ -260,10 +224,6 @@ class Block:
     @property
     def n_points(self) -> int:
         return int(np.prod([part.stop - part.start for part in self.slices.values()]))
-
-    @property
-    def name(self) -> str:
-        return "_".join(f"{axis}{part.start}-{part.stop}" for axis, part in self.slices.items())
 
 
 def blocks_of(field: xr.Dataset, n_points: int) -> list[Block]:

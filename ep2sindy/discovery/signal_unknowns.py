@@ -21,7 +21,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.names import number_text
 from ep2sindy.model.comparison import SPIRALS, Verdict
 from ep2sindy.model.free_run import FreeCycle, free_run
-from ep2sindy.runtime.kept import Once, at_once
+from ep2sindy.runtime.parallel import Once, at_once
 from ep2sindy.runtime.progress import Progress
 from ep2sindy.signals.embedding import Chosen, Embedded, LogRate, Rate
 from ep2sindy.signals.trace import Trace, is_positive

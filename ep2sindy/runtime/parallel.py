@@ -8,9 +8,10 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
-from itertools import islice
+from itertools import count, islice
+from pathlib import Path
 from threading import RLock
 from time import perf_counter
 from types import ModuleType
@@ -19,6 +20,7 @@ from typing import Any, Protocol, runtime_checkable
 import cloudpickle
 from joblib import Parallel, delayed, effective_n_jobs
 
+from ep2sindy.runtime.kept import kept
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.trust.interruption import end_with
 from ep2sindy.trust.user_code import isolate_children, own_packages
@@ -163,6 +165,47 @@ class Loky:
         yield from found
 
 
+Once = Callable[[Callable[[], Any]], Any]  # does a piece of work, or reads its result back
+
+
+def at_once(function: Callable[[], Any]) -> Any:
+    """Do a piece of work, and keep nothing."""
+    return function()
+
+
+@dataclass(frozen=True, eq=False)
+class KeptWorkers:
+    """Workers whose finished pieces are kept in a folder, and read back by a run that goes on.
+
+    A piece is named by the number of the call of `run` that it belongs to, and by its own: the
+    calls must come in the same order in every run of the same settings. folder: None keeps nothing.
+    """
+
+    workers: Workers
+    folder: Path | None
+    _calls: Iterator[int] = field(default_factory=count)
+
+    def run(
+        self, function: Callable[[Any], Any], pieces: Iterable[Any]
+    ) -> Iterator[tuple[int, Any]]:
+        return self.workers.run(self.keeping(function), enumerate(pieces))
+
+    def once(self, function: Callable[[], Any]) -> Any:
+        """The result of one piece of work that is done in this process."""
+        return self.keeping(lambda _: function())((0, None))
+
+    def keeping(self, function: Callable[[Any], Any]) -> Callable[[tuple[int, Any]], Any]:
+        """The function of numbered pieces that does each, or reads its result back."""
+        return partial(_kept_piece, self.folder, next(self._calls), function)
+
+
+def _kept_piece(
+    folder: Path | None, call: int, function: Callable[[Any], Any], numbered: tuple[int, Any]
+) -> Any:
+    number, piece = numbered
+    return kept(folder, (call, number), function, piece) if folder else function(piece)
+
+
 def run_alike(
     workers: Workers, function: Callable[[Any], Any], pieces: Iterable[Any], n_pieces: int
 ) -> Iterator[tuple[int, Any]]:
@@ -171,6 +214,11 @@ def run_alike(
     The first piece is then done in this process, and the others too if they would take less time
     than the start of the processes.
     """
+    if isinstance(workers, KeptWorkers):
+        yield from run_alike(
+            workers.workers, workers.keeping(function), enumerate(pieces), n_pieces
+        )
+        return
     waiting = iter(pieces)
     n_first = 1 if isinstance(workers, Loky) else 0
     begin = perf_counter()

@@ -136,8 +136,8 @@ class Study:
     systems: names of systems, or `dysts` for all of that collection, which needs the package.
     noises: standard deviations of the white noise, in RMS of each state. n_trajectories: number of
     trajectories in each realization. degree: of the library; None takes each system's own.
-    variants: names among the definitions. thesis: the thesis's tables, shown beside ours. keep: the
-    folder of finished realizations, from which a run continues a broken one.
+    variants: names among the definitions. thesis: the thesis's tables, shown beside ours. keep:
+    whether a run goes on with the finished realizations of one that was broken off.
     """
 
     systems: NamesOrOne
@@ -149,7 +149,7 @@ class Study:
     definitions: Mapping[str, Deferred]
     thesis: Mapping[str, Any]
     parallel: Workers
-    keep: str = ".cache/benchmark"
+    keep: bool = True
 
     def idle(self) -> dict[str, str]:
         unused = [name for name in self.definitions if name not in self.variants]

@@ -18,7 +18,6 @@ from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.point_search import PointSearch
 from ep2sindy.discovery.pointwise import (
     STATUSES,
-    blocks_of,
     pointwise,
 )
 from ep2sindy.discovery.recipe import regression_of
@@ -38,10 +37,9 @@ from ep2sindy.report.document import (
     pictures,
 )
 from ep2sindy.report.run import Run
-from ep2sindy.runtime.kept import Kept
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.runtime.progress import Advance
-from ep2sindy.studies.resume import kept_pieces, told
+from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.simulated import say_simulation
 from ep2sindy.studies.source import Step, open_prepared, say_field
 from ep2sindy.studies.study import A_LIST, Count, Deferred, Names
@@ -72,9 +70,9 @@ class Study:
     """Search an equation at every grid point, and group the points into regimes.
 
     terms: those of variables_if_present are left out if the field lacks their variables.
-    relations: between coefficients of the equations at a point. keep: the
-    folder of finished blocks, from which a run continues a broken one. outline: the thruster whose
-    channel is drawn into the maps.
+    relations: between coefficients of the equations at a point. keep: whether a run goes on with
+    the finished blocks of one that was broken off. outline: the thruster whose channel is drawn
+    into the maps.
     """
 
     data: Deferred
@@ -88,7 +86,7 @@ class Study:
     least_variation: float
     max_regimes: Count
     block_points: Count
-    keep: str
+    keep: bool
     outline: Thruster | None
 
     def __post_init__(self) -> None:
@@ -115,9 +113,15 @@ class Study:
         left_out = [name for name in map(str, self.terms) if name not in search.library.names]
         if left_out:
             run.say(f"terms left out, for this field lacks their variables: {', '.join(left_out)}")
-        kept = kept_pieces(self.keep, run, aside=AFTERWARDS)
         begin = time.perf_counter()
-        result, n_before = self._searched(field, search, kept, run)
+        with resumed(self.keep, run, self.parallel, aside=AFTERWARDS) as workers:
+            result = pointwise(
+                field,
+                search,
+                workers=workers,
+                block_points=self.block_points,
+                progress=Rates(run),
+            )
         wall_s = time.perf_counter() - begin
         rng = np.random.default_rng(run.seed)
         with run.progress(None, "", "regimes"):
@@ -125,39 +129,14 @@ class Study:
         result = result.assign(regime=found.labels, confidence=found.confidence)
         packed = {str(name): {"zlib": True, "complevel": 4} for name in result.data_vars}
         write_netcdf(result, run.folder.path / "pointwise.nc", encoding=packed)
-        kept.clear()
-        return Outcome(result, found, self.outline, wall_s=wall_s, n_before=n_before)
-
-    def _searched(
-        self, field: xr.Dataset, search: PointSearch, kept: Kept, run: Run
-    ) -> tuple[xr.Dataset, int]:
-        """The result, continued from a broken run if any, and number of points from that run."""
-        blocks = blocks_of(field, self.block_points)
-        n_before = sum(block.n_points for block in blocks if kept.holds(block))
-        n_points = sum(block.n_points for block in blocks)
-        if n_before:
-            run.say(f"going on with {n_before} of {n_points} points that a broken run had done")
-        with told(kept, run):
-            result = pointwise(
-                field,
-                search,
-                workers=self.parallel,
-                kept=kept,
-                block_points=self.block_points,
-                progress=Rates(run, n_before),
-            )
-        return result, n_before
+        return Outcome(result, found, self.outline, wall_s=wall_s)
 
 
 @dataclass(frozen=True, eq=False)
 class Rates:
-    """Progress of the run, and points per second in TensorBoard during the run.
-
-    n_before: number of points that an earlier run had finished; they come first.
-    """
+    """Progress of the run, and points per second in TensorBoard during the run."""
 
     run: Run
-    n_before: int
 
     @contextmanager
     def stage(self, total: int | None, unit: str, label: str = "") -> Iterator[Advance]:
@@ -168,7 +147,7 @@ class Rates:
                 nonlocal done
                 done += n_more
                 advance(n_more)
-                per_s = max(done - self.n_before, 0) / max(time.perf_counter() - begin, 1e-9)
+                per_s = done / max(time.perf_counter() - begin, 1e-9)
                 rates = {"points/done": float(done), "points/per_s": per_s}
                 self.run.board.scalars(rates, step=done)
 
@@ -179,14 +158,13 @@ class Rates:
 class Outcome:
     """Equations found at the grid points; `pointwise.nc` holds the full result.
 
-    wall_s: duration of the search. n_before: number of points from an earlier, broken run.
+    wall_s: duration of the search.
     """
 
     result: xr.Dataset
     regimes: Regimes
     outline: Thruster | None
     wall_s: float
-    n_before: int
 
     @property
     def n_points(self) -> int:
@@ -194,8 +172,7 @@ class Outcome:
 
     @property
     def points_per_s(self) -> float:
-        """Points per second of this run, without the points of an earlier, broken run."""
-        return (self.n_points - self.n_before) / self.wall_s
+        return self.n_points / self.wall_s
 
     @property
     def status_counts(self) -> dict[str, int]:

@@ -139,8 +139,8 @@ class Study:
     models: of which one is selected, by name; None searches for terms.
     degrees: candidate degrees of the polynomials, of which one is selected. map_points: number of
     points along each parameter. labels: names of the parameters in figures.
-    forecasts: number of starts over the second half of every record left out; 0 for none. keep: the
-    folder of finished pieces, from which a run continues a broken one.
+    forecasts: number of starts over the second half of every record left out; 0 for none. keep:
+    whether a run goes on with the finished pieces of one that was broken off.
     """
 
     source: Source
@@ -154,7 +154,7 @@ class Study:
     map_points: Count
     labels: Mapping[str, str]
     forecasts: int = 0
-    keep: str = ".cache/predict"
+    keep: bool = True
 
     def __post_init__(self) -> None:
         if self.forecasts < 0:

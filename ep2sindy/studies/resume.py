@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 from ep2sindy.data.steps import files_of
 from ep2sindy.operating.file_names import FilePattern
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.files import fingerprint
-from ep2sindy.runtime.kept import Kept, KeptWorkers
-from ep2sindy.runtime.parallel import ONE_BY_ONE, Workers
+from ep2sindy.runtime.kept import folder_of_pieces
+from ep2sindy.runtime.parallel import ONE_BY_ONE, KeptWorkers, Workers
 from ep2sindy.trust.user_code import PACKAGE, own_source
 
 # Settings of every study that do not change a piece's result; they may differ when a broken run is
@@ -74,43 +76,28 @@ def _files_named(settings: object) -> Iterator[str]:
             yield text
 
 
-def kept_pieces(keep: str, run: Run, *, aside: Collection[str] = ()) -> Kept:
-    """The store of a run's finished pieces, below the folder `keep`; says if it begins anew.
-
-    aside: see `pieces_key`.
-    """
-    key = pieces_key(run.settings, aside=aside)
-    kept = Kept(Path(keep) / key, key)  # runs of other settings may be at work beside it
-    if not kept.n_pieces and (others := kept.others()):
-        run.say(
-            f"this run begins anew: what is kept in {keep} of {len(others)} other "
-            f"run{'s' if len(others) > 1 else ''} was made by other settings, data or code"
-        )
-    return kept
-
-
 @contextmanager
-def told(kept: Kept, run: Run) -> Iterator[None]:
-    """Say how to go on, if a run is broken off."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        run.say(f"finished pieces are kept in {kept.folder}: the same command goes on with them")
-        raise
+def resumed(
+    keep: bool, run: Run, workers: Workers = ONE_BY_ONE, *, aside: Collection[str] = ()
+) -> Iterator[KeptWorkers]:
+    """Workers that go on with the pieces that a broken run had finished, kept in the user's cache.
 
-
-@contextmanager
-def resumed(keep: str, run: Run, workers: Workers = ONE_BY_ONE) -> Iterator[KeptWorkers]:
-    """Workers that go on with the pieces that a broken run had finished.
-
+    keep: False begins anew and keeps nothing. aside: see `pieces_key`.
     The pieces are removed once the run has written all that it found.
     """
-    kept = kept_pieces(keep, run)
-    if kept.n_pieces:
-        run.say(f"going on with {kept.n_pieces} pieces that a broken run had done")
-    keeping = KeptWorkers(workers, kept)
-    with told(kept, run):
-        yield keeping
-    for reason in keeping.refused:
-        run.say(f"some pieces were not kept, and would be computed again: {reason}")
-    run.when_written(kept.clear)
+    folder = None
+    if keep:
+        try:
+            folder = folder_of_pieces(pieces_key(run.settings, aside=aside))
+        except OSError as error:
+            run.say(f"finished pieces are not kept: {error}")
+    if folder is not None and folder.exists():
+        run.say("going on with the pieces that a broken run had finished")
+    try:
+        yield KeptWorkers(workers, folder)
+    except KeyboardInterrupt:
+        if folder is not None:
+            run.say("finished pieces are kept: the same command goes on with them")
+        raise
+    if folder is not None:
+        run.when_written(partial(rmtree, folder, ignore_errors=True))

@@ -22,7 +22,7 @@ from ep2sindy.discovery.method import AnyMethod, TrajectorySearch
 from ep2sindy.discovery.one_signal import SignalSearch, choose_attempt, count_fitted, evaluate
 from ep2sindy.discovery.signal_unknowns import FITTED, fit_offset
 from ep2sindy.report.run import Run
-from ep2sindy.runtime.kept import Once
+from ep2sindy.runtime.parallel import Once
 from ep2sindy.signals.embedding import Delays, LogRate, Rate
 from ep2sindy.signals.trace import Trace, prepare_signal
 from ep2sindy.studies.resume import resumed
@@ -48,7 +48,7 @@ class Study:
     decimate, detrend: see `prepare_signal`. degree, functions, function_degree: of the library; a
     `?` in a function stands for a number to be fitted, as in `sign(?*v)` and `1/(?+x)`.
     held_out: the share at the end of the record that is not fitted and serves as the test. keep:
-    the folder of finished searches, from which a run continues a broken one.
+    whether a run goes on with the finished searches of one that was broken off.
     """
 
     source: Source
@@ -65,7 +65,7 @@ class Study:
     function_degree: Count
     held_out: Share
     unit: str | None = None
-    keep: str = ".cache/trace"
+    keep: bool = True
 
     def __post_init__(self) -> None:
         if isinstance(self.offset, str) and self.offset != "fit":
