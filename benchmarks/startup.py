@@ -120,7 +120,7 @@ def run(case: Case, checkout: Path, folder: Path) -> Waited:
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # as installed: bytecode is kept
     with tempfile.TemporaryDirectory() as cache:
         if case.cold:
-            environment["NUMBA_CACHE_DIR"] = cache
+            environment["EP2SINDY_CACHE"] = cache
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         outputs = (watched if case.watched else silent)(case.command, folder, environment)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -243,7 +243,7 @@ main()
 def test_a_killed_run_ends_with_the_same_file(
     grid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("EP2SINDY_CACHE", str(tmp_path / "cache"))
 
     def run(folder: Path, *program: str) -> int:
         overrides = [*on_file(grid, folder), "block_points=1", "bootstraps.n=20", "keep=true"]
@@ -253,12 +253,12 @@ def test_a_killed_run_ends_with_the_same_file(
     undisturbed, broken = tmp_path / "undisturbed", tmp_path / "broken"
     assert run(undisturbed, "-m", "experiments.run") == 0
     assert run(broken, "-c", KILLED) == -signal.SIGKILL
-    assert len(list((tmp_path / "cache" / "ep2sindy").rglob("output.pkl"))) == 5
+    assert len(list((tmp_path / "cache" / "pieces").rglob("output.pkl"))) == 5
     assert run(broken, "-m", "experiments.run") == 0
     (one,), (other,) = (place.rglob("pointwise.nc") for place in (undisturbed, broken))
     assert one.read_bytes() == other.read_bytes()
     assert "going on with the pieces" in (other.parent / "run.log").read_text()
-    assert not list((tmp_path / "cache" / "ep2sindy").rglob("output.pkl"))
+    assert not list((tmp_path / "cache" / "pieces").rglob("output.pkl"))
 
 
 def test_continuity_is_found_at_every_point_of_a_simulated_channel(tmp_path: Path) -> None:

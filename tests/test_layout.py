@@ -223,26 +223,6 @@ def test_a_class_name_stands_once() -> None:
     assert twice == {"Study", "Outcome"}
 
 
-def test_few_modules_serve_one_neighbour_alone() -> None:
-    """Such a module belongs into the one that imports it, unless one of the reasons holds.
-
-    Kernels are compiled anew where their file changes, so they stand apart; readers, commands and
-    studies are siblings that one register names; the others would make a file of over 500 lines.
-    """
-    importers: dict[str, set[str]] = {module: set() for module in PATHS}
-    for module, path in PATHS.items():
-        for name in own(imports(path, at_once=False)) - {module}:
-            importers[name].add(module)
-    lonely = {
-        module
-        for module, users in importers.items()
-        if len(users) == 1 and next(iter(users)).split(".")[0] == module.split(".")[0]
-    }
-    siblings = ("data.readers.", "app.", "studies.")
-    lonely = {m for m in lonely if not m.endswith("kernels") and not m.startswith(siblings)}
-    assert len(lonely) <= 10, sorted(lonely)
-
-
 def test_the_drawing_of_the_house_is_what_the_imports_say() -> None:
     house = run_path(str(PACKAGE.parent / "docs" / "house.py"))
     assert house["DRAWING"].read_text("utf-8") == house["drawing"](), "run python docs/house.py"

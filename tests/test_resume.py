@@ -11,8 +11,9 @@ import pytest
 from omegaconf import DictConfig
 
 import ep2sindy as ep
-from ep2sindy.runtime import kept, parallel
+from ep2sindy.runtime import parallel
 from ep2sindy.runtime.parallel import KeptWorkers, Loky, Serial
+from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.studies import benchmark, trace
 from tests.programs import Computed, composed, computed
 from tests.test_experiment_trace import glance, scope, signal
@@ -24,7 +25,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The user's cache, and a folder to stand in."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    monkeypatch.setattr(kept, "user_cache_path", lambda name: tmp_path / "cache" / name)
+    monkeypatch.setenv("EP2SINDY_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
@@ -73,12 +74,12 @@ def test_a_damaged_piece_is_computed_again(tmp_path: Path) -> None:
 
 def test_pieces_of_a_run_that_nobody_took_up_are_removed(cache: Path) -> None:
     for key, days in (("old", 31.0), ("young", 29.0)):
-        folder = kept.folder_of_pieces(key)
+        folder = cache_folder("pieces", key)
         folder.mkdir()
         then = folder.stat().st_mtime - 86400.0 * days
         os.utime(folder, (then, then))
-    kept.folder_of_pieces("new")
-    assert [each.name for each in (cache / "ep2sindy" / "pieces").iterdir()] == ["young"]
+    cache_folder("pieces", "new")
+    assert [each.name for each in (cache / "pieces").iterdir()] == ["young"]
 
 
 def ends(*_: object, **settings: object) -> None:
@@ -171,7 +172,7 @@ def test_other_settings_begin_anew(
 
 
 def test_where_no_cache_can_be_written_a_run_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kept, "user_cache_path", lambda name: Path("~") / ".cache" / name)
+    monkeypatch.setenv("EP2SINDY_CACHE", "~/.cache")
     given = ["systems=[oscillator]", "noises=[0.0]", "n_realizations=1", "variants=[STLSQ]"]
     found = computed(composed("+exp=benchmark", *given, "parallel=serial"))
     assert "finished pieces are not kept: a cache needs an absolute folder" in found.log

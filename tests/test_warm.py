@@ -16,9 +16,9 @@ from ep2sindy.runtime import compilation
 
 @pytest.fixture
 def compilations(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[bool]:
-    """What comes of each compilation, the next one first; the stamp lies in `tmp_path`."""
+    """What comes of each compilation, the next one first; the cache lies in `tmp_path`."""
     outcomes = [True, True, True]
-    monkeypatch.setattr(warm, "cache_folder", lambda: tmp_path / "kernels")
+    monkeypatch.setenv("EP2SINDY_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(warm, "_compiled_side_by_side", lambda: outcomes.pop(0))
     return outcomes
 
@@ -47,39 +47,63 @@ def test_kernels_are_compiled_again_where_a_source_has_changed(
 
 def test_what_kernels_import_compiles_them_again_too() -> None:
     """Columns of a table and constants stand in other files, and are compiled in."""
-    folder = compilation.PACKAGE / "thruster" / "axial"
-    watched = {name for name, *_ in compilation._stamp(folder)}
-    assert {"collision_kernels.py", "closures.py", "constants.py", "compilation.py"} <= watched
-    assert {"closures.py", "constants.py"} <= {path.name for path in compilation.sources()}
+    kernels = compilation._kernels_in(compilation.PACKAGE / "thruster" / "axial")
+    watched = {path.name for path in (*kernels, *compilation._imported(kernels))}
+    assert {"collision_kernels.py", "closures.py", "constants.py"} <= watched
+    assert watched | {"compilation.py"} <= {path.name for path in compilation.sources()}
 
 
-@pytest.mark.parametrize("damage", ["renamed", "cut", "overwritten"])
-def test_an_index_that_cannot_be_read_is_made_again(
-    damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As after an upgrade in place: the index of a kernel names a class that is no more."""
+def called(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a kernel that calls another, by a process of its own."""
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; sys.path.insert(0, sys.argv[1]); import my_kernels",
+    ]
+    return subprocess.run(
+        [*command, str(folder)],
+        env=os.environ | environment, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def kernels(tmp_path: Path) -> Path:
     folder = tmp_path / "own"
     folder.mkdir()
-    source = (
-        "from typing import NamedTuple\n"
-        "from ep2sindy.runtime.compilation import compiled\n"
-        "class State(NamedTuple):\n    x: float\n"
-        "@compiled\ndef double(state):\n    return 2.0 * state.x\n"
-        "print(double(State(1.5)))\n"
+    start = "from ep2sindy.runtime.compilation import compiled\n"
+    (folder / "inner.py").write_text(f"{start}@compiled\ndef inner(x):\n    return x + 1.0\n")
+    program = (
+        f"{start}from inner import inner\n@compiled\ndef twice(x):\n    return 2.0 * inner(x)\n"
     )
-    program = folder / "my_kernels.py"
-    program.write_text(source)
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    call = [sys.executable, "-c", "import sys; sys.path.insert(0, sys.argv[1]); import my_kernels"]
-    command = [*call, str(folder)]
-    subprocess.run(command, env=environment, capture_output=True, check=True)
-    (index,) = (tmp_path / "cache").rglob("*.nbi")
-    if damage == "renamed":
-        program.write_text(source.replace("State", "OtherState"))
-    else:
-        index.write_bytes(index.read_bytes()[:-9] if damage == "cut" else b"not a pickle")
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert run.stdout == "3.0\n", run.stderr
+    (folder / "my_kernels.py").write_text(f"{program}print(twice(1.5))\n")
+    return folder
+
+
+def test_a_kernel_is_kept_in_the_users_cache_and_follows_what_it_calls(
+    kernels: Path, tmp_path: Path
+) -> None:
+    cache = str(tmp_path / "cache")
+    first = called(kernels, EP2SINDY_CACHE=cache)
+    assert (first.stdout, first.stderr) == ("5.0\n", f"{compilation.ANNOUNCEMENT}\n")
+    assert list((tmp_path / "cache" / "kernels").rglob("*.nbi"))
+    again = called(kernels, EP2SINDY_CACHE=cache)
+    assert (again.stdout, again.stderr) == ("5.0\n", "")
+    inner = kernels / "inner.py"
+    inner.write_text(inner.read_text().replace("x + 1.0", "x + 1.25"))
+    assert called(kernels, EP2SINDY_CACHE=cache).stdout == "5.5\n"
+    assert not list(kernels.rglob("*.nbi"))
+
+
+def test_without_a_folder_kernels_are_compiled_every_time_and_it_is_said(kernels: Path) -> None:
+    for place, reason in (
+        ("~/.cache", "a cache needs an absolute folder"),
+        ("/dev/null", "cannot"),
+    ):
+        run = called(kernels, EP2SINDY_CACHE=place)
+        assert run.stdout == "5.0\n"
+        assert run.stderr.count("they are not kept, for") == 1
+        assert reason in run.stderr
+    assert not Path("~").exists()
 
 
 def test_what_was_broken_off_is_taken_up_again(compilations: list[bool]) -> None:
@@ -92,9 +116,11 @@ def test_what_was_broken_off_is_taken_up_again(compilations: list[bool]) -> None
 def test_a_folder_that_cannot_be_written_costs_no_run(
     compilations: list[bool], tmp_path: Path
 ) -> None:
-    (tmp_path / "kernels").write_text("a file")
+    (tmp_path / "cache").write_text("a file")
     warm.warm()
-    assert len(compilations) == 2
+    assert len(compilations) == 3
+    with pytest.raises(SystemExit, match="error: .*cannot be a cache: "):
+        warm.main([])
 
 
 def test_kernels_of_the_package_alone_are_told_and_in_place_of_the_announcement(
@@ -133,7 +159,7 @@ def test_parts_of_the_package_that_call_kernels_run(part: str) -> None:
 @pytest.mark.slow
 def test_every_kernel_is_compiled_and_then_none_is(tmp_path: Path) -> None:
     """From nothing; and a search, a refinement and a simulation find all that they call."""
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    environment = os.environ | {"EP2SINDY_CACHE": str(tmp_path)}
     command = [sys.executable, "-m", "ep2sindy.app.main", "warm"]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert compilation.ANNOUNCEMENT in run.stderr

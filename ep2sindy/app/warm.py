@@ -13,14 +13,16 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from hashlib import sha256
+from pathlib import Path
 
 import numpy as np
 
 import ep2sindy as ep
 from ep2sindy.model.many import DrivenWindows, Ensemble
-from ep2sindy.runtime.compilation import ANNOUNCEMENT, cache_folder, sources, tell_each_kernel
+from ep2sindy.runtime.compilation import ANNOUNCEMENT, digest, sources, tell_each_kernel
 from ep2sindy.runtime.progress import Bars
 from ep2sindy.runtime.screen import say
+from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import isolate
 
 ABOUT = """Compiles all kernels of the package, once after installation: a minute on two cores.
@@ -30,31 +32,39 @@ Runs of the command line do so by themselves; in Python, a call compiles what it
 def main(arguments: Sequence[str]) -> None:
     """Compile, and report where the kernels are kept."""
     argparse.ArgumentParser("ep2sindy warm", description=ABOUT).parse_args(arguments)
+    try:
+        place = _stamp().parent
+    except OSError as error:
+        sys.exit(f"error: {error}")
     warm()
-    say(f"all kernels are compiled; they are kept in {cache_folder()}")
+    say(f"all kernels are compiled; they are kept in {place}")
 
 
 def warm() -> None:
     """Compile all kernels with a message, unless this machine has compiled these sources."""
-    stamp, state = cache_folder() / "warm", _state()
-    if stamp.is_file() and stamp.read_text("utf-8") == state:
+    try:
+        stamp = _stamp()
+    except OSError:  # every process compiles what it uses, and says so
+        return
+    if stamp.exists():
         return
     say(ANNOUNCEMENT, error=True)
     if not _compiled_side_by_side():
         return
     with suppress(OSError):  # on a full disk, the next run repeats this half minute
-        stamp.parent.mkdir(parents=True, exist_ok=True)
-        stamp.write_text(state, "utf-8")
+        stamp.mkdir()
 
 
-def _state() -> str:
-    """Hash of what compiled kernels depend on: their sources, numba, Python and the processor."""
+def _stamp() -> Path:
+    """A folder that is there once all kernels are compiled from these sources, on this machine.
+
+    Raises OSError if kernels cannot be kept.
+    """
     import numba
     from llvmlite.binding import get_host_cpu_name
 
-    files = [(path.name, path.stat().st_mtime, path.stat().st_size) for path in sources()]
-    versions = numba.__version__, sys.version, get_host_cpu_name()
-    return sha256(repr((files, versions)).encode()).hexdigest()
+    versions = f"{digest(sources())}{numba.__version__}{sys.version}{get_host_cpu_name()}"
+    return cache_folder("kernels", f"warm_{sha256(versions.encode()).hexdigest()[:16]}")
 
 
 def _compiled_side_by_side() -> bool:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 from collections.abc import Callable, Iterable
-from contextlib import suppress
-from functools import cache, partial
+from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from ep2sindy.runtime.screen import say
+from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import PACKAGE, away_from
 
 SETTINGS = ".numba_config.yaml"  # read from the current folder, which may not be trustworthy
@@ -66,22 +66,39 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
     Kernels release the GIL, so that a worker in a long call still notices that its run was killed.
     The functions that a kernel calls are compiled into it, and so are constants. A change in any
     file of its folder, or in a file from which kernels there import names, therefore triggers a
-    new compilation. Numba itself checks only the kernel's own file.
+    new compilation: the cache lies in a folder that is named after them. Numba itself checks only
+    the kernel's own file. Without a folder that can be written, every process compiles anew.
     """
     if function is None:
         return lambda each: compiled(each, **options)
     _listen()
-    # No one calls kernels from C, and a wrapper for that would be compiled for each.
-    kernel: Any = numba.njit(cache=True, nogil=True, **({"no_cfunc_wrapper": True} | options))(
-        function
-    )
-    kept: Any = getattr(kernel._cache, "_cache_file", None)
-    if hasattr(kept, "_source_stamp"):  # numba has no public interface for this
-        kept._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
-        kept._load_index = partial(_index_or_none, kept._load_index)
-    if hasattr(kernel._cache, "save_overload"):
-        kernel._cache.save_overload = partial(_keep_if_room, kernel._cache.save_overload)
-    return kernel
+    folder = _folder_of(Path(function.__code__.co_filename).parent)
+    place: Any = config
+    before, place.CACHE_DIR = place.CACHE_DIR, folder  # read where a function is decorated
+    try:
+        # No one calls kernels from C, and a wrapper for that would be compiled for each.
+        settings = {"no_cfunc_wrapper": True} | options
+        return numba.njit(cache=bool(folder), nogil=True, **settings)(function)
+    finally:
+        place.CACHE_DIR = before
+
+
+@cache
+def _folder_of(sources: Path) -> str:
+    """Where the kernels of a folder of sources are kept; empty if they cannot be."""
+    files = {*sources.glob("*.py"), *_imported(_kernels_in(sources)), THIS}
+    try:
+        return str(cache_folder("kernels", f"{sources.name}_{digest(files)}"))
+    except OSError as error:
+        _UNKEPT.append(f"; they are not kept, for {error}")
+        return ""
+
+
+def digest(files: Iterable[Path]) -> str:
+    """Hash of the places, dates and sizes of files."""
+    stats = [(str(file), file.stat()) for file in sorted(files)]
+    found = [(name, stat.st_mtime_ns, stat.st_size) for name, stat in stats]
+    return sha256(repr(found).encode()).hexdigest()[:16]
 
 
 def sources() -> list[Path]:
@@ -106,16 +123,6 @@ def _imported(files: Iterable[Path]) -> set[Path]:
     return {place for place in places if place.is_file()}
 
 
-def cache_folder() -> Path:
-    """Folder of the compiled kernels: beside this file, or where numba chose to keep them."""
-
-    @numba.njit(cache=True)
-    def probe() -> None:
-        """Never called."""
-
-    return Path(str(probe.stats.cache_path))
-
-
 def tell_each_kernel(tell: Callable[[str], None]) -> None:
     """Call `tell` with the name of each kernel of the package once it is compiled.
 
@@ -125,39 +132,13 @@ def tell_each_kernel(tell: Callable[[str], None]) -> None:
     _TOLD.append(tell)
 
 
-def _index_or_none(load: Callable[[], dict]) -> dict:
-    """Index of compiled kernels; empty if it cannot be read, so that they are compiled again.
-
-    An index holds the types of arguments. One of an earlier version may name a class that has been
-    renamed since, and numba reads it before it compares the stamp.
-    """
-    try:
-        return load()
-    except (AttributeError, ImportError, EOFError, pickle.UnpicklingError):
-        return {}
-
-
-def _keep_if_room(save: Callable, *compiled: Any) -> None:
-    """Save a kernel, ignoring errors: a full disk costs the next run half a minute, no results."""
-    with suppress(OSError):
-        save(*compiled)
-
-
-@cache
-def _stamp(folder: Path) -> tuple[tuple[str, float, int], ...]:
-    """Names, dates and sizes of all files on which the kernels of a folder depend."""
-    files = {*folder.glob("*.py"), *_imported(_kernels_in(folder)), THIS}
-    stats = [(file.name, file.stat()) for file in sorted(files)]
-    return tuple((name, stat.st_mtime, stat.st_size) for name, stat in stats)
-
-
 class _Listener(event.Listener):
     """Announces once per process that kernels are being compiled; cached ones cause no message."""
 
     def on_start(self, event: event.Event) -> None:
         if not _TOLD:
             _TOLD.append(lambda name: None)  # numba reports every function; one message is enough
-            say(ANNOUNCEMENT, error=True)
+            say(ANNOUNCEMENT + "".join(_UNKEPT[:1]), error=True)
 
     def on_end(self, event: event.Event) -> None:
         kernel: Any = event.data.get("dispatcher")
@@ -168,6 +149,7 @@ class _Listener(event.Listener):
 
 
 _TOLD: list[Callable[[str], None]] = []  # receivers of kernel names; empty until one is needed
+_UNKEPT: list[str] = []  # why kernels cannot be kept
 _LISTENERS: list[_Listener] = []
 
 

@@ -18,9 +18,8 @@ from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
 import cloudpickle
-from joblib import Parallel, delayed, effective_n_jobs
+from joblib import Memory, Parallel, delayed, effective_n_jobs
 
-from ep2sindy.runtime.kept import kept
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.trust.interruption import end_with
 from ep2sindy.trust.user_code import isolate_children, own_packages
@@ -204,6 +203,20 @@ def _kept_piece(
 ) -> Any:
     number, piece = numbered
     return kept(folder, (call, number), function, piece) if folder else function(piece)
+
+
+def kept(folder: Path, piece: tuple[int, int], function: Callable[[Any], Any], value: Any) -> Any:
+    """`function(value)`, or what it returned when this piece was done before.
+
+    piece: numbers of the piece's call and of the piece in it.
+    """
+    return Memory(folder, verbose=0).cache(_done, ignore=["function", "value"])(
+        piece, function, value
+    )
+
+
+def _done(piece: tuple[int, int], function: Callable[[Any], Any], value: Any) -> Any:
+    return function(value)
 
 
 def run_alike(

@@ -14,8 +14,8 @@ from ep2sindy.data.steps import files_of
 from ep2sindy.operating.file_names import FilePattern
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.files import fingerprint
-from ep2sindy.runtime.kept import folder_of_pieces
 from ep2sindy.runtime.parallel import ONE_BY_ONE, KeptWorkers, Workers
+from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import PACKAGE, own_source
 
 # Settings of every study that do not change a piece's result; they may differ when a broken run is
@@ -88,7 +88,7 @@ def resumed(
     folder = None
     if keep:
         try:
-            folder = folder_of_pieces(pieces_key(run.settings, aside=aside))
+            folder = cache_folder("pieces", pieces_key(run.settings, aside=aside))
         except OSError as error:
             run.say(f"finished pieces are not kept: {error}")
     if folder is not None and folder.exists():
