@@ -23,6 +23,7 @@ import xarray as xr
 import yaml
 
 import ep2sindy as ep
+from benchmarks.hallthruster_input import simulate_hallthruster_input
 from benchmarks.landmark import LANDMARK_POINT, landmark_thruster, read_landmark_rates
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.thruster.axial import simulate as axial
@@ -169,9 +170,7 @@ def spt100_run(config: dict[str, Any], n_cells: int, duration_s: float = 2e-3) -
         path = Path(folder) / "spt100.json"
         path.with_name("bfield.csv").write_text("\n".join(rows) + "\n")
         path.write_text(json.dumps(given))
-        return ep.thruster.simulate_hallthruster_input(
-            path, cache=folder, sample_s=1.5e-6, progress=False
-        )
+        return simulate_hallthruster_input(path, cache=folder, sample_s=1.5e-6, progress=False)
 
 
 def figures(run: xr.Dataset) -> dict[str, float]:

@@ -11,6 +11,7 @@ import argparse
 import numpy as np
 from sklearn.metrics import adjusted_rand_score
 
+from benchmarks.regions import REGIONS, STATES, RegionField, three_regions
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.point_search import PointSearch
 from ep2sindy.discovery.pointwise import pointwise
@@ -21,7 +22,6 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Loky
 from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.rule import Selection
-from ep2sindy.systems.regions import REGIONS, STATES, RegionField, three_regions
 
 NOISES = (0.0, 0.02, 0.05, 0.1)
 RULES: dict[str, Selection] = {

@@ -108,6 +108,5 @@ from ep2sindy import thruster as thruster
 from ep2sindy import systems as systems
 from ep2sindy import datasets as datasets
 from ep2sindy import parallel as parallel
-from ep2sindy import benchmark as benchmark
 from ep2sindy import sklearn as sklearn
 from ep2sindy import warnings as warnings

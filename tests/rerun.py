@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.regions import three_regions
 from ep2sindy.data.open import write_field
-from ep2sindy.systems.regions import three_regions
 from tests.pages import (
     COMMAND,
     PAGES,

@@ -19,6 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy as ep
+from benchmarks.regions import three_regions
 from ep2sindy._stubs import dotted_names
 from ep2sindy.app.arguments import mend
 from ep2sindy.app.runner import check_effects, check_overrides, study_class
@@ -27,7 +28,6 @@ from ep2sindy.data.open import write_field
 from ep2sindy.model.comparison import Verdict
 from ep2sindy.report.results import View
 from ep2sindy.studies.library_result import RULES, candidate_metrics
-from ep2sindy.systems.regions import three_regions
 from tests.pages import (
     FENCE,
     PAGES,

@@ -120,7 +120,7 @@ def test_every_definition_makes_a_variant() -> None:
 
 def test_every_rival_makes_a_variant() -> None:
     pytest.importorskip("pysindy")
-    for name, definition in composed().definitions.items():
+    for name, definition in composed("definitions=pysindy").definitions.items():
         if name.startswith("PySINDy"):
             assert isinstance(instantiate(definition), Variant)
 
@@ -128,7 +128,7 @@ def test_every_rival_makes_a_variant() -> None:
 @pytest.fixture
 def no_pysindy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pysindy", None)
-    monkeypatch.delitem(sys.modules, "ep2sindy.studies.pysindy_variants", raising=False)
+    monkeypatch.delitem(sys.modules, "benchmarks.pysindy_variants", raising=False)
 
 
 @pytest.mark.usefixtures("no_pysindy")
@@ -140,8 +140,8 @@ def test_other_variants_run_without_pysindy(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("no_pysindy")
 def test_a_rival_without_pysindy_is_refused(tmp_path: Path) -> None:
-    config = composed(*toy(tmp_path), "variants=[ours,PySINDy_SSR]")
-    message = r"'PySINDy_SSR' needs PySINDy: pip install \"ep2sindy\[benchmark\]\".*variants=\[ours"
+    config = composed(*toy(tmp_path), "definitions=pysindy", "variants=[ours,PySINDy_SSR]")
+    message = r"PySINDy is not there: pip install \"ep2sindy\[benchmark\]\""
     with pytest.raises(ValueError, match=message):
         run_config(config)
 

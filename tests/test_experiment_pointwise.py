@@ -12,12 +12,12 @@ import pytest
 import xarray as xr
 from omegaconf import DictConfig, OmegaConf
 
+from benchmarks.regions import TERMS, three_regions
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.studies import pointwise
 from ep2sindy.studies.resume import pieces_key
-from ep2sindy.systems.regions import TERMS, three_regions
 from tests import programs
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
+from benchmarks.hallthruster_input import read_hallthruster_input, simulate_hallthruster_input
 from ep2sindy.thruster.constants import K_BOLTZMANN
 
 Z = np.linspace(0.0, 0.08, 41)
@@ -45,7 +46,7 @@ def folder(tmp_path: Path) -> Path:
 def read(folder: Path, content: object):
     path = folder / "input.json"
     path.write_text(json.dumps(content))
-    return ep.thruster.read_hallthruster_input(path)
+    return read_hallthruster_input(path)
 
 
 def changed(**config: object) -> dict:
@@ -281,9 +282,9 @@ def test_a_file_that_is_no_input_is_refused(tmp_path: Path, content: str, messag
     path = tmp_path / "input.json"
     path.write_text(content)
     with pytest.raises(ValueError, match=message):
-        ep.thruster.read_hallthruster_input(path)
+        read_hallthruster_input(path)
     with pytest.raises(ValueError, match=r"no such input of HallThruster\.jl"):
-        ep.thruster.read_hallthruster_input(tmp_path / "none.json")
+        read_hallthruster_input(tmp_path / "none.json")
 
 
 def test_a_file_is_simulated_as_it_says(folder: Path) -> None:
@@ -291,7 +292,7 @@ def test_a_file_is_simulated_as_it_says(folder: Path) -> None:
         anode_boundary_condition="dirichlet", conductivity_model={"type": "Braginskii"}
     )
     read(folder, content)
-    field = ep.thruster.simulate_hallthruster_input(
+    field = simulate_hallthruster_input(
         folder / "input.json", cache=folder, duration_s=4e-5, n_cells=20, progress=False
     )
     assert dict(field.sizes) == {"time": 21, "z": 20}  # 2 us, as the file's frames
@@ -302,4 +303,4 @@ def test_numerics_that_are_not_here_are_refused_before_a_run(folder: Path) -> No
     grid = {"type": "UnevenGrid", "num_cells": 90}
     read(folder, TUTORIAL | {"simulation": TUTORIAL["simulation"] | {"grid": grid}})
     with pytest.raises(ValueError, match=r"n_cells=90 takes one"):
-        ep.thruster.simulate_hallthruster_input(folder / "input.json", cache=folder, progress=False)
+        simulate_hallthruster_input(folder / "input.json", cache=folder, progress=False)

@@ -7,11 +7,11 @@ import pytest
 from omegaconf import DictConfig
 
 import ep2sindy as ep
+from benchmarks.regions import three_regions
 from ep2sindy.app.arguments import mend, options_first
 from ep2sindy.app.runner import check_effects, study_class
 from ep2sindy.app.schema import bind_step, study_of
 from ep2sindy.data.fields import check_field
-from ep2sindy.systems.regions import three_regions
 from tests import programs
 from tests.programs import composed, ended
 

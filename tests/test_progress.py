@@ -257,10 +257,7 @@ def test_whoever_is_not_asked_is_silent(prey: ep.Trajectory, capfd: pytest.Captu
         and (parameter := inspect.signature(value).parameters.get("progress"))
     }
     simulators = {name for name, default in asking.items() if default is True}
-    assert simulators == {
-        "simulate", "simulate_2d",
-        "simulate_hallthruster_input",
-    }  # fmt: skip
+    assert simulators == {"simulate", "simulate_2d"}
     assert {asking[name] for name in set(asking) - simulators} == {False}
     assert {"discover", "estimate", "refine", "pointwise", "discover_shared"} <= set(asking)
     ep.discover(prey, LIBRARY, regression())

@@ -5,8 +5,7 @@ import pytest
 
 pytest.importorskip("pysindy")
 
-from ep2sindy.library.library import named_terms
-from ep2sindy.studies.pysindy_variants import (
+from benchmarks.pysindy_variants import (
     PySINDyAsItComes,
     PySINDyEnsemble,
     PySINDySmoothing,
@@ -20,6 +19,7 @@ from ep2sindy.studies.pysindy_variants import (
     least_aicc,
     pysindy_library,
 )
+from ep2sindy.library.library import named_terms
 from ep2sindy.systems.systems import lotka_volterra, van_der_pol
 
 METHODS = [

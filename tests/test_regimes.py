@@ -5,6 +5,7 @@ import pytest
 import xarray as xr
 from sklearn.metrics import adjusted_rand_score
 
+from benchmarks.regions import REGIONS, STATES, RegionField, three_regions
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.point_search import PointSearch
 from ep2sindy.discovery.pointwise import pointwise
@@ -13,7 +14,6 @@ from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Serial
-from ep2sindy.systems.regions import REGIONS, STATES, RegionField, three_regions
 
 SIZES = {"fast": (8, 7, 600), "full": (20, 15, 1500)}
 ONE_EQUATION = dict.fromkeys(REGIONS, REGIONS["exit"])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from benchmarks.regions import INPUTS, REGIONS, STATES, RegionField, three_regions
 from ep2sindy.data.fields import check_field
 from ep2sindy.model.model import coef_matrix
-from ep2sindy.systems.regions import INPUTS, REGIONS, STATES, RegionField, three_regions
 from ep2sindy.thruster.parameters import Thruster
 
 DT_S = 1.5e-6

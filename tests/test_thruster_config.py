@@ -58,12 +58,6 @@ def test_data_from_a_file_have_no_thruster() -> None:
     assert "thruster" not in composed("+exp=discover", "data=file").data
 
 
-def test_an_input_of_hallthruster_is_a_data_group(tmp_path: Path) -> None:
-    config = composed("+exp=breathing", "data=hallthruster_input", f"data.path={tmp_path}/no.json")
-    with pytest.raises(ValueError, match=r"no such input of HallThruster\.jl: .*no\.json"):
-        bind(config.data, "data")()
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [

@@ -33,7 +33,6 @@ READERS: dict[str, Callable[[Path], object]] = {
         path, mass_u=131.3, ionization_eV=12.1, excitation_eV=8.3
     ),
     "restart.nc": lambda path: ep.thruster.Restart(path),
-    "input.json": lambda path: ep.thruster.read_hallthruster_input(path),
     "law.json": lambda path: ep.operating.OperatingLaw.load(path),
     "model.json": lambda path: ep.SparseModel.load(path),
 }

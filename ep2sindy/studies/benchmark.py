@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.util import find_spec
 from itertools import product
 from typing import Any, Protocol, runtime_checkable
 
@@ -94,19 +93,13 @@ class Variant(Protocol):
 def build_variants(names: Sequence[str], definitions: Mapping[str, Deferred]) -> dict[str, Variant]:
     """Build the named methods from `definitions`; the others are not built.
 
-    Raises ValueError for an unknown name, for a method whose package is not installed, or for an
-    object without a `find` method.
+    Raises ValueError for an unknown name, or for an object without a `find` method.
     """
     unknown = [name for name in names if name not in definitions]
     if unknown:
         raise ValueError(f"unknown variants {unknown}; there are {list(definitions)}")
     variants = {}
     for name in names:
-        if "PySINDy" in definitions[name].settings["_target_"] and find_spec("pysindy") is None:
-            raise ValueError(
-                f'variants {name!r} needs PySINDy: pip install "ep2sindy[benchmark]", or leave it '
-                "out, such as variants=[ours,STLSQ]"
-            )
         variant = definitions[name].build()
         if not isinstance(variant, Variant):
             raise ValueError(

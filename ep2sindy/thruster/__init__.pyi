@@ -41,8 +41,3 @@ from ep2sindy.thruster.walls import SheathWall as SheathWall  # for configs
 from ep2sindy.thruster.walls import wall_material as wall_material  # for configs
 from ep2sindy.thruster.walls import AnodeSheath as AnodeSheath  # for configs
 from ep2sindy.thruster.walls import FixedAnode as FixedAnode  # for configs
-from ep2sindy.thruster.hallthruster_input import HallThrusterInput as HallThrusterInput
-from ep2sindy.thruster.hallthruster_input import read_hallthruster_input as read_hallthruster_input
-from ep2sindy.thruster.hallthruster_input import (
-    simulate_hallthruster_input as simulate_hallthruster_input,
-)  # for configs

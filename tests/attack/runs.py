@@ -157,7 +157,7 @@ def prepare(folder: Path) -> None:
     import pandas as pd
 
     import ep2sindy as ep
-    from ep2sindy.systems.regions import three_regions
+    from benchmarks.regions import three_regions
 
     folder.mkdir(parents=True)
     ep.write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, folder / "grid.nc")

@@ -81,8 +81,8 @@ def files() -> None:
 def program() -> None:
     """A whole run with its folder, figures, page and TensorBoard, pieces in two workers."""
     import ep2sindy as ep
+    from benchmarks.regions import three_regions
     from ep2sindy.app.runner import run_config
-    from ep2sindy.systems.regions import three_regions
     from tests.attack.runs import RUNS
     from tests.programs import composed
 

@@ -14,19 +14,23 @@ another choice found the truth more often in this benchmark:
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
-import pysindy
 from jaxtyping import Bool, Float
 from sklearn.exceptions import ConvergenceWarning
 
+import ep2sindy as ep
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Finding
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.regression.searches import BestSubset, Unproven
+
+try:
+    import pysindy
+except ImportError as error:
+    raise ModuleNotFoundError('PySINDy is not there: pip install "ep2sindy[benchmark]"') from error
 
 TINY = float(np.finfo(np.float64).tiny)
 
@@ -35,21 +39,22 @@ Candidates = dict[str, list[tuple[tuple[str, ...], float]]]
 
 @dataclass(frozen=True, eq=False)
 class SINDyRows:
-    """The regression a method solves: x_dot = theta coef, columns of theta in library order."""
+    """The regression a method solves: x_dot = theta coef, columns of theta in library order.
+
+    triangle: theta and x_dot reduced to terms + states rows by QR; the Gram matrix is unchanged.
+    Column norms, least-squares coefficients and residuals are unchanged too, and so is every
+    support that PySINDy selects. Only the time it takes shrinks.
+    """
 
     theta: Float[np.ndarray, "rows terms"]
     x_dot: Float[np.ndarray, "rows states"]
+    triangle: tuple[np.ndarray, np.ndarray] = field(init=False)
 
-    @cached_property
-    def triangle(self) -> tuple[np.ndarray, np.ndarray]:
-        """theta and x_dot reduced to terms + states rows by QR; the Gram matrix is unchanged.
-
-        Column norms, least-squares coefficients and residuals are unchanged too, and so is every
-        support that PySINDy selects. Only the time it takes shrinks.
-        """
+    def __post_init__(self) -> None:
         rows = np.concatenate([self.theta, self.x_dot], axis=1)
-        triangle = np.asarray(np.linalg.qr(rows, mode="r"))
-        return triangle[:, : self.theta.shape[1]], triangle[:, self.theta.shape[1] :]
+        whole = np.asarray(np.linalg.qr(rows, mode="r"))
+        n_terms = self.theta.shape[1]
+        object.__setattr__(self, "triangle", (whole[:, :n_terms], whole[:, n_terms:]))
 
     def thresholds(self, n: int, smallest: float) -> Float[np.ndarray, " n"]:
         """`n` thresholds, log-spaced from `smallest` to 1 of the largest normalised coefficient."""
@@ -79,6 +84,7 @@ class SINDyRows:
         return found
 
 
+@ep.for_configs
 @dataclass(frozen=True)
 class PySINDySmoothing:
     """Savitzky-Golay smoothing, then second-order differences; theta holds the smoothed states.
@@ -104,6 +110,7 @@ class PySINDySmoothing:
         return SINDyRows(np.concatenate(theta), np.concatenate(x_dot))
 
 
+@ep.for_configs
 @dataclass(frozen=True)
 class PySINDyStlsq:
     """Sequentially thresholded least squares over a range of thresholds."""
@@ -120,6 +127,7 @@ class PySINDyStlsq:
         return rows.candidates(masks, library, runs[0].state_names)
 
 
+@ep.for_configs
 @dataclass(frozen=True)
 class PySINDySsr:
     """Stepwise sparse regression: the smallest normalised coefficient is removed, one at a time."""
@@ -137,6 +145,7 @@ class PySINDySsr:
         return rows.candidates(masks, library, runs[0].state_names)
 
 
+@ep.for_configs
 @dataclass(frozen=True)
 class PySINDyEnsemble:
     """Library bagging: STLSQ on `n_models` libraries with `n_dropped` random terms left out.
@@ -170,6 +179,7 @@ class PySINDyEnsemble:
         return rows.candidates(np.array(masks), library, runs[0].state_names)
 
 
+@ep.for_configs
 @dataclass(frozen=True)
 class PySINDyWeakForm:
     """Weak form on random domains of each run, with STLSQ over a range of thresholds.
@@ -214,6 +224,7 @@ class PySINDyWeakForm:
         return SINDyRows(theta, np.asarray(weak.convert_u_dot_integral(run.states)))
 
 
+@ep.for_configs
 @dataclass(frozen=True)
 class PySINDySubsets:
     """The subsets of least residual on PySINDy's rows, one of each size up to `max_terms`.
@@ -240,6 +251,7 @@ class PySINDySubsets:
         return rows.candidates(masks, library, runs[0].state_names)
 
 
+@ep.for_configs
 @dataclass(frozen=True)
 class PySINDyVariant:
     """A method of PySINDy in our benchmark; it gives candidates, and the user would have to choose.
@@ -265,6 +277,7 @@ class PySINDyVariant:
         )
 
 
+@ep.for_configs
 @dataclass(frozen=True)
 class PySINDyAsItComes:
     """`pysindy.SINDy` with its own defaults, but for the degree of the library.
