@@ -72,7 +72,7 @@ TOYS: dict[str, list[str]] = {
     ],
     "pointwise": [
         "+exp=pointwise", *ON_FILE, GRID, "data.r.name=r", "data.variables.u_ir.name=u_ir",
-        "keep=false", "parallel=serial", "bootstraps.n=6", "block_points=5", "max_regimes=3",
+        "parallel=serial", "bootstraps.n=6", "block_points=5", "max_regimes=3",
     ],
     "trace": [
         "+exp=trace", "data=file", "data.path={signal}", "signal=I", "unit=A", "search.n_best=2",
@@ -110,7 +110,7 @@ torch.nn.init.zeros_(last.bias)
 network = torch.nn.Sequential(torch.nn.Linear(2, 4), torch.nn.Tanh(), last)
 run = prey.trajectory(noise=0.01, rng=0)
 fit = ep.refine_with_correction(
-    known, [run], network, window=15, n_windows=4, rng=0,
+    known, [run], network, window=15, n_windows=4, seed=0,
     method=ep.refinement.GradientDescent(max_iter=4),
 )
 states = run.states[::50]
