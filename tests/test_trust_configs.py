@@ -21,10 +21,13 @@ from ep2sindy.app.safety import CheckedLoader, check_places, check_references, r
 from ep2sindy.app.schema import as_node, bind, defaults_of
 from ep2sindy.app.targets import FOR_CONFIGS, check_targets
 from ep2sindy.studies.libraries import register_named
-from tests.attack.payloads import BOMB, RUNS
 from tests.programs import ended
 
 ROOT = Path(__file__).resolve().parents[1]
+RUNS = "__import__('pathlib').Path('canary_that_sang').touch()"
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12)
+)
 # What Hydra would call, what writes or runs what it is given, and what is not for configs.
 REFUSED = [
     "sympy.sympify", "joblib.load", "pandas.read_pickle", "numpy.load", "pathlib.Path.write_text",

@@ -14,7 +14,16 @@ from packaging.requirements import Requirement
 
 from ep2sindy import Variable, open_field
 from ep2sindy.data.readers import zarr as reader
-from tests.attack.payloads import CANARY, Sings
+
+CANARY = "canary_that_sang"
+
+
+class Sings:
+    """Unpickled, it leaves a mark."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return eval, (f"__import__('pathlib').Path('{CANARY}').touch()",)
+
 
 SETTINGS: Any = {"variables": {"I_d": Variable("I", "A")}, "time": Variable("time", "s")}
 
