@@ -13,17 +13,14 @@ from omegaconf import DictConfig, OmegaConf
 import ep2sindy as ep
 from ep2sindy.app import program, sweep
 from ep2sindy.app.runner import (
-    check_overrides,
     hparams_of,
     list_studies,
     run_config,
     study_class,
-    unused_rows,
 )
 from ep2sindy.app.schema import Configured, keys_of, study_of, value_of
 from ep2sindy.app.sweep import index_text, write_index
 from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.regression.rows import Formulation
 from ep2sindy.runtime.files import write_json, write_text
 from ep2sindy.selection.rule import Selection
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
@@ -181,13 +178,6 @@ def test_what_is_built_later_can_be_changed_by_place() -> None:
     assert str(changed) != str(later)
     with pytest.raises(ValueError, match="data.volts must be there to be changed: it is not"):
         later.changed({"volts": 1.0})
-
-
-def test_only_groups_that_a_study_uses_may_be_set() -> None:
-    check_overrides(["search=stlsq", "n=1"], used=keys_of(Toy), experiment="toy")
-    for unused in ("parallel=serial", "+data.path=x", "trajectory.zone.z=[0,1]", "prepare=[]"):
-        with pytest.raises(ValueError, match="would do nothing: toy does not use"):
-            check_overrides([unused], used=keys_of(Toy), experiment="toy")
 
 
 def test_studies_are_found_by_name() -> None:
@@ -366,41 +356,3 @@ def test_mistakes_end_in_one_clear_message(
     assert message in error
     assert error.startswith("error: ")
     assert not list(tmp_path.glob("outputs/*/*"))  # no run folder of a run that never began
-
-
-@dataclass(frozen=True)
-class WithRows:
-    """A study that makes rows beside its search."""
-
-    method: AnyMethod
-    formulation: Formulation
-
-
-@dataclass(frozen=True)
-class WithoutRows:
-    """A study that searches, and does nothing else."""
-
-    method: AnyMethod
-
-
-@pytest.mark.parametrize(
-    ("study", "typed", "said"),
-    [
-        (WithRows(ep.TrajectorySearch(), ep.Weak()), ["search.max_terms=3"], ""),
-        (WithRows(ep.Regression(), ep.Weak()), ["formulation=weak"], ""),
-        (
-            WithRows(ep.TrajectorySearch(), ep.Weak()),
-            ["seed=1", "formulation=weak", "+formulation.n_steps=3"],
-            "formulation=weak +formulation.n_steps=3: a search of trajectories makes no rows, so "
-            "it serves only the fits and figures that this experiment makes of rows beside the",
-        ),
-        (WithoutRows(ep.TrajectorySearch()), ["formulation=weak"], "so it does nothing here; equ"),
-        (WithoutRows(ep.Regression()), ["formulation=weak"], ""),
-    ],
-)
-def test_a_formulation_beside_a_search_of_trajectories_is_spoken_of(
-    study: object, typed: list[str], said: str
-) -> None:
-    message = unused_rows(typed, study)
-    assert said in message
-    assert bool(said) == bool(message)

@@ -454,12 +454,6 @@ def test_settings_that_cannot_work_are_refused(
     assert message in str(caught.value)
 
 
-def test_a_share_for_no_model_is_refused(predator_prey: Path, tmp_path: Path) -> None:
-    config = composed(*plain(predator_prey, tmp_path)[:-1])
-    with pytest.raises(ValueError, match="held_out would do nothing: it is for a model that lives"):
-        run_config(config)
-
-
 def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> None:
     config = composed(*breathing(predator_prey, tmp_path), "bootstraps.n_culled=6")
     with pytest.raises(ValueError, match="n_culled"):

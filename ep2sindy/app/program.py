@@ -166,7 +166,7 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
             say(first_word(config))  # the imports below take seconds
             from ep2sindy.app.runner import run_config
 
-            finished = run_config(config, overrides=typed)
+            finished = run_config(config)
         except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
             ended_early(error)
             return [str(error)]

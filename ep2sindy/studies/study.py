@@ -56,17 +56,6 @@ class Experiment(Protocol):
     def compute(self, run: Run) -> Outcome: ...
 
 
-@runtime_checkable
-class Selective(Protocol):
-    """An experiment some of whose settings have no effect beside the others that it was given.
-
-    idle: their dotted keys, each with the reason; a setting at or below one of them is refused if
-    it was typed, so that nothing that a person asks for is left aside in silence.
-    """
-
-    def idle(self) -> Mapping[str, str]: ...
-
-
 @dataclass(frozen=True)
 class Check:
     """A requirement on a value: the words after `must be` in an error, and a test."""
