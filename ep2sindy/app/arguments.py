@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy.runtime.screen import listed, near_words
 
+JOBS = "jobs"  # folder of a sweep with a record of each job
 COMMANDS = ("compare", "inspect", "warm")  # that stand first, without +exp=NAME
 QUOTED_KEY = re.compile(r"""(?<=[{,])\s*(?P<quote>["'])(?P<name>\w+)(?P=quote)\s*(?=:)""")
 # `points.files=PATTERN`, whose braces would be a mapping to Hydra; or the same as `points=PATTERN`.
