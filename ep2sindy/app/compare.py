@@ -21,7 +21,6 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ep2sindy.app.arguments import JOBS
-from ep2sindy.app.safety import check_yaml
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import by_place
@@ -148,7 +147,6 @@ def _checked(path: Path, kinds: Mapping[str, Any]) -> dict[str, Any]:
 def _read_settings(path: Path) -> dict[str, Any]:
     """The run's settings by dotted place."""
     with _damage_named(path):
-        check_yaml(path)
         config: Any = OmegaConf.to_container(OmegaConf.load(path))
         if not isinstance(config, dict):
             raise ValueError("a mapping must stand there")

@@ -17,7 +17,6 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy.studies
-from ep2sindy.app.safety import check_output
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
@@ -109,7 +108,8 @@ def check_common(config: DictConfig) -> None:
         raise ValueError(
             f"experiment names a folder: letters, digits and _, not {config.experiment!r}"
         )
-    check_output(config)
+    if not isinstance(config.get("output"), str) or not config.output:
+        raise ValueError(f"output must be a folder's name: {config.get('output')!r} came")
 
 
 def formats_of(config: DictConfig) -> list[str]:
