@@ -14,7 +14,6 @@ from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.files import read_json
-from ep2sindy.trust.limits import check_kind
 
 FORMAT = "ep2sindy.SparseModel/1"
 
@@ -89,7 +88,6 @@ def read_stored(path: Path, read: Callable[[str], Model]) -> Model:
 
     Raises UnknownFunctionError or another ValueError.
     """
-    check_kind(path)
     try:
         return read(path.read_text(encoding="utf-8"))
     except UnknownFunctionError as error:
