@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ import xarray as xr
 from ep2sindy.data.fields import channel_length_m
 from ep2sindy.data.numbers import count_dates
 from ep2sindy.library.units import seconds_in
+from ep2sindy.runtime.screen import words_of
 
 # xarray must keep times as numbers, whatever their attribute `units` says.
 UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
@@ -28,11 +28,6 @@ PACKED_BY = ("scale_factor", "add_offset")
 AT_ONCE = 2**28  # bytes of an array up to which it is read once when its file is opened
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-
-
-# Errors whose words are about code, and tell nothing of a file.
-INTERNAL = (AssertionError, AttributeError, IndexError, NameError, TypeError)
-IN_PYTHON = re.compile(r"NoneType|zip\(\)|no attribute|values to unpack")
 
 
 Form: TypeAlias = Literal["folder", "hdf5", "workbook", "zip", "other"]
@@ -155,10 +150,7 @@ def damage_named(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # a library may raise anything for a damaged file
-        said = " ".join(str(error).split()).removesuffix(".")
-        if isinstance(error, INTERNAL) or " " not in said or IN_PYTHON.search(said):
-            said = "it is damaged, or of another kind than its name says"
-        raise ValueError(f"{path} cannot be read: {said}") from error
+        raise ValueError(f"{path} cannot be read: {words_of(error)}") from error
 
 
 @contextmanager
