@@ -56,7 +56,7 @@ def plain(path: Path, output: Path) -> list[str]:
 def breathing_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of one breathing experiment on known data."""
     output = tmp_path_factory.mktemp("outputs")
-    return run_config(composed(*breathing(predator_prey, output))).folder
+    return run_config(composed(*breathing(predator_prey, output)))
 
 
 def summary_of(folder: Path) -> dict:

@@ -163,7 +163,7 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
             say(first_word(config))  # the imports below take seconds
             from ep2sindy.app.runner import run_config
 
-            record["folder"] = str(run_config(config).folder)
+            record["folder"] = str(run_config(config))
         except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
             record["error"] = str(error)
     return [record["error"]] if "error" in record else []

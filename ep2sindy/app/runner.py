@@ -6,7 +6,6 @@ import re
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -32,16 +31,8 @@ from ep2sindy.studies.study import Experiment, Outcome
 from ep2sindy.trust.user_code import load_user_module
 
 
-@dataclass(frozen=True)
-class Finished:
-    """A completed run: its folder, and its headline figures."""
-
-    folder: Path
-    headline: Mapping[str, float]
-
-
-def run_config(config: DictConfig) -> Finished:
-    """Build the study that a config names, compute it, and write its outcome."""
+def run_config(config: DictConfig) -> Path:
+    """Build the study that a config names, compute it, and write its outcome; its run folder."""
     check_common(config)
     formats = formats_of(config)
     with Bars().stage(3, "step", "loading") as advance:
@@ -54,8 +45,8 @@ def run_config(config: DictConfig) -> Finished:
     warm()
     with start_run(config) as run:
         outcome = study.compute(run)
-        headline = write(run, outcome, study, formats)
-    return Finished(run.folder.path, headline)
+        write(run, outcome, study, formats)
+    return run.folder.path
 
 
 def study_class(name: object) -> type:
@@ -146,9 +137,7 @@ def start_run(config: DictConfig) -> Iterator[Run]:
         screen.close()
 
 
-def write(
-    run: Run, outcome: Outcome, study: Experiment, formats: Sequence[str] = ("png",)
-) -> dict[str, float]:
+def write(run: Run, outcome: Outcome, study: Experiment, formats: Sequence[str] = ("png",)) -> None:
     """Write an outcome into the run folder; models and tables first, as views may fail."""
     folder, models = run.folder, outcome.models()
     for name, model in models.items():
@@ -174,7 +163,6 @@ def write(
     for end in run.ends:
         end()
     run.screen.conclude(result, folder.path)
-    return headline
 
 
 def about(run: Run, study: Experiment) -> About:
