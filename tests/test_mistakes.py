@@ -81,6 +81,11 @@ def test_options_may_stand_anywhere_and_keep_their_values() -> None:
     assert sorted_out[4:] == ["+exp=discover", "seed=0,1", "~search"]
 
 
+def test_a_group_that_an_experiment_does_not_use_may_be_set() -> None:
+    config = composed("+exp=weak", "parallel=serial")
+    assert study_of(study_class(config.study), config)
+
+
 # Settings with which each step of the table in docs/data.md is called, on a small field.
 STEPS = {
     "crop": "start_s: 1.0e-5, stop_s: 1.0e-4",
