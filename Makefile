@@ -8,7 +8,7 @@ TYPED := $(patsubst %,tests/test_%.py,types files numbers fields inspection kalm
 	propellants axial plane thruster model simulation forecast datasets weak constraints search systems given \
 	control_law refine_law operating_plots map_plots plots sklearn report compare experiment_frontier)
 
-.PHONY: attack breathing test test-fast test-slow test-docs lint types docs docs-numbers benchmark clean
+.PHONY: breathing test test-fast test-slow test-docs lint types docs docs-numbers benchmark clean
 
 # The stamp is written last: an interrupted installation is taken up again.
 .venv/installed: pyproject.toml constraints.txt
@@ -67,12 +67,6 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.regimes
 	$(BIN)/python -m benchmarks.joint
 	$(BIN)/python -m benchmarks.trajectory_scores
-
-# Mutated files; runs that are killed, that cannot write, two at once, many in one process: a
-# quarter of an hour, goes on where it was broken off, and prints the table of docs/trust.md.
-# How to ask for all of it stands there, too.
-attack: .venv/installed
-	$(BIN)/python -m tests.attack $(ARGS)
 
 clean:
 	rm -rf .venv site .cache .mypy_cache .ruff_cache .pytest_cache

@@ -1,4 +1,4 @@
-"""From a command line to a study: configs, their errors, sweeps and their index."""
+"""From a command line to a study: configs, their errors, and sweeps."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -6,25 +6,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy as ep
-from ep2sindy.app import program, sweep
+from ep2sindy.app import program
 from ep2sindy.app.runner import (
-    check_overrides,
     hparams_of,
     list_studies,
     run_config,
     study_class,
-    unused_rows,
 )
 from ep2sindy.app.schema import Configured, keys_of, study_of, value_of
-from ep2sindy.app.sweep import index_text, write_index
 from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.regression.rows import Formulation
-from ep2sindy.runtime.files import write_json, write_text
+from ep2sindy.runtime.files import read_json
 from ep2sindy.selection.rule import Selection
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
 from tests.programs import ended
@@ -183,13 +178,6 @@ def test_what_is_built_later_can_be_changed_by_place() -> None:
         later.changed({"volts": 1.0})
 
 
-def test_only_groups_that_a_study_uses_may_be_set() -> None:
-    check_overrides(["search=stlsq", "n=1"], used=keys_of(Toy), experiment="toy")
-    for unused in ("parallel=serial", "+data.path=x", "trajectory.zone.z=[0,1]", "prepare=[]"):
-        with pytest.raises(ValueError, match="would do nothing: toy does not use"):
-            check_overrides([unused], used=keys_of(Toy), experiment="toy")
-
-
 def test_studies_are_found_by_name() -> None:
     assert "libraries" in list_studies()
     assert study_class("libraries").__name__ == "Study"
@@ -269,60 +257,6 @@ def test_flags_may_stand_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert sys.argv[1:] == ["-m", "+exp=discover", "seed=0,1"]
 
 
-def records(folder: Path) -> None:
-    done = {"job": 0, "overrides": ["+exp=toy", "seed=1"], "status": "done"}
-    done |= {"folder": "outputs/toy/1", "headline": {"r2": 0.5}}
-    failed = {"job": 1, "overrides": ["+exp=toy", "seed=-1"], "status": "failed", "error": "no"}
-    for record in (failed, done):
-        write_json(folder / "jobs" / f"{record['job']}.json", record)
-
-
-def test_an_index_has_every_job_in_order(tmp_path: Path) -> None:
-    records(tmp_path)
-    write_index(tmp_path)
-    index = pd.read_csv(tmp_path / "index.csv", keep_default_na=False)
-    assert list(index.columns) == ["job", "overrides", "status", "r2", "folder", "error"]
-    assert index["status"].tolist() == ["done", "failed"]
-    assert index["error"].tolist() == ["", "no"]
-    text = index_text(tmp_path)
-    assert "sweep of 2 jobs" in text
-    assert "seed=-1" in text
-    assert "+exp=toy" not in text  # what all jobs share is left out
-    assert text.endswith("index.csv")
-
-
-def test_an_index_shows_lists_and_what_is_no_number_as_they_are(tmp_path: Path) -> None:
-    for job, names in enumerate(("[ours,b]", "[ours]")):
-        record = {"job": job, "overrides": [f"variants={names}"], "status": "done", "folder": "x"}
-        write_json(tmp_path / "jobs" / f"{job}.json", record | {"headline": {"r2": float("nan")}})
-    write_index(tmp_path)
-    assert pd.read_csv(tmp_path / "index.csv")["r2"].isna().all()
-    text = index_text(tmp_path)
-    assert "variants=[ours,b]" in text
-    assert "nan" not in text
-
-
-def test_an_index_without_records_says_so(tmp_path: Path) -> None:
-    assert index_text(tmp_path) == f"no job of the sweep noted its end in {tmp_path}"
-
-
-def test_an_index_knows_a_job_that_ended_while_it_was_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    records(tmp_path)
-    late = tmp_path / "jobs" / "0.json"
-    text = late.read_text()
-    late.unlink()
-
-    def written_meanwhile(path: Path, index: str) -> None:
-        write_text(path, index)
-        late.write_text(text)
-
-    monkeypatch.setattr(sweep, "write_text", written_meanwhile)
-    write_index(tmp_path)
-    assert pd.read_csv(tmp_path / "index.csv")["job"].tolist() == [0, 1]
-
-
 def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -336,10 +270,10 @@ def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
     )
     assert error == "error: 2 jobs failed"
     said = capsys.readouterr()
-    for text in ("job 0: ", "job 1: ", "sweep of 2 jobs", "seed must be a whole number"):
+    for text in ("job 0: ", "job 1: ", "ep2sindy compare outputs", "seed must be a whole number"):
         assert text in said.out
-    (path,) = tmp_path.glob("outputs/multirun/*/index.csv")
-    errors = pd.read_csv(path)["error"].tolist()
+    paths = sorted(tmp_path.glob("outputs/multirun/*/jobs/*.json"))
+    errors = [read_json(path.read_text())["error"] for path in paths]
     assert errors[0] == "seed must be a whole number, zero or more: -1 came"
     assert errors[1].startswith("no such file: ")
     assert "Traceback" not in said.err
@@ -366,41 +300,3 @@ def test_mistakes_end_in_one_clear_message(
     assert message in error
     assert error.startswith("error: ")
     assert not list(tmp_path.glob("outputs/*/*"))  # no run folder of a run that never began
-
-
-@dataclass(frozen=True)
-class WithRows:
-    """A study that makes rows beside its search."""
-
-    method: AnyMethod
-    formulation: Formulation
-
-
-@dataclass(frozen=True)
-class WithoutRows:
-    """A study that searches, and does nothing else."""
-
-    method: AnyMethod
-
-
-@pytest.mark.parametrize(
-    ("study", "typed", "said"),
-    [
-        (WithRows(ep.TrajectorySearch(), ep.Weak()), ["search.max_terms=3"], ""),
-        (WithRows(ep.Regression(), ep.Weak()), ["formulation=weak"], ""),
-        (
-            WithRows(ep.TrajectorySearch(), ep.Weak()),
-            ["seed=1", "formulation=weak", "+formulation.n_steps=3"],
-            "formulation=weak +formulation.n_steps=3: a search of trajectories makes no rows, so "
-            "it serves only the fits and figures that this experiment makes of rows beside the",
-        ),
-        (WithoutRows(ep.TrajectorySearch()), ["formulation=weak"], "so it does nothing here; equ"),
-        (WithoutRows(ep.Regression()), ["formulation=weak"], ""),
-    ],
-)
-def test_a_formulation_beside_a_search_of_trajectories_is_spoken_of(
-    study: object, typed: list[str], said: str
-) -> None:
-    message = unused_rows(typed, study)
-    assert said in message
-    assert bool(said) == bool(message)

@@ -1,4 +1,4 @@
-"""Run folders side by side, and the page of a sweep."""
+"""Run folders side by side, and the jobs of a sweep."""
 
 import json
 import shutil
@@ -10,10 +10,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.app.compare import main as compare
-from ep2sindy.app.sweep import write_index
 from ep2sindy.report.results import LABELS, in_words
 from ep2sindy.runtime.files import write_json
-from tests.browser import seen
 
 CONFIG = (
     "experiment: discover\nseed: 0\n"
@@ -104,7 +102,6 @@ def test_a_template_of_ones_own_makes_the_page(runs: tuple[Path, Path], tmp_path
     ("name", "message"),
     [
         ("nowhere", "a run is a folder: .*nowhere is not there; runs there are, for example"),
-        ("sweep", "sweep is a sweep, and compares its jobs in index.html"),
         ("early", "early has no summary.json: it ended early, see its run.log; runs there"),
         ("empty", "empty has no summary.json: no run; runs there are, for example"),
     ],
@@ -112,7 +109,7 @@ def test_a_template_of_ones_own_makes_the_page(runs: tuple[Path, Path], tmp_path
 def test_what_is_no_run_is_named_with_the_way_out(
     name: str, message: str, runs: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    for folder, file in (("sweep", "index.csv"), ("early", "run.log"), ("empty", "x")):
+    for folder, file in (("early", "run.log"), ("empty", "x")):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / file).write_text("")
     with pytest.raises(ValueError, match=message):
@@ -131,29 +128,24 @@ def test_one_run_cannot_be_compared(runs: tuple[Path, Path]) -> None:
         compare([str(runs[0])])
 
 
-def test_a_sweep_has_a_page_that_leads_to_its_jobs(tmp_path: Path) -> None:
-    folder = tmp_path / "sweep"
-    for job in range(3):
-        record = {"job": job, "overrides": ["+exp=toy", f"degree={job + 1}"], "status": "done"}
-        record |= {"folder": str(tmp_path / f"run{job}"), "headline": {"one/r2": 0.1 * job}}
-        if job == 1:
-            record |= {"status": "failed", "error": "<b>no</b>", "headline": {}}
-        write_json(folder / "jobs" / f"{job}.json", record)
-    write_index(folder)
-    text = (folder / "index.html").read_text()
-    for words in (
-        "Sweep of 3 jobs",
-        '<a href="../run0/report.html">0</a>',
-        "In all jobs: +exp=toy.",
-        "Job 1: &lt;b&gt;no&lt;/b&gt;",
-        '<th class="number">one: R2</th>',
-        "job 2: degree=3\none: R2: 0.2</title>",
-    ):
-        assert words in text
-    for width_px in (1280, 390):
-        found = seen(folder / "index.html", width_px)
-        assert (found.figures, found.empty, found.console) == (1, 0, [])
-        assert found.scroll_px <= width_px
+def test_the_jobs_of_a_sweep_are_compared_but_for_those_that_failed(
+    runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sweep, page = tmp_path / "sweep", tmp_path / "page.html"
+    for job, record in {2: {"folder": str(runs[1])}, 10: {"error": "no"}}.items():
+        write_json(sweep / "jobs" / f"{job}.json", record)
+    with pytest.raises(ValueError, match="to compare takes two runs or more"):
+        compare([str(sweep)])
+    write_json(sweep / "jobs" / "0.json", {"folder": str(runs[0])})
+    capsys.readouterr()
+    compare([str(sweep), "--page", str(page)])
+    said = capsys.readouterr().out
+    assert said.startswith("left out: job 10 failed: no\n")
+    assert "search.max_terms" in said
+    assert page.is_file()
+    write_json(sweep / "jobs" / "3.json", {"folder": 1})
+    with pytest.raises(ValueError, match=r"3\.json cannot be read \(folder cannot be 1\)"):
+        compare([str(sweep)])
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def toy(output: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs")))).folder
+    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs"))))
 
 
 def test_every_cell_is_counted(toy_run: Path) -> None:
@@ -134,8 +134,8 @@ def no_pysindy(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("no_pysindy")
 def test_other_variants_run_without_pysindy(tmp_path: Path) -> None:
     settings = ["systems=[oscillator]", "noises=[0]", "variants=[STLSQ]"]
-    finished = run_config(composed(*toy(tmp_path), *settings))
-    assert (finished.folder / "summary.json").is_file()
+    folder = run_config(composed(*toy(tmp_path), *settings))
+    assert (folder / "summary.json").is_file()
 
 
 @pytest.mark.usefixtures("no_pysindy")
@@ -177,7 +177,7 @@ def test_systems_of_the_collection_are_counted_together(tmp_path: Path) -> None:
         f"output={tmp_path}", "n_realizations=1", "parallel=serial", "noises=[0.01]",
         "systems=[Lorenz,SprottA,lorenz]", "variants=[STLSQ,ours]",
     ]  # fmt: skip
-    folder = run_config(composed(*overrides)).folder
+    folder = run_config(composed(*overrides))
     counted = json.loads((folder / "summary.json").read_text())["cells"]
     assert [(c["system"], c["variant"], c["n"]) for c in counted] == [
         ("dysts", "STLSQ", 2), ("dysts", "ours", 2), ("lorenz", "STLSQ", 1), ("lorenz", "ours", 1),

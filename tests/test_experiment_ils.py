@@ -46,7 +46,7 @@ def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
 
 @pytest.fixture(scope="module")
 def toy_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run_config(ils(predator_prey, tmp_path_factory.mktemp("outputs"))).folder
+    return run_config(ils(predator_prey, tmp_path_factory.mktemp("outputs")))
 
 
 def test_integral_least_squares_returns_predator_and_prey(toy_run: Path) -> None:

@@ -58,7 +58,7 @@ def toy(output: Path) -> list[str]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of three operating points."""
-    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs")), THREE)).folder
+    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs")), THREE))
 
 
 def summary_of(folder: Path) -> dict:
@@ -315,7 +315,7 @@ def test_without_published_values_nothing_speaks_of_a_thesis(tmp_path: Path) -> 
 
 def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:
     still = breathing_file(tmp_path / "c.nc", amplitude=1e-3, dt_s=1.5e-6)
-    folder = run_config(composed(*own_files(tmp_path, still), "trajectory.zone=null")).folder
+    folder = run_config(composed(*own_files(tmp_path, still), "trajectory.zone=null"))
     assert not (folder / "figures").exists()
     log = " ".join((folder / "run.log").read_text().split())
     assert "None: 0 points fitted; a law needs 3" in log

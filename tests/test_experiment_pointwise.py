@@ -61,7 +61,7 @@ def summary_of(folder: Path) -> dict:
 
 @pytest.fixture(scope="module")
 def toy_run(grid: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run_config(composed(*on_file(grid, tmp_path_factory.mktemp("run")))).folder
+    return run_config(composed(*on_file(grid, tmp_path_factory.mktemp("run"))))
 
 
 def test_the_summary_counts_the_points(toy_run: Path) -> None:

@@ -40,7 +40,7 @@ def toy(output: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs")), POINTS)).folder
+    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs")), POINTS))
 
 
 def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:

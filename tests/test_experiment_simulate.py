@@ -61,7 +61,7 @@ def summary_of(folder: Path) -> dict:
 
 @pytest.fixture(scope="module")
 def one(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run_config(composed(*toy(tmp_path_factory.mktemp("one")))).folder
+    return run_config(composed(*toy(tmp_path_factory.mktemp("one"))))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def field(one: Path) -> xr.Dataset:
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A voltage that cannot be, two that breathe, one whose run breaks at once."""
-    return run_config(composed(*toy(tmp_path_factory.mktemp("scan")), VOLTAGES)).folder
+    return run_config(composed(*toy(tmp_path_factory.mktemp("scan")), VOLTAGES))
 
 
 def test_a_run_keeps_its_field_and_says_what_it_did(one: Path, field: xr.Dataset) -> None:
@@ -243,7 +243,7 @@ def test_a_point_of_a_scan_without_a_simulation_says_the_way_out(
 
 
 def test_a_run_that_breaks_at_once_is_reported(tmp_path: Path) -> None:
-    folder = run_config(composed(*toy(tmp_path), "data.operating_point.voltage=5000.0")).folder
+    folder = run_config(composed(*toy(tmp_path), "data.operating_point.voltage=5000.0"))
     summary = summary_of(folder)
     assert (summary["status"], summary["n_samples"]) == ("diverged", 0)
     assert summary["warnings"] == ["the simulation diverged: the end of its record is no physics"]

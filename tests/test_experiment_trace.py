@@ -51,7 +51,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_path: Path) -> None:
-    folder = run_config(composed(*toy(record, tmp_path))).folder
+    folder = run_config(composed(*toy(record, tmp_path)))
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["signal"]["embedding"] == "HiddenStates"
     assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
@@ -85,7 +85,7 @@ def test_hidden_states_that_are_a_misfit_are_shown_if_they_are_asked_for(tmp_pat
 
 def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path: Path) -> None:
     own = ("selection.n_starts=2", "embedding=log_rate")
-    folder = run_config(composed(*toy(record, tmp_path, *own))).folder
+    folder = run_config(composed(*toy(record, tmp_path, *own)))
     summary = json.loads((folder / "summary.json").read_text())
     living = summary["living"]
     assert living["verdict"] == "lives"

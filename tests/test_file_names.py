@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 from ep2sindy.app.arguments import mend
-from ep2sindy.app.runner import check_effects
 from ep2sindy.app.schema import study_of
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
@@ -201,7 +200,6 @@ def test_points_of_a_thruster_are_proposed_to_both_studies_of_points(
     [
         ([], "points of files need data that are read from files: .*simulate came .* data=recogni"),
         (["data=recognised"], r"a trend goes along one parameter .*\['a'\].* trends=\[\] leaves"),
-        (["data=recognised", "trends=[]", "parameters.V_D_V=null"], "the names of the files name"),
     ],
 )
 def test_settings_that_do_not_go_with_files_are_refused(
@@ -211,5 +209,5 @@ def test_settings_that_do_not_go_with_files_are_refused(
     typed = ["+exp=parametric", mend("points.files=a{a}.csv"), *more]
     config = composed(*typed)
     with pytest.raises(ValueError, match=message) as refused:
-        check_effects(typed, study_of(parametric.Study, config), config)
+        study_of(parametric.Study, config)
     assert not re.search(r"\?\?\?", str(refused.value))

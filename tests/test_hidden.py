@@ -93,14 +93,14 @@ def test_the_experiment_finds_it_too(tmp_path) -> None:
     table = np.column_stack([run.t, run.states])
     np.savetxt(path, table, delimiter=",", header="time,x", comments="")
     given = ["+exp=discover", "data=recognised", f"data.path={path}", "trajectory.states=[x]"]
-    folder = run_config(composed(*given, "hidden=[g]", "forecasts=4", f"output={tmp_path}")).folder
+    folder = run_config(composed(*given, "hidden=[g]", "forecasts=4", f"output={tmp_path}"))
     summary = json.loads((folder / "summary.json").read_text())["models"]["model"]
     assert set(summary["equations"]["g"]["terms"]) == set(GROWTH)
     assert list(summary["estimate"]["noise_std"]) == ["x"]
     known = run_config(
         composed(*given, "hidden=[g]", "relations=['g: x*g == 1']", "forecasts=0",
                  f"output={tmp_path}")
-    ).folder  # fmt: skip
+    )  # fmt: skip
     model = ep.SparseModel.load(known / "models" / "model.json")
     assert model.terms("g")["x*g"] == pytest.approx(1.0, rel=1e-12)
     with pytest.raises(ValueError, match="one library and without living"):

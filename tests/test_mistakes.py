@@ -1,15 +1,14 @@
-"""Mistakes on the command line end in our words: misspelt names, and settings without effect."""
+"""Mistakes on the command line end in our words, with the nearest name."""
 
 import re
 from pathlib import Path
 
 import pytest
-from omegaconf import DictConfig
 
 import ep2sindy as ep
 from benchmarks.regions import three_regions
 from ep2sindy.app.arguments import mend, options_first
-from ep2sindy.app.runner import check_effects, study_class
+from ep2sindy.app.runner import study_class
 from ep2sindy.app.schema import bind_step, study_of
 from ep2sindy.data.fields import check_field
 from tests import programs
@@ -82,57 +81,9 @@ def test_options_may_stand_anywhere_and_keep_their_values() -> None:
     assert sorted_out[4:] == ["+exp=discover", "seed=0,1", "~search"]
 
 
-@pytest.mark.parametrize(
-    ("typed", "reason"),
-    [
-        (["+exp=predict", "structures.degree=3"], "models are given"),
-        (["+exp=trace", "embedding=hidden", "harmonics=3"], "embedding=hidden finds states"),
-        (
-            ["+exp=trace", "embedding=hidden", "selection.n_starts=4"],
-            "embedding=hidden finds states",
-        ),
-        (["+exp=trace", "embedding=hidden", "search.n_best=2"], "embedding=hidden finds states"),
-        (["+exp=trace", "function_degree=2"], "functions are none"),
-        (["+exp=discover", "libraries.model.function_degree=2"], "the library has no functions"),
-        (["+exp=discover", "+libraries.model.n_norm=library"], "Evidence selects, and not the kn"),
-        (["+exp=breathing", "selection=ebic", "libraries.simple.n_norm=library"], "EBIC selects"),
-        (["+exp=benchmark", "variants=[ours]", "definitions.STLSQ.depth=2"], "has no STLSQ"),
-        (["+exp=parametric", "search=stlsq", "law.tied_degree=2"], "only search=best_subset"),
-        (["+exp=trace", "bootstraps.block=5"], "bootstraps.n is 0, and no bootstrap is drawn"),
-        (["+exp=trace", "data=file", "data.path=x", "data.r.unit=mm"], "data.r.name is null"),
-    ],
-)
-def test_a_setting_without_effect_is_refused(typed: list[str], reason: str) -> None:
-    config, needed = built(typed)
-    with pytest.raises(ValueError, match=re.escape(reason)) as refused:
-        check_effects(typed, needed, config)
-    assert typed[-1] in str(refused.value)
-    assert "would do nothing" in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    "typed",
-    [
-        ["+exp=predict", "models=null", "structures.degree=3"],
-        ["+exp=trace", "embedding=rate", "harmonics=3", "selection.n_starts=4"],
-        ["+exp=trace", "embedding=hidden", "degree=2", "n_states=2"],
-        ["+exp=trace", "functions=[sin]", "function_degree=2"],
-        ["+exp=trace", "search=trajectory"],
-        ["+exp=trace", "search=stlsq", "selection=ebic"],
-        ["+exp=trace", "bootstraps.n=4", "bootstraps.block=5"],
-        ["+exp=trace", "data=file", "data.path=x", "data.r.name=r", "data.r.unit=mm"],
-        ["+exp=breathing", "selection=knee", "libraries.simple.n_norm=library"],
-    ],
-)
-def test_a_setting_with_an_effect_is_taken(typed: list[str]) -> None:
-    config, study = built(typed)
-    check_effects(typed, study, config)
-
-
-def built(typed: list[str]) -> tuple[DictConfig, object]:
-    states = ["trajectory.states=[x,y]"] if "+exp=discover" in typed else []
-    config = composed(*typed, *states)
-    return config, study_of(study_class(config.study), config)
+def test_a_group_that_an_experiment_does_not_use_may_be_set() -> None:
+    config = composed("+exp=weak", "parallel=serial")
+    assert study_of(study_class(config.study), config)
 
 
 # Settings with which each step of the table in docs/data.md is called, on a small field.
@@ -145,6 +96,7 @@ STEPS = {
     "delay": "variable: n_i, delay_s: 1.0e-5, name: past",
     "derivative": "variable: n_i, name: rate",
     "detrend": "variables: [n_i], degree: 1",
+    "gradient": 'of: "n_i*u_iz", name: slope',
     "derive": 'name: flux, expression: "n_i*u_iz", units: "m^-2/s"',
     "radial_from_middle": "middle_m: 0.04",
     "keep_where": 'condition: "(z > 0.002)"',

@@ -91,7 +91,7 @@ def test_a_page_shows_the_result_on_the_first_screen(
 ) -> None:
     browser()  # skips before the run
     toy = [each for each in TOYS[name](predator_prey, tmp_path) if not each.startswith("+exp")]
-    page = run_config(composed(f"+exp={name}", *toy)).folder / "report.html"
+    page = run_config(composed(f"+exp={name}", *toy)) / "report.html"
     assert page.stat().st_size < MOST_BYTES
     for width_px, n_screens in ((1280, 1), (390, 2)):
         found = seen(page, width_px, questions=QUESTIONS)

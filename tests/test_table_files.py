@@ -158,11 +158,10 @@ def test_a_missing_extra_is_named(
 
 @pytest.mark.parametrize("part", [0.3, 0.6, 0.9])
 def test_damaged_parquet_ends_in_one_message(tmp_path: Path, part: float) -> None:
-    """Its library is written in C++: the test process meets the damage first."""
     write_parquet(tmp_path / "a.parquet")
     content = bytearray((tmp_path / "a.parquet").read_bytes())
     place = int(part * len(content))
     content[place : place + 64] = bytes(64)
     (tmp_path / "a.parquet").write_bytes(content)
-    with pytest.raises(ValueError, match="a.parquet cannot be read: .*readable to its end"):
+    with pytest.raises(ValueError, match="a.parquet cannot be read: "):
         ep.open_field(tmp_path / "a.parquet")

@@ -1,13 +1,21 @@
 """Inputs that are damaged, or ask for more than there is, end in words that name them."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
+import xarray as xr
+from numcodecs.pickles import Pickle
 
 import ep2sindy as ep
 from ep2sindy.app.compare import read_run
+from ep2sindy.data.mapping import read_array
+from ep2sindy.data.readers.registry import open_source
+from ep2sindy.data.readers.source import damage_named
 from ep2sindy.library.names import split_term
 from ep2sindy.thruster.axial.settings import Settings
 from ep2sindy.trust import memory
@@ -91,6 +99,77 @@ def test_a_run_folder_with_little_in_it_is_read(tmp_path: Path) -> None:
     for each, text in RUN.items():
         (tmp_path / each).write_text(text)
     assert read_run(tmp_path, 0).settings == {"seed": 1}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes of POSIX")
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.csv")
+    for path in (tmp_path / "a.csv", Path("/dev/zero")):
+        with pytest.raises(ValueError, match="a file or a folder must come"):
+            open_source(path)
+
+
+def test_an_array_is_counted_before_memory_is_asked_for(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("x", (2**50,), "f8", chunks=(1024,))
+    with pytest.raises(ValueError, match=r"a\.h5 cannot be read: '/x' would take .* GB of memory"):
+        read_array(open_source(tmp_path / "a.h5"), "x", "x")
+
+
+def test_a_circle_of_groups_is_not_walked_twice(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "circle.h5", "w") as file:
+        file["g/x"] = np.arange(6.0)
+        file["g/again"] = file["g"]
+    assert "g/x" in open_source(tmp_path / "circle.h5").names
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (AttributeError("'NoneType' object has no attribute 'x'"), "it is damaged, or of another"),
+        (ValueError("zip() argument 2 is shorter than argument 1"), "it is damaged, or of another"),
+        (KeyError("x"), "it is damaged, or of another"),
+        (OSError("Unable to open file\n(truncated file: eof = 9)."), "Unable to open file (trunca"),
+    ],
+)
+def test_a_library_speaks_in_one_line_and_python_does_not(
+    error: Exception, said: str, tmp_path: Path
+) -> None:
+    words = pytest.raises(ValueError, match="a.nc cannot be read: ")
+    with words as caught, damage_named(tmp_path / "a.nc"):
+        raise error
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+class Marks:
+    """Unpickled, it leaves a mark."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return eval, ("__import__('pathlib').Path('it_ran').touch()",)
+
+
+@pytest.mark.parametrize("array", ["time", "I"])
+def test_pickled_objects_of_a_zarr_store_do_not_run(
+    array: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "a.zarr"
+    field = xr.Dataset({"I": ("time", np.arange(5.0))}, coords={"time": np.arange(5.0)})
+    field.to_zarr(path, consolidated=False, zarr_format=2)
+    place = path / array / ".zarray"
+    objects = {"dtype": "|O", "filters": [{"id": "pickle", "protocol": 4}], "compressor": None}
+    place.write_text(json.dumps(json.loads(place.read_text()) | objects))
+    content = Pickle().encode(np.array([Marks()] * 5, dtype=object))
+    (path / array / "0").write_bytes(content)
+    with pytest.raises(ValueError, match="a.zarr cannot be read"):
+        ep.open_field(path, variables={"I_d": ep.Variable("I", "A")}, time=ep.Variable("time", "s"))
+    assert not Path("it_ran").exists()
+
+
+def test_numcodecs_that_unpickle_are_not_installed_along() -> None:
+    project = (Path(__file__).resolve().parents[1] / "pyproject.toml").read_text()
+    assert "numcodecs>=0.16.6" in project
 
 
 @pytest.mark.parametrize("text", ["x*" * 20_000, "sin(" + "1" * 40_000, "x" + " " * 100_000 + "!"])

@@ -16,12 +16,10 @@ from omegaconf import OmegaConf
 import ep2sindy as ep
 from ep2sindy.app import program
 from ep2sindy.app.inspection import commands, config_text
-from ep2sindy.app.sweep import RECORDS, index_text
 from ep2sindy.data.inspection import inspect_file
 from ep2sindy.report.document import Section, Table, Text
 from ep2sindy.report.screen import Screen
 from ep2sindy.runtime import progress
-from ep2sindy.runtime.files import write_json
 from ep2sindy.runtime.screen import in_line, one_screen, plain, say
 from ep2sindy.studies.source import say_data
 from ep2sindy.thruster import cache
@@ -105,12 +103,6 @@ def test_markup_and_names_of_emoji_are_text_on_every_screen(
     screen.show([Section("s", [Table(pd.DataFrame({text: [text]}), title=text, note=text)])])
     screen.close()
     assert (tmp_path / "run.log").read_text().count(text) == 8
-    capsys.readouterr()
-    record = {"job": 0, "overrides": [], "status": "ok", "headline": {text: 1}, "folder": text}
-    write_json(tmp_path / RECORDS / "0.json", record)
-    shown = index_text(tmp_path)
-    assert shown.count(text) == 2
-    assert plain(shown) == shown  # else `say` would write its colours out
 
 
 def test_labels_of_bars_and_files_that_are_read_stay_in_their_line(

@@ -1,16 +1,21 @@
 """Arguments of the command line: mended before Hydra reads them, its errors in our words.
 
+Hydra itself calls what stands in `callbacks` and in the settings of its loggers. These must stay as
+they are, since a config may name only what is marked for configs.
+
 Only Hydra is imported here: a command must not wait for the numerics.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Any
 
+import hydra._internal.hydra as program
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
@@ -18,10 +23,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy.runtime.screen import listed, near_words
 
+JOBS = "jobs"  # folder of a sweep with a record of each job
 COMMANDS = ("compare", "inspect", "warm")  # that stand first, without +exp=NAME
 QUOTED_KEY = re.compile(r"""(?<=[{,])\s*(?P<quote>["'])(?P<name>\w+)(?P=quote)\s*(?=:)""")
 # `points.files=PATTERN`, whose braces would be a mapping to Hydra; or the same as `points=PATTERN`.
 FILES = re.compile(r"points(?:\.files=|=(?=[^\[{]*\{\w+\}))(?P<value>.+)", re.DOTALL)
+
+SILENT = {"version": 1, "root": {"level": "ERROR"}, "disable_existing_loggers": True}
+FIXED: Mapping[str, Any] = {"callbacks": {}, "job_logging": SILENT, "hydra_logging": SILENT}
 
 Compose = Callable[[list[str]], DictConfig]
 
@@ -63,6 +72,36 @@ def mend(text: str) -> str:
     except OverrideParseException as error:
         raise ValueError(_unreadable(text, error.message.strip().partition("\n")[0])) from error
     return without
+
+
+class Loader(ConfigLoaderImpl):
+    """Hydra's loader of configs, with errors in our words; it calls nothing that a config names."""
+
+    def load_configuration(
+        self, config_name: str | None, overrides: list[str], *how: Any, **more: Any
+    ) -> DictConfig:
+        def compose(overrides: list[str]) -> DictConfig:
+            return ConfigLoaderImpl.load_configuration(self, config_name, overrides, *how, **more)
+
+        with explained(overrides, compose):
+            found = compose(overrides)
+        for name, value in FIXED.items():
+            if (came := OmegaConf.to_container(found.hydra[name], resolve=True)) != value:
+                raise ValueError(
+                    f"hydra.{name} must stay as it is, for it names what is called: {came!r} came; "
+                    "leave it out"
+                )
+        return found
+
+
+@contextmanager
+def our_loader() -> Iterator[None]:
+    """A context in which Hydra composes configs by `Loader`."""
+    program.ConfigLoaderImpl = Loader  # type: ignore[misc]
+    try:
+        yield
+    finally:
+        program.ConfigLoaderImpl = ConfigLoaderImpl  # type: ignore[misc]
 
 
 @contextmanager
@@ -118,6 +157,7 @@ def _not_set(error: ConfigCompositionException, overrides: Sequence[str], compos
                 f"{merged[1]!r} cannot be set, for the config has another kind of value there: "
                 f"{cause}; --cfg job shows what it has"
             )
+        said = said or f"a config cannot be read: {cause}"
         return said.partition("\nSee https")[0]
     key = found[2]
     typed = next((text for text in overrides if _key(text) == key), key)

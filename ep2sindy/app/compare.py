@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from string import ascii_uppercase
 from typing import Any
 
 import pandas as pd
@@ -19,7 +20,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ep2sindy.app.safety import check_yaml
+from ep2sindy.app.arguments import JOBS
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import by_place
@@ -33,7 +34,8 @@ from ep2sindy.runtime.screen import say
 from ep2sindy.studies.views import display_equation
 
 ABOUT = """Compares runs: settings that differ, headline figures, equations with their intervals.
-A run is the folder that it printed last, such as outputs/breathing/2025-01-31_101500."""
+A run is the folder that it printed last, such as outputs/breathing/2025-01-31_101500. Of a sweep,
+outputs/multirun/2025-01-31_101500, all jobs that came to their end are compared."""
 NOTE = (
     "Apart: the 95 % intervals of two runs have no value in common; overlap: all have. A dash: "
     "the term is not in the model, or its interval is not known."
@@ -43,21 +45,23 @@ NOTE = (
 SUMMARY = {"experiment": str, "seed": int, "headline": dict, "warnings": list, "data": dict}
 PROVENANCE = {"commit": str, "versions": dict}
 REQUIRED = {"experiment", "seed"}
+JOB = {"folder": str, "error": str}
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Compare the run folders named on the command line.
+    """Compare the run folders, and the jobs of sweeps, named on the command line.
 
     Raises ValueError for a folder that holds no run, or a template that is missing.
     """
     parser = argparse.ArgumentParser("ep2sindy compare", description=ABOUT)
-    parser.add_argument("run", nargs="+", help="run folder; two or more")
+    parser.add_argument("run", nargs="+", help="run folder, two or more; or a sweep")
     parser.add_argument("--page", default="compare.html", help="where the page goes")
     parser.add_argument("--template", help="a Jinja2 template of your own for the page")
     given = parser.parse_args(arguments)
-    if len(given.run) < 2:
-        raise ValueError(f"to compare takes two runs or more: {given.run} came")
-    runs = [read_run(Path(path), k) for k, path in enumerate(given.run)]
+    folders = [folder for path in given.run for folder in folders_of(Path(path))]
+    if len(folders) < 2:
+        raise ValueError(f"to compare takes two runs or more: {list(map(str, folders))} came")
+    runs = [read_run(folder, k) for k, folder in enumerate(folders)]
     page = Path(given.page)
     template = Path(given.template) if given.template else TEMPLATES / "page.html"
     sections = compare_runs(runs, beside=page.parent)
@@ -90,25 +94,33 @@ class ReadRun:
         return {name: float("nan") if v is None else float(v) for name, v in found.items()}
 
 
+def folders_of(path: Path) -> list[Path]:
+    """The run folder at a path; of a sweep, those of its jobs, saying which of them failed."""
+    records = sorted((path / JOBS).glob("[!.]*.json"), key=lambda each: (len(each.stem), each.stem))
+    found = []
+    for place in records:
+        record = _checked(place, JOB)
+        if record["error"] or not record["folder"]:
+            say(f"left out: job {place.stem} failed: {record['error']}")
+        else:
+            found.append(Path(record["folder"]))
+    return found if records else [path]
+
+
 def read_run(folder: Path, number: int) -> ReadRun:
-    """Read a completed run. number: from zero; it gives the label A, B, ...
+    """Read a completed run. number: from zero; it gives the label A, B, ..., Z, AA, BB, ...
 
     Raises ValueError for a folder that is not a run, or a run that ended early.
     """
     if not folder.is_dir():
         raise ValueError(f"a run is a folder: {folder} is not there; {_nearby(folder)}")
-    if (folder / "index.csv").is_file():
-        raise ValueError(
-            f"{folder} is a sweep, and compares its jobs in index.html; name the folders of two "
-            "of its jobs, see index.csv"
-        )
     if not (folder / "summary.json").is_file():
         said = "it ended early, see its run.log" if (folder / "run.log").is_file() else "no run"
         raise ValueError(f"{folder} has no summary.json: {said}; {_nearby(folder)}")
     paths = sorted((folder / "models").glob("[!.]*.json"))
     return ReadRun(
         folder=folder,
-        label=chr(ord("A") + number),
+        label=ascii_uppercase[number % 26] * (1 + number // 26),
         summary=_checked(folder / "summary.json", SUMMARY),
         provenance=_checked(folder / "provenance.json", PROVENANCE),
         settings=_read_settings(folder / "config.yaml"),
@@ -135,7 +147,6 @@ def _checked(path: Path, kinds: Mapping[str, Any]) -> dict[str, Any]:
 def _read_settings(path: Path) -> dict[str, Any]:
     """The run's settings by dotted place."""
     with _damage_named(path):
-        check_yaml(path)
         config: Any = OmegaConf.to_container(OmegaConf.load(path))
         if not isinstance(config, dict):
             raise ValueError("a mapping must stand there")

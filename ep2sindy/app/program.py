@@ -14,10 +14,11 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import hydra
@@ -29,8 +30,8 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ep2sindy.app.arguments import COMMANDS, options_first
-from ep2sindy.app.safety import check_places, checked_loader, resolved
+from ep2sindy.app.arguments import COMMANDS, JOBS, options_first, our_loader
+from ep2sindy.runtime.files import write_json
 from ep2sindy.runtime.screen import listed, near_words, plain, say
 from ep2sindy.runtime.threads import start_on_one_thread
 from ep2sindy.trust.interruption import end_as_interrupted
@@ -61,7 +62,7 @@ def run() -> None:
                 sweeps[:] = [Path(HydraConfig.get().sweep.dir)]
             failed.extend(run_job(config, conf))
 
-        with checked_loader(), isolate_children(), said_as_text():
+        with our_loader(), isolate_children(), said_as_text():
             job()
     except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
         sys.exit(plain(f"error: {str(error) or type(error).__name__}"))
@@ -75,9 +76,7 @@ def run() -> None:
         sys.exit("interrupted: files under their final names are whole")
     finally:
         for sweep in sweeps:
-            from ep2sindy.app.sweep import index_text
-
-            say(index_text(sweep))
+            say(f"the jobs side by side: ep2sindy compare {quote(str(sweep))}")
     if failed:
         why = failed[0] if len(failed) == 1 else f"{len(failed)} jobs failed"
         sys.exit(plain(f"error: {why}"))
@@ -157,56 +156,40 @@ def prepare_arguments(conf: Path) -> None:
 
 def run_job(config: DictConfig, conf: Path) -> list[str]:
     """Run one job; returns why it ended early, if it did. A sweep notes that and goes on."""
-    with note_job() as (done, ended_early):
+    with note_job() as record:
         try:
             if config.experiment is None:
                 raise _no_experiment(HydraConfig.get().overrides.task, conf)
-            typed = HydraConfig.get().overrides.task
-            check_places(resolved(config), typed)
             say(first_word(config))  # the imports below take seconds
             from ep2sindy.app.runner import run_config
 
-            finished = run_config(config, overrides=typed)
+            record["folder"] = str(run_config(config))
         except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
-            ended_early(error)
-            return [str(error)]
-        done(finished.folder, finished.headline)
-    return []
+            record["error"] = str(error)
+    return [record["error"]] if "error" in record else []
 
 
 @contextmanager
-def note_job() -> Iterator[
-    tuple[Callable[[Path, Mapping[str, float]], None], Callable[[BaseException], None]]
-]:
-    """In a sweep, report each job's begin and note its end; otherwise do nothing.
+def note_job() -> Iterator[dict[str, Any]]:
+    """In a sweep, report a job's begin, and write its record for `compare` when it ends.
 
-    Yields two callbacks: the first takes the run folder and headline figures of a completed job,
-    the second takes the error of a job that failed.
+    Yields the record, which gets the run's `folder` or the `error` that ended it.
     """
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
-        yield (lambda folder, headline: None), (lambda error: None)
+    run = HydraConfig.get()
+    record: dict[str, Any] = {"overrides": list(run.overrides.task)}
+    if run.mode != RunMode.MULTIRUN:
+        yield record
         return
-    job, overrides = HydraConfig.get().job.num, list(HydraConfig.get().overrides.task)
-    sweep = Path(HydraConfig.get().sweep.dir)
-    record: dict[str, Any] = {"job": job, "overrides": overrides, "status": "failed"}
-    say(f"job {job}: {' '.join(overrides)}")
-
-    def done(folder: Path, headline: Mapping[str, float]) -> None:
-        record.update(status="done", folder=str(folder), headline=dict(headline))
-
-    def ended_early(error: BaseException) -> None:
-        record["error"] = f"{error}" or type(error).__name__
-        say(f"job {job} failed: {record['error']}")
-
+    say(f"job {run.job.num}: {' '.join(record['overrides'])}")
     try:
-        yield done, ended_early
+        yield record
     except BaseException as error:
-        ended_early(error)
+        record["error"] = str(error) or type(error).__name__
         raise
     finally:
-        from ep2sindy.app.sweep import note_end  # loads pandas, only when a job has ended
-
-        note_end(sweep, record)
+        if "error" in record:
+            say(f"job {run.job.num} failed: {record['error']}")
+        write_json(Path(run.sweep.dir) / JOBS / f"{run.job.num}.json", record)
 
 
 def first_word(config: DictConfig) -> str:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -17,12 +16,9 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy.studies
-from ep2sindy.app.safety import check_output
-from ep2sindy.app.schema import GROUPS, keys_of, study_of
+from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
-from ep2sindy.discovery.method import TrajectorySearch
-from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.about import ASIDE, About, by_place, settings_used
 from ep2sindy.report.folder import FORMATS, RunFolder
 from ep2sindy.report.page import page_html
@@ -31,42 +27,26 @@ from ep2sindy.report.run import Run
 from ep2sindy.report.screen import PAGE, Screen
 from ep2sindy.report.tensorboard import Board
 from ep2sindy.runtime.progress import Bars, count_pieces
-from ep2sindy.studies.study import Experiment, Outcome, Selective
+from ep2sindy.studies.study import Experiment, Outcome
 from ep2sindy.trust.user_code import load_user_module
 
 
-@dataclass(frozen=True)
-class Finished:
-    """A completed run: its folder, and its headline figures."""
-
-    folder: Path
-    headline: Mapping[str, float]
-
-
-def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished:
-    """Build the study that a config names, compute it, and write its outcome.
-
-    overrides: settings from the command line; one that the study does not use is an error.
-    """
+def run_config(config: DictConfig) -> Path:
+    """Build the study that a config names, compute it, and write its outcome; its run folder."""
     check_common(config)
     formats = formats_of(config)
-    overrides = list(overrides)
     with Bars().stage(3, "step", "loading") as advance:
         check_targets(config)
         advance(1)
         kind = study_class(config.get("study"))
         advance(1)
-        check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
         study: Experiment = study_of(kind, config)  # an invalid setting leaves no run folder
-        check_effects(overrides, study, config)
         advance(1)
     warm()
     with start_run(config) as run:
-        if said := unused_rows(overrides, study):
-            run.say(said)
         outcome = study.compute(run)
-        headline = write(run, outcome, study, formats)
-    return Finished(run.folder.path, headline)
+        write(run, outcome, study, formats)
+    return run.folder.path
 
 
 def study_class(name: object) -> type:
@@ -119,7 +99,8 @@ def check_common(config: DictConfig) -> None:
         raise ValueError(
             f"experiment names a folder: letters, digits and _, not {config.experiment!r}"
         )
-    check_output(config)
+    if not isinstance(config.get("output"), str) or not config.output:
+        raise ValueError(f"output must be a folder's name: {config.get('output')!r} came")
 
 
 def formats_of(config: DictConfig) -> list[str]:
@@ -135,67 +116,6 @@ def formats_of(config: DictConfig) -> list[str]:
             f"are made of: {formats!r} came; figures.formats=[png,pdf] adds drawings for print"
         )
     return formats
-
-
-def check_overrides(overrides: Iterable[str], *, used: Collection[str], experiment: str) -> None:
-    """Raise ValueError for a key of conf/config.yaml that was set but is not used by the study."""
-    for text in overrides:
-        key = _key_of(text)
-        if key in set(GROUPS) - set(used):
-            raise ValueError(
-                f"{text!r} would do nothing: {experiment} does not use {key!r}; leave it out"
-            )
-
-
-def check_effects(overrides: Iterable[str], study: Experiment, config: DictConfig) -> None:
-    """Raise ValueError for a typed setting that has no effect beside the others."""
-    idle = dict(study.idle()) if isinstance(study, Selective) else {}
-    for text in overrides:
-        key = text.lstrip("+~").partition("=")[0].replace("/", ".")
-        reasons = {place: why for place, why in idle.items() if f"{key}.".startswith(f"{place}.")}
-        if why := "".join([*reasons.values()][:1]) or _idle_beside(key, config):
-            raise ValueError(f"{text!r} would do nothing: {why}; leave it out, or change that")
-
-
-def _idle_beside(key: str, config: DictConfig) -> str:
-    """Why a setting has no effect beside others of its group; empty if it has one."""
-    place, _, name = key.rpartition(".")
-    if place == "bootstraps" and name != "n" and OmegaConf.select(config, "bootstraps.n") == 0:
-        return "bootstraps.n is 0, and no bootstrap is drawn"
-    beside = OmegaConf.select(config, place) if place.startswith("data.") else None
-    if (
-        name in ("unit", "dims")
-        and isinstance(beside, DictConfig)
-        and OmegaConf.select(beside, "name", default="") is None
-    ):
-        return f"{place}.name is null, so nothing of the file is taken for it"
-    return ""
-
-
-def unused_rows(overrides: Iterable[str], study: Any) -> str:
-    """A message if rows were set on the command line, and the study searches trajectories.
-
-    Empty otherwise. study: a dataclass.
-    """
-    rows = [text for text in overrides if _key_of(text) == "formulation"]
-    values = [getattr(study, field.name) for field in fields(study)]
-    if not rows or not any(isinstance(value, TrajectorySearch) for value in values):
-        return ""
-    beside = any(isinstance(value, Formulation) for value in values)
-    use = (
-        "it serves only the fits and figures that this experiment makes of rows beside the search"
-        if beside
-        else "it does nothing here"
-    )
-    return (
-        f"{' '.join(rows)}: a search of trajectories makes no rows, so {use}; equations are "
-        "searched in rows by search=best_subset selection=ebic"
-    )
-
-
-def _key_of(override: str) -> str:
-    """The first key of a setting: `formulation` of `+formulation.split.test_fraction=0`."""
-    return re.split(r"[.=@]", override.lstrip("+~/"))[0]
 
 
 @contextmanager
@@ -217,9 +137,7 @@ def start_run(config: DictConfig) -> Iterator[Run]:
         screen.close()
 
 
-def write(
-    run: Run, outcome: Outcome, study: Experiment, formats: Sequence[str] = ("png",)
-) -> dict[str, float]:
+def write(run: Run, outcome: Outcome, study: Experiment, formats: Sequence[str] = ("png",)) -> None:
     """Write an outcome into the run folder; models and tables first, as views may fail."""
     folder, models = run.folder, outcome.models()
     for name, model in models.items():
@@ -245,7 +163,6 @@ def write(
     for end in run.ends:
         end()
     run.screen.conclude(result, folder.path)
-    return headline
 
 
 def about(run: Run, study: Experiment) -> About:

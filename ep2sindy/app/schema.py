@@ -74,7 +74,7 @@ def _without_formats(config: DictConfig, *, has_own: bool) -> DictConfig:
     own = {name: v for name, v in (config.get("figures") or {}).items() if name != "formats"}
     if own and not has_own:
         first = f"figures.{next(iter(own))}"
-        raise ValueError(f"{first!r} would do nothing: this experiment has figures.formats alone")
+        raise ValueError(f"unknown key {first!r}: this experiment has figures.formats alone")
     found = config.copy()
     OmegaConf.set_struct(found, False)
     found.figures = own

@@ -13,7 +13,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy._stubs import dotted_names
-from ep2sindy.trust.user_code import is_for_configs, load_user_module
+from ep2sindy.trust.user_code import load_marked
 
 # Full names: `ep2sindy.EBIC`, `ep2sindy.thruster.Thruster`.
 FOR_CONFIGS = frozenset(name for name, entry in dotted_names().items() if entry.for_configs)
@@ -54,21 +54,16 @@ def _near(name: str) -> str:
 
 def _own(name: str, place: str) -> Callable[..., Any]:
     """An object that the user has marked; only files below the current folder are imported."""
-    module, _, last = name.rpartition(".")
     try:
-        target = getattr(load_user_module(module), last)
+        return load_marked(name)
     except (ModuleNotFoundError, AttributeError) as error:
         raise ValueError(
             f"{place} must name a _target_ of ep2sindy that is for configs, such as "
             f"ep2sindy.EBIC, or one of yours below the folder that you start in: {name!r} came, "
             f"and {error}"
         ) from error
-    if not is_for_configs(target):
-        raise ValueError(
-            f"{place} must name a _target_ that is for configs: {name!r} came; if it is yours, "
-            f"mark it with @ep.for_configs where it is defined"
-        )
-    return target
+    except ValueError as error:
+        raise ValueError(f"{place} must name a _target_: {error}") from error
 
 
 def check_targets(node: Any, place: str = "") -> None:

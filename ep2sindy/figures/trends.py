@@ -1,7 +1,4 @@
-"""Figures of the parametric study from tables of estimates and laws, and figures of a sweep.
-
-A sweep's figure shows the results of its jobs against their settings.
-"""
+"""Figures of the parametric study from tables of estimates and laws."""
 
 from __future__ import annotations
 
@@ -11,20 +8,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 
 from ep2sindy.figures.style import (
     COLOURS,
     TITLE,
     WIDTH,
     held_label,
-    hover_spot,
     legend_above,
-    make_grid,
     make_panels,
     name_label,
     sample_line,
@@ -109,28 +102,3 @@ def _list_entries(
     ]
     colour = next(iter(colours.values()))
     return marks + ([Line2D([], [], color=colour, lw=1.2, label="control law")] if laws else [])
-
-
-def sweep_figure(
-    x: Float[np.ndarray, " jobs"],
-    values: Mapping[str, Float[np.ndarray, " jobs"]],
-    *,
-    x_label: str,
-    jobs: Sequence[str],
-) -> Figure:
-    """A panel per headline figure, with a dot per job; hovering over a dot names the job.
-
-    x: the setting of each job, or its number. values: NaN if a job has none.
-    """
-    figure, axes = make_grid(len(values), width=3.0, height=2.4, extra=0.2)
-    for ax, (name, numbers) in zip(axes, values.items(), strict=True):
-        there = np.isfinite(numbers)
-        ax.plot(x[there], numbers[there], "o", color=COLOURS[0], ms=6)
-        for k in np.flatnonzero(there).tolist():
-            hover_spot(ax, x[k], numbers[k], f"{jobs[k]} | {name}: {numbers[k]:.4g}")
-        ax.set_title(name.replace(": ", ":\n"), fontsize=TITLE)
-        ax.set_xlabel(x_label)
-        ax.xaxis.set_major_locator(MaxNLocator(5, integer=bool((x == np.round(x)).all())))
-        ax.margins(x=0.08, y=0.12)
-        ax.grid(axis="y", alpha=0.25)
-    return figure

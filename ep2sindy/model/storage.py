@@ -14,7 +14,7 @@ from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.files import read_json
-from ep2sindy.trust.limits import check_kind
+from ep2sindy.runtime.screen import words_of
 
 FORMAT = "ep2sindy.SparseModel/1"
 
@@ -81,7 +81,7 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
     except KeyError as error:
         raise ValueError(f"a model file must hold {FORMAT} JSON: {error} is missing") from error
     except (TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
-        raise ValueError(f"a model file must hold {FORMAT} JSON: {error}") from error
+        raise ValueError(f"a model file must hold {FORMAT} JSON: {words_of(error)}") from error
 
 
 def read_stored(path: Path, read: Callable[[str], Model]) -> Model:
@@ -89,7 +89,6 @@ def read_stored(path: Path, read: Callable[[str], Model]) -> Model:
 
     Raises UnknownFunctionError or another ValueError.
     """
-    check_kind(path)
     try:
         return read(path.read_text(encoding="utf-8"))
     except UnknownFunctionError as error:

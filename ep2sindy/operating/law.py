@@ -29,6 +29,7 @@ from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.runtime.files import read_json, write_text
+from ep2sindy.runtime.screen import words_of
 from ep2sindy.runtime.values import read_only
 from ep2sindy.selection.criteria import FLOOR
 
@@ -217,7 +218,7 @@ class OperatingLaw:
         except UnknownFunctionError:
             raise  # the file is valid, but a function in it must be registered before reading
         except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
-            raise ValueError(f"a law file must hold {FORMAT} JSON: {error}") from error
+            raise ValueError(f"a law file must hold {FORMAT} JSON: {words_of(error)}") from error
 
     def save(self, path: str | Path) -> None:
         write_text(Path(path), self.to_json())

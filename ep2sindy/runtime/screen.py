@@ -28,6 +28,19 @@ def in_line(text: str) -> str:
     return plain(text).replace("\n", "\\n").replace("\t", "\\t")
 
 
+# Errors whose words are about code, and tell nothing of a file.
+_INTERNAL = (AssertionError, AttributeError, IndexError, NameError, TypeError)
+_IN_PYTHON = re.compile(r"NoneType|zip\(\)|no attribute|values to unpack")
+
+
+def words_of(error: BaseException) -> str:
+    """What an error says of the file that was read, in one line and without words about code."""
+    said = " ".join(str(error).split()).removesuffix(".")
+    if isinstance(error, _INTERNAL) or " " not in said or _IN_PYTHON.search(said):
+        return "it is damaged, or of another kind than its name says"
+    return said
+
+
 def say(text: str, *, error: bool = False) -> None:
     """Print a line; error: to standard error. A failing stream is ignored, see `on_screen`."""
     stream = sys.stderr if error else sys.stdout

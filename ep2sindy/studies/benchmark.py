@@ -144,10 +144,6 @@ class Study:
     parallel: Workers
     keep: bool = True
 
-    def idle(self) -> dict[str, str]:
-        unused = [name for name in self.definitions if name not in self.variants]
-        return {f"definitions.{name}": f"variants has no {name}" for name in unused}
-
     def compute(self, run: Run) -> Outcome:
         published = published_cells(self.thesis)
         variants = build_variants(self.variants, self.definitions)

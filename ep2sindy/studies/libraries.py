@@ -131,8 +131,8 @@ class Study:
     starts of forecasts, over the held-out part of a living model, or else over the last quarter of
     the record; zero leaves them out. hidden: states that nobody measured, relations between
     coefficients, terms that an equation may not have (exclude), and roles, as for `discover`.
-    Raises ValueError for held_out without living, as it would do nothing, and for hidden states
-    with several libraries or with living, which need samples of all states.
+    Raises ValueError for hidden states with several libraries or with living, which need samples of
+    all states.
     """
 
     source: Source
@@ -164,21 +164,6 @@ class Study:
             )
         if self.forecasts < 0:
             raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
-        if self.living is None and self.held_out is not None:
-            raise ValueError(
-                "held_out would do nothing: it is for a model that lives, and living is null; give "
-                "held_out=null as well, or say in living how it is searched for"
-            )
-
-    def idle(self) -> dict[str, str]:
-        found = {}
-        for name, case in self.libraries.items():
-            if not case.functions:
-                found[f"libraries.{name}.function_degree"] = "the library has no functions"
-            if not isinstance(self.method.selection, Knee):
-                rule = type(self.method.selection).__name__
-                found[f"libraries.{name}.n_norm"] = f"{rule} selects, and not the knee"
-        return found
 
     def compute(self, run: Run) -> Outcome:
         methods = {name: case.method(self.method) for name, case in self.libraries.items()}

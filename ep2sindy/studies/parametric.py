@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.discovery.method import AnyMethod, Regression
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.figures.trends import PUBLISHED, rows_at, trends_figure
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import constraint
@@ -29,7 +29,6 @@ from ep2sindy.operating.quantities import REFINED, Fitted, PointResult, Quantity
 from ep2sindy.operating.quantity_law import exponent, laws, trends
 from ep2sindy.operating.records import point_label
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.regression.searches import BestSubset
 from ep2sindy.report.document import (
     Block,
     Captioned,
@@ -183,14 +182,6 @@ class Study:
                     f"a trend goes along one parameter and holds the others of {names}: {each} "
                     "came; trends=[] leaves all out"
                 )
-
-    def idle(self) -> dict[str, str]:
-        own, found = self.method, {}
-        if isinstance(self.points, str):
-            found["parameters"] = "the names of the files name them"
-        if not (isinstance(own, Regression) and isinstance(own.search, BestSubset)):
-            found["law.tied_degree"] = "only search=best_subset finds a support for all points"
-        return found
 
     @cached_property
     def _given(self) -> GivenPoints:

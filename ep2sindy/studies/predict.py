@@ -22,7 +22,7 @@ from ep2sindy.operating.choice import (
 )
 from ep2sindy.operating.fit import SETTINGS, error_statistics
 from ep2sindy.operating.law import law_basis
-from ep2sindy.operating.map import MAX_PARAMETERS, Fate
+from ep2sindy.operating.map import Fate
 from ep2sindy.operating.records import OperatingRecord, most_central, point_label
 from ep2sindy.report.document import (
     Block,
@@ -169,16 +169,6 @@ class Study:
             n_spare=1,
             remedy="give it more values, or leave it out (~parameters.{name})",
         )
-
-    def idle(self) -> dict[str, str]:
-        found = {}
-        if self.models is not None:
-            found["structures"] = "models are given, and models=null alone searches for terms"
-        if isinstance(self.points, str):
-            found["parameters"] = "the names of the files name them"
-        if len(self._given.names) > MAX_PARAMETERS:
-            found["map_points"] = f"a map is drawn over {MAX_PARAMETERS} parameters or fewer"
-        return found
 
     def compute(self, run: Run) -> Outcome:
         how = self._how(run.seed)

@@ -25,8 +25,8 @@ class Outcome(Protocol):
     figures: by name, drawn when they are written. in_short: what was found in five lines or so, the
     end of the screen and the beginning of the page. sections: all else, for the page and run.log.
     summary: the findings, for `summary.json`; experiment and seed are added to it. headline: the
-    few numbers by which runs are compared, in TensorBoard and in the index of a sweep. Their names
-    do not depend on the findings.
+    few numbers by which runs are compared, in TensorBoard and by `compare`. Their names do not
+    depend on the findings.
     """
 
     def models(self) -> Mapping[str, SparseModel]: ...
@@ -54,17 +54,6 @@ class Experiment(Protocol):
     """
 
     def compute(self, run: Run) -> Outcome: ...
-
-
-@runtime_checkable
-class Selective(Protocol):
-    """An experiment some of whose settings have no effect beside the others that it was given.
-
-    idle: their dotted keys, each with the reason; a setting at or below one of them is refused if
-    it was typed, so that nothing that a person asks for is left aside in silence.
-    """
-
-    def idle(self) -> Mapping[str, str]: ...
 
 
 @dataclass(frozen=True)

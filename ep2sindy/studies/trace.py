@@ -18,9 +18,9 @@ import xarray as xr
 from ep2sindy.data.conversion import to_si
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
-from ep2sindy.discovery.method import AnyMethod, TrajectorySearch
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.one_signal import SignalSearch, choose_attempt, count_fitted, evaluate
-from ep2sindy.discovery.signal_unknowns import FITTED, fit_offset
+from ep2sindy.discovery.signal_unknowns import fit_offset
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Once
 from ep2sindy.signals.embedding import Delays, LogRate, Rate
@@ -78,19 +78,6 @@ class Study:
             self.method, self.embedding, self.n_states, self.harmonics, self.degree,
             self.functions, self.function_degree,
         )  # fmt: skip
-
-    def idle(self) -> dict[str, str]:
-        found = {}
-        if not self.functions:
-            found["function_degree"] = "functions are none"
-        if self.embedding == "hidden":
-            why = "embedding=hidden finds states and equations together, by search=trajectory"
-            found |= dict.fromkeys(("formulation", "bootstraps", "selection", "depth"), why)
-            if not isinstance(self.method, TrajectorySearch):
-                found["search"] = why
-            if not any(FITTED in text for text in self.functions):
-                found["harmonics"] = f"{why}, without smoothing"
-        return found
 
     def compute(self, run: Run) -> Outcome:
         data = self._sampled(run)

@@ -1,1 +1,1 @@
-"""Protection against untrusted files, configs and folders, and handling of early ends of a run."""
+"""Code that a config names, results as they were written, free memory, and early ends of a run."""

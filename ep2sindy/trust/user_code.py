@@ -85,10 +85,6 @@ def for_configs(call: Called) -> Called:
     return call
 
 
-def is_for_configs(value: object) -> bool:
-    return getattr(value, MARK, None) is value
-
-
 def identify(call: Callable[..., Any]) -> str:
     """Module and name of a function or of a callable's class, with a hash of the file it is from.
 
@@ -121,9 +117,10 @@ def load_marked(name: str) -> Any:
     """
     module, _, last = name.rpartition(".")
     found = getattr(load_user_module(module), last)
-    if not is_for_configs(found):
+    if getattr(found, MARK, None) is not found:
         raise ValueError(
-            f"{name} must be for configs: mark it with @ep.for_configs where it is defined"
+            f"{name} must be for configs: mark it with @ep.for_configs where it is defined, if it "
+            "is yours"
         )
     return found
 

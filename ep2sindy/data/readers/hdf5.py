@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.readers.source import PACKED_BY, UNDECODED, FileSource, Reader, check_packing
+from ep2sindy.trust.memory import check_memory
 
 if TYPE_CHECKING:
     import h5py
@@ -129,6 +130,8 @@ def read_written(found: h5py.Dataset) -> np.ndarray:
     """
     if found.shape is None:
         raise ValueError(f"{found.name!r} is empty: its dataspace is null, and holds no values")
+    n_bytes = found.size * found.dtype.itemsize
+    check_memory(n_bytes, repr(found.name), way_out="copy the part that you need into a file")
     values = np.asarray(found[()])
     holes = holes_of(found)
     if not holes:
@@ -143,7 +146,7 @@ def read_written(found: h5py.Dataset) -> np.ndarray:
 
 def holes_of(found: h5py.Dataset) -> list[tuple[slice, ...]]:
     """Blocks of a numeric data set without storage in the file, because they were never written."""
-    if not found.size or found.shape == () or found.dtype.kind not in "iuf":
+    if not found.size or found.shape == () or found.dtype.kind not in "iuf" or found.is_virtual:
         return []
     if found.chunks is None or not found.id.get_num_chunks():
         return [] if found.id.get_storage_size() else [(slice(None),) * found.ndim]

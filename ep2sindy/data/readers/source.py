@@ -18,12 +18,14 @@ import xarray as xr
 from ep2sindy.data.fields import channel_length_m
 from ep2sindy.data.numbers import count_dates
 from ep2sindy.library.units import seconds_in
-from ep2sindy.trust.limits import ALWAYS, check_declared
+from ep2sindy.runtime.screen import words_of
 
 # xarray must keep times as numbers, whatever their attribute `units` says.
 UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
 
 PACKED_BY = ("scale_factor", "add_offset")
+
+AT_ONCE = 2**28  # bytes of an array up to which it is read once when its file is opened
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -123,7 +125,7 @@ def _is_workbook(path: Path) -> bool:
     try:
         with ZipFile(path) as archive:
             return any(name.startswith("xl/") for name in archive.namelist())
-    except BadZipFile:  # cut short: the list of its members stands at its end
+    except BadZipFile:  # damaged: the list of its members stands at its end
         return path.suffix.lower() in (".xlsx", ".xlsm")
 
 
@@ -144,14 +146,11 @@ def _is_hdf5(path: Path) -> bool:
 
 @contextmanager
 def damage_named(path: Path) -> Iterator[None]:
-    """Turn any error of a parsing library into a ValueError that names the file."""
+    """Turn any error of a parsing library into a ValueError of one line that names the file."""
     try:
         yield
     except Exception as error:  # a library may raise anything for a damaged file
-        said = str(error).strip().removesuffix(".") or type(error).__name__
-        raise ValueError(
-            f"{path} cannot be read: {said}; the file may be cut short, or of another kind"
-        ) from error
+        raise ValueError(f"{path} cannot be read: {words_of(error)}") from error
 
 
 @contextmanager
@@ -192,8 +191,7 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
     def read(name: str) -> xr.DataArray:
         check_packing(name, stored[name])
         array = dataset[name]
-        check_declared(repr(name), array.nbytes, path)
-        if array.nbytes <= ALWAYS:
+        if array.nbytes <= AT_ONCE:
             array.compute()  # damage shows here, where the error names the file; result not kept
         return array
 

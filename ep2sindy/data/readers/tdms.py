@@ -9,7 +9,6 @@ import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.readers.source import FileSource, Reader, counted_dates
-from ep2sindy.trust.limits import check_declared
 
 STEP, UNIT = "wf_increment", "unit_string"  # properties of a channel: its step in s, its unit
 
@@ -29,8 +28,6 @@ def read_tdms(path: Path) -> FileSource:
             for group in groups
             for channel in group.channels()
         }
-        for name, channel in channels.items():
-            check_declared(repr(name), 8 * len(channel), path)
         values = {name: np.asarray(channel[:]) for name, channel in channels.items()}
         said = {name: dict(channel.properties) for name, channel in channels.items()}
 

@@ -25,7 +25,6 @@ from ep2sindy.thruster.axial.state_kernels import (
 )
 from ep2sindy.thruster.checks import check_positive
 from ep2sindy.thruster.constants import E_CHARGE
-from ep2sindy.trust.guard import look_through_first
 
 Profile = Float[np.ndarray, " cells"]
 # Arrays of a run's cells at its last instant, from which another run can continue.
@@ -253,11 +252,12 @@ def _ended_run(run: xr.Dataset | str | Path) -> xr.Dataset:
         path = Path(run)
         if not path.is_file():
             raise ValueError(f"no such run to go on from: {path.absolute()}")
-        with damage_named(path):
-            look_through_first(path, "HDF5")
-            with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
-                ends = [name for name in stored.data_vars if str(name).startswith(END)]
-                run = stored[ends].load()
+        with (
+            damage_named(path),
+            xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored,
+        ):
+            ends = [name for name in stored.data_vars if str(name).startswith(END)]
+            run = stored[ends].load()
     if END + "n_n" not in run or "parameters" not in run.attrs:
         raise ValueError(
             f"a restart must be a run of simulate, which keeps its end (end_n_n, ...): this one "
