@@ -17,7 +17,6 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from unittest.mock import patch
 
 import netCDF4
 import numpy as np
@@ -30,7 +29,6 @@ from threadpoolctl import threadpool_limits
 from benchmarks.timing import cpu_s
 from ep2sindy.data.open import read_field
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery import pointwise as module
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.point_search import PointSearch
 from ep2sindy.discovery.pointwise import blocks_of, pointwise
@@ -166,11 +164,6 @@ def compare(path: Path) -> None:
     print(f"  reading                   {read_s:8.1f} CPU-s")
     print(f"  reading and searching     {total_s:8.1f} CPU-s, {1e3 * ours:.2f} ms per point")
     print(f"  peak memory               {peak_GiB:8.2f} GiB")
-    few = field.isel(z=slice(0, 2)).load()  # where reading does not count
-    with patch.object(module, "compiled_points", lambda search, t: None):
-        general = cpu_s(lambda: study(few), n_runs=2)
-    ratio = general / cpu_s(lambda: study(few), n_runs=2)
-    print(f"  each point by Regression: {ratio:.1f} times as long as compiled, without reading")
     problems = [rows_at(field, iz, 20) for iz in (10, 30)]
     ways: dict[str, Callable[[RegressionRows], None]] = {
         "scikit-learn": plain_way,

@@ -59,6 +59,14 @@ def breathing_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory)
     return run_config(composed(*breathing(predator_prey, output)))
 
 
+def test_two_densities_alone_leave_out_what_needs_more(predator_prey: Path, tmp_path: Path) -> None:
+    given = [text for text in plain(predator_prey, tmp_path) if "variables" not in text]
+    found = computed(composed(*given))
+    assert set(found.summary["models"]) == {"simple"}
+    assert "the library ionization is left out: the data have no R_ion" in found.log
+    assert "the library velocity is left out: the data have no R_ion, u_iz" in found.log
+
+
 def summary_of(folder: Path) -> dict:
     return json.loads((folder / "summary.json").read_text())
 

@@ -120,18 +120,6 @@ def _refinement() -> None:
     )
 
 
-def _points() -> None:
-    """Compile the search at the points of a field."""
-    system = ep.lotka_volterra()
-    field = system.trajectory(noise=0.02, rng=0).to_xarray().expand_dims(z=[0.0, 1.0], axis=1)
-    for block in (1, 50):  # long blocks are summed in another way
-        method = ep.Regression(
-            ep.Differential(), ep.BestSubset(), ep.Knee(), ep.Bootstraps(n=2, block=block)
-        )
-        search = ep.discovery.PointSearch(system.model.states, system.model.library, method)
-        ep.pointwise(field, search, workers=ep.parallel.Serial())
-
-
 def _plane() -> None:
     """Compile the (z, r) simulator."""
     step_s = 1e-6
@@ -142,7 +130,6 @@ def _plane() -> None:
 PARTS: Mapping[str, Callable[[], None]] = {
     "search": _search,
     "refinement": _refinement,
-    "points": _points,
     "plane": _plane,
 }
 

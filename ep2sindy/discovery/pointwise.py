@@ -19,7 +19,6 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.point_search import (
     LAYOUT,
     PointSearch,
-    compiled_points,
     nothing,
     search_point,
 )
@@ -153,14 +152,13 @@ def _search_block(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarra
     t = grid_points(block, "time")
     found: dict[str, list[np.ndarray]] = {name: [] for name in LAYOUT}
     status, reasons = [], []
-    no_result, compiled = nothing(search), compiled_points(search, t)
+    no_result = nothing(search)
     for values in _columns(block, search.variables):
         point = no_result
         status.append(_status(values, search))
         if status[-1] == 0:
             try:
-                fast = compiled.at(values) if compiled else None
-                point = fast or search_point(_trajectory(t, values, block, search), search)
+                point = search_point(_trajectory(t, values, block, search), search)
             except ValueError as error:
                 status[-1] = STATUSES.index(NO_FIT)
                 reasons.append(str(error))

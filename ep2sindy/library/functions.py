@@ -53,11 +53,6 @@ class Kind:
     degree: float | None = None
     own: bool = False
 
-    @classmethod
-    def by_name(cls, name: str) -> Kind:
-        """The function that is registered by a name, as `runtime/kept.py` reads it back."""
-        return _kinds[name]
-
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by name; a user's function is registered again in the receiving process."""
         if not self.own:

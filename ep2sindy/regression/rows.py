@@ -174,10 +174,6 @@ class RegressionRows:
     def train_theta(self) -> Float[np.ndarray, "train terms"]:
         return self.train_rows[:, : len(self.library)]
 
-    @property
-    def test_theta(self) -> Float[np.ndarray, "test terms"]:
-        return self.test_rows[:, : len(self.library)]
-
     def train_target(self, equation: int) -> Float[np.ndarray, " train"]:
         return self._scaled_target(equation, test=False)
 

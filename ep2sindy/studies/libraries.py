@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from ep2sindy.data.quantities import QUANTITIES
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.method import AnyMethod, Regression
@@ -166,14 +167,16 @@ class Study:
             raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
 
     def compute(self, run: Run) -> Outcome:
-        methods = {name: case.method(self.method) for name, case in self.libraries.items()}
         with run.progress(None, "", "data"):
             opened = self.source.fields()
+        chosen = self._served_by(opened[0], run)
+        methods = {name: case.method(self.method) for name, case in chosen.items()}
         sampling = self.source.trajectory
-        seen = [case.library(opened[0], sampling) for case in self.libraries.values()]
+        seen = [case.library(opened[0], sampling) for case in chosen.values()]
         runs = [self.source.sampled(field, seen, run) for field in opened]
-        cases = self.libraries.items()
-        libraries = {name: case.library(opened[0], sampling, self.hidden) for name, case in cases}
+        libraries = {
+            name: case.library(opened[0], sampling, self.hidden) for name, case in chosen.items()
+        }
         if len(runs) > 1:
             run.say(f"{len(runs)} records in one search; figures show the first")
         if not self.hidden and (hint := alone(runs[0])):
@@ -195,6 +198,22 @@ class Study:
         with_hidden = [found.runs[0] for found in estimated if found and self.hidden]
         data = (with_hidden or runs)[0]
         return Outcome(data, results, self.figures, self.formulation.smoother, files)
+
+    def _served_by(self, field: xr.Dataset, run: Run) -> dict[str, LibraryCase]:
+        """The libraries without those of quantities that a field lacks; all, if none is left.
+
+        A name that is no known quantity stays, to be refused.
+        """
+        lacking = {
+            name: [each for each in case.variables if each in QUANTITIES and each not in field]
+            for name, case in self.libraries.items()
+        }
+        if all(lacking.values()):
+            return dict(self.libraries)
+        for name, variables in lacking.items():
+            if variables:
+                run.say(f"the library {name} is left out: the data have no {', '.join(variables)}")
+        return {name: case for name, case in self.libraries.items() if not lacking[name]}
 
     def _result(
         self,
