@@ -100,7 +100,6 @@ from ep2sindy import library as library
 from ep2sindy import discovery as discovery
 from ep2sindy import regression as regression
 from ep2sindy import model as model
-from ep2sindy import forecasting as forecasting
 from ep2sindy import refinement as refinement
 from ep2sindy import signals as signals
 from ep2sindy import operating as operating

@@ -1,4 +1,3 @@
 # Data
-from ep2sindy.data.inspection import Inspection as Inspection
 from ep2sindy.data.sampling import ZoneAverage as ZoneAverage  # for configs
 from ep2sindy.data.sampling import GridPoint as GridPoint  # for configs

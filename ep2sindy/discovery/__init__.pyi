@@ -2,7 +2,6 @@
 from ep2sindy.data.coerce import Task as Task
 from ep2sindy.discovery.method import DiscoveryMethod as DiscoveryMethod
 from ep2sindy.discovery.method import IdentifiedEquations as IdentifiedEquations
-from ep2sindy.discovery.choice import Choice as Choice
 from ep2sindy.estimation.estimate import Estimate as Estimate
 from ep2sindy.discovery.one_signal import SignalDiscovery as SignalDiscovery
 from ep2sindy.discovery.point_search import PointSearch as PointSearch

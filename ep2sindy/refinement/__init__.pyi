@@ -9,9 +9,6 @@ from ep2sindy.refinement.methods.nelder_mead import NelderMead as NelderMead  # 
 from ep2sindy.refinement.steps import RungeKutta as RungeKutta  # for configs
 from ep2sindy.refinement.steps import HermiteSimpson as HermiteSimpson  # for configs
 from ep2sindy.refinement.ode import ODE as ODE
-from ep2sindy.refinement.windows import cut_windows as cut_windows
-from ep2sindy.refinement.windows import WindowBatch as WindowBatch
 from ep2sindy.refinement.correction import Corrected as Corrected
 from ep2sindy.refinement.law import refine_law as refine_law
-from ep2sindy.refinement.law import LawRefinement as LawRefinement
 from ep2sindy.refinement.elimination import Elimination as Elimination

@@ -3,7 +3,6 @@ from ep2sindy.signals.kalman import KalmanSmoother as KalmanSmoother  # for conf
 from ep2sindy.signals.log_smoother import LogSmoother as LogSmoother  # for configs
 from ep2sindy.signals.smoothers import SavitzkyGolay as SavitzkyGolay  # for configs
 from ep2sindy.signals.smoothers import NoSmoothing as NoSmoothing  # for configs
-from ep2sindy.signals.spectrum import power_spectrum as power_spectrum
 from ep2sindy.signals.spectrum import dominant_frequency as dominant_frequency
 from ep2sindy.signals.attractor import Cycle as Cycle
 from ep2sindy.signals.attractor import find_cycle as find_cycle
@@ -14,4 +13,3 @@ from ep2sindy.signals.embedding import Rate as Rate  # for configs
 from ep2sindy.signals.embedding import LogRate as LogRate  # for configs
 from ep2sindy.signals.embedding import Delays as Delays  # for configs
 from ep2sindy.signals.embedding import embed as embed
-from ep2sindy.signals.embedding import Embedded as Embedded
