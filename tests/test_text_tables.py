@@ -215,7 +215,7 @@ def test_stretches_that_a_file_joins_are_not_made_even(tmp_path: Path) -> None:
     ],
 )
 def test_a_slash_in_a_unit_is_no_path(tmp_path: Path, name: str, column: str, unit: str) -> None:
-    (tmp_path / "a.csv").write_text(f"t,{name}\n" + rows(T, X))
+    (tmp_path / "a.csv").write_text(f"t_s,{name}\n" + rows(T, X))
     assert inspect_file(tmp_path / "a.csv").variables[column].unit == unit
     field = open_field(tmp_path / "a.csv")
     assert field[column].attrs["units"] == unit
@@ -251,10 +251,13 @@ def test_the_name_of_a_column_says_the_unit_of_time(
     assert clock_of(field).unit == unit
 
 
-def test_a_first_column_of_another_name_is_time_and_said_to_be(tmp_path: Path) -> None:
+def test_a_first_column_of_another_name_is_no_time_unless_the_user_says_so(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("frame,x\n" + rows(np.arange(30.0), X))
     (note,) = inspect_file(tmp_path / "a.csv").notes()
-    assert note.startswith("time is taken from 'frame', which is the first column, and rises even")
+    assert note == "a field needs time: give the step between samples, data.dt_s=STEP in s"
+    (tmp_path / "b.csv").write_text("when,x\n" + rows(0.5 * np.arange(30.0), X))
+    (note,) = inspect_file(tmp_path / "b.csv").notes()
+    assert note.endswith("or, if 'when' is time, 'data.time={name:when,unit:UNIT}'")
 
 
 def test_a_preamble_beside_the_rows_says_units(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 
 from ep2sindy.data.conversion import counted_in
 from ep2sindy.data.mapping import read_array
-from ep2sindy.data.quantities import typical
 from ep2sindy.data.readers.source import FileSource
 from ep2sindy.data.readers.table_layout import unit_in_brackets
 
@@ -21,8 +20,8 @@ TEXT = "text or objects"  # problem of arrays that are not numbers
 class ArrayInfo:
     """Summary of one array in a file: shape, unit, range, missing values, spacing.
 
-    unit: "" if the file states none. low, high: range of the finite values. size: median magnitude
-    of the nonzero values. n_missing: number of NaN or infinite values. step: median step of
+    unit: "" if the file states none. low, high:
+    range of the finite values. n_missing: number of NaN or infinite values. step: median step of
     an increasing vector, else None. even: True if the steps are equal. gap: where steps that are
     otherwise even leave out samples, in words. falls: where a vector first does not
     increase, in words. problem: reason why the array cannot be used, or "".
@@ -35,7 +34,6 @@ class ArrayInfo:
     dims: tuple[str, ...] = ()
     low: float = np.nan
     high: float = np.nan
-    size: float = 0.0
     n_missing: int = 0
     step: float | None = None
     even: bool = False
@@ -50,8 +48,8 @@ class ArrayInfo:
 
     @property
     def is_counter(self) -> bool:
-        """True for a vector that merely numbers the samples, 0, 1, 2 ..., in no unit."""
-        return self.even and self.step == 1.0 and self.low in (0.0, 1.0) and self.unit in ("", "1")
+        """True for a vector without a unit that may number the samples, from 0, 1 or 22."""
+        return self.even and self.step == 1.0 and self.low % 1.0 == 0.0 and self.unit in ("", "1")
 
 
 def describe_array(source: FileSource, name: str) -> ArrayInfo:
@@ -71,7 +69,7 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
         name, values.shape, str(array.dtype), stated, dims,
         float(finite.min()) if finite.size else np.nan,
         float(finite.max()) if finite.size else np.nan,
-        typical(values), int(values.size - finite.size),
+        int(values.size - finite.size),
         float(np.median(steps)) if steps.size else None,
         bool(steps.size and np.ptp(steps) <= 1e-3 * steps.mean()),
         _gap(steps),

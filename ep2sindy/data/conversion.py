@@ -55,7 +55,12 @@ def to_si(array: xr.DataArray, ours: str, unit: str, *, is_variable: bool = Fals
 
 
 def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[float, float, str]:
-    """Factor, offset and target unit that convert numbers in `unit` to the unit of our name."""
+    """Factor, offset and target unit that convert numbers in `unit` to the unit of our name.
+
+    A variable without a unit stays a pure number, whatever it is called.
+    """
+    if is_variable and unit == "1":
+        return 1.0, 0.0, unit
     suffixes = (u for suffix, u in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}"))
     known = KNOWN_UNITS if is_variable else COORDINATE_UNITS | KNOWN_UNITS
     target = known.get(ours) or next(suffixes, None)
@@ -85,6 +90,17 @@ def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[floa
         named = (u for u in NAMED_UNITS if registry().Quantity(1, u).check(ruler.dimensionality))
         target = next(named, plain)
     return factor, zero, unit_product([(target, 1)])
+
+
+def converts(ours: str, unit: str, *, is_variable: bool = False) -> bool:
+    """True for a unit, other than that of a pure number, which converts to that of our name."""
+    if unit in ("", "1"):
+        return False
+    try:
+        conversion(ours, unit, is_variable=is_variable)
+    except ValueError:
+        return False
+    return True
 
 
 def same_unit(unit: str, stated: str) -> bool:

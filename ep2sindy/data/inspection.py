@@ -12,8 +12,9 @@ from math import isclose
 from pathlib import Path
 
 from ep2sindy.data.arrays import ArrayInfo
+from ep2sindy.data.conversion import KNOWN_UNITS
 from ep2sindy.data.mapping import Variable
-from ep2sindy.data.quantities import MADE_FROM
+from ep2sindy.data.quantities import MADE_FROM, is_counter_name
 from ep2sindy.data.readers.registry import reader_of
 from ep2sindy.data.readers.source import FileSource
 from ep2sindy.data.recognition import Recognised, recognise
@@ -53,17 +54,13 @@ class Inspection:
         return self.source.channel_m
 
     @property
-    def has_time(self) -> bool:
-        return self.found.has_time
-
-    @property
     def is_certain(self) -> bool:
         """True if `open_field` opens the file without a mapping."""
         return not self.found.doubts
 
     @property
     def variables(self) -> dict[str, Variable]:
-        """Mapping of the recognised variables; some of their units may be only likely."""
+        """Mapping of the recognised variables."""
         return dict(self.found.variables)
 
     @property
@@ -86,24 +83,29 @@ class Inspection:
     @property
     def prepare(self) -> dict[str, str]:
         """Variables that the file lacks but a step of `prepare` can compute: name -> step."""
-        have = self.found.variables
+        have = self._quantities
         return {
             name: step
             for name, (source, step) in MADE_FROM.items()
             if source in have and name not in have
         }
 
+    @property
+    def _quantities(self) -> set[str]:
+        """Variables that are what their names say: `n_i` without a unit is a name like others."""
+        return {n for n, v in self.variables.items() if n not in KNOWN_UNITS or v.unit != "1"}
+
     def lacking(self, needed: Iterable[str]) -> tuple[str, ...]:
         """Names in `needed` that the file lacks and that no step of `prepare` can compute."""
-        have = {*self.found.variables, *self.prepare}
+        have = {*self._quantities, *self.prepare}
         return tuple(name for name in needed if name not in have)
 
     @property
     def signals(self) -> list[str]:
-        """Variables that vary and do not increase throughout, as a coordinate does."""
+        """Variables that vary, count nothing, and do not increase throughout as coordinates do."""
         held = {each.name: each for each in self.found.held}
         arrays = {n: held[self._array_of(v)] for n, v in self.variables.items()}
-        return [n for n, one in arrays.items() if one.step is None and one.low < one.high]
+        return [n for n, one in arrays.items() if _is_signal(one)]
 
     def _array_of(self, variable: Variable) -> str:
         """Name of the array in the file that a variable is, or is a part of."""
@@ -112,27 +114,20 @@ class Inspection:
         return name if whole else name.rpartition("[")[0]
 
     def is_trace(self, variable: Variable) -> bool:
-        """True if a variable depends on time alone, varies, and does not increase throughout."""
+        """True if a variable depends on time alone, and is one of the signals."""
         name = self._array_of(variable)
         one = next(each for each in self.found.held if each.name == name)
         n_axes = 1 + len(re.findall(r"\d+", str(variable.name)[len(one.name) :]))
         of_time = len(one.lengths) == n_axes and self.found.n_samples in one.lengths
-        return of_time and one.step is None and one.low < one.high
+        return of_time and _is_signal(one)
 
     def notes(self) -> list[str]:
-        """Messages about open decisions, units that are only likely, and missing information."""
-        texts = []
-        steps = self.source.steps
-        if not self.has_time:
-            what = "step between samples"
-            if steps:
-                what = f"time of one step, of those numbered {steps[0]} to {steps[-1]}"
-            texts.append(f"no time: give the {what}, data.dt_s=STEP in s")
+        """Messages about what is asked, other open decisions, and missing information."""
+        texts = [*self.found.asked]
         if self.dt_s is not None:
-            how = "is the number of a step times" if steps else "in steps of"
+            how = "is the number of a step times" if self.source.steps else "in steps of"
             texts.append(f"time {how} {self.dt_s:.6g} s, as the file says beside its arrays")
-        texts += [text.removesuffix(": give it") for text in self.found.guesses.values()]
-        texts += list(self.found.questions)
+        texts += self.found.questions
         texts += [
             f"{n} is made by {step} from {MADE_FROM[n][0]}" for n, step in self.prepare.items()
         ]
@@ -225,17 +220,24 @@ class Inspection:
         roles: dict[str, list[str]] = {}
         for ours, variable in {**self.found.axes, **self.found.variables}.items():
             name = str(variable.name)
+            is_open = ours in self.found.no_unit
+            text = f"{ours}, in what unit?" if is_open else f"{ours} in {variable.unit}"
             for each in {name, name.partition("[")[0]}:
-                roles.setdefault(each, []).append(f"{ours} in {variable.unit}")
+                roles.setdefault(each, []).append(text)
         return roles
 
 
-def inspect_file(path: str | Path | Sequence[str | Path]) -> Inspection:
-    """List the arrays of a file and recognise quantities by names, units, shapes and sizes.
+def _is_signal(one: ArrayInfo) -> bool:
+    return one.step is None and one.low < one.high and not is_counter_name(one.name)
 
-    path: a file, or a pattern or a list of the files of the steps of one run.
-    Reads every array once. The result prints as a table, followed by notes on units that are only
-    likely and on missing information. `ep2sindy.open_field(path, variables=found.variables,
+
+def inspect_file(path: str | Path | Sequence[str | Path], *, plasma: bool = False) -> Inspection:
+    """List the arrays of a file and recognise quantities by names, units and shapes.
+
+    path: a file, or a pattern or a list of the files of the steps of one run. plasma: names such as
+    Te mean quantities where the file states no unit, too, and what has no unit is in SI.
+    Reads every array once. The result prints as a table, followed by notes on what must be given
+    and on missing information. `ep2sindy.open_field(path, variables=found.variables,
     time=found.time, z=found.z, r=found.r, dt_s=found.dt_s)` opens the recognised field.
     Raises ValueError for a file that is missing, empty, damaged or of an unknown kind.
 
@@ -244,7 +246,7 @@ def inspect_file(path: str | Path | Sequence[str | Path]) -> Inspection:
     'm^-3'
     """
     source = open_record(path)
-    found = recognise(source)
+    found = recognise(source, plasma=plasma)
     kind = reader_of(Path(files_of(path)[0])).name
     return Inspection(kind, source, found)
 
