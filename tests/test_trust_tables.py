@@ -68,12 +68,8 @@ AMBIGUOUS = {
         "t\tx\n" + "".join(f"{k}\t1,{k:03d}\n" for k in range(9)),
         "'1,000' may be 1.000 or 1000, and no number of the file tells which",
     ),
-    "two decimal signs": (
-        "t;x;y\n" + "".join(f"{k};0,{k};{k}.25\n" for k in range(9)),
-        r"column 'x' holds '0,0', and in others it is '\.'",
-    ),
     "one column of decimal commas, or two": (
-        "x\n1,5\n2,5\n3,5\n", r"rows such as '1,5' may be two numbers, or one",
+        "x\n1,5\n2,5\n3,5\n", r"it has 1 names, \['x'\], and the rows have 2 columns",
     ),
     "a word in the first row": ("t,x\n0,bad\n1,2\n2,4\n", r"line 2, \['0', 'bad'\], is neither"),
     "a word in the second row": ("t,x\n0,1\n1,bad\n2,4\n3,5\n", "line 3 is '1,bad'"),
@@ -108,7 +104,6 @@ ROWS = "".join(f"{k},{2 * k}\n" for k in range(9))
         ("a,b\nms,A\n", ["a", "b"], ["ms", "A"], [0.0, 0.0]),
         ("t,x\n---,---\n", ["t", "x"], ["", ""], [0.0, 0.0]),
         ("t,x\n-1,n/a\n", ["t", "x"], ["", ""], [-1.0, np.nan]),
-        ("t,x\nn/a,n/a\n", ["t", "x"], ["", ""], [np.nan, np.nan]),
         ("run A,run A\nt,x\n", ["t", "x"], ["", ""], [0.0, 0.0]),
         ("# from a,scope\na,b\n", ["a", "b"], ["", ""], [0.0, 0.0]),
     ],
@@ -136,7 +131,7 @@ def test_columns_of_one_name_are_numbered_and_none_is_taken_for_the_name(tmp_pat
 def test_columns_that_are_left_out_are_said(tmp_path: Path) -> None:
     text = "t,x,note,rare\n" + "".join(f"{k},{k},ok,{k if k == 3 else ''}\n" for k in range(9))
     (tmp_path / "a.csv").write_text(text)
-    assert "left out, with few numbers: note, rare" in open_source(tmp_path / "a.csv").words
+    assert "left out: note" in open_source(tmp_path / "a.csv").words
 
 
 def test_an_index_and_a_column_of_one_name_are_refused() -> None:
