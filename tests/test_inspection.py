@@ -12,6 +12,7 @@ from scipy.io import savemat
 
 import ep2sindy as ep
 from ep2sindy.app.inspection import experiments
+from ep2sindy.data.coerce import trajectories_of
 from ep2sindy.data.conversion import conversion
 from ep2sindy.data.quantities import axis_of, axis_unit, quantity_of, split_unit
 from ep2sindy.data.readers.registry import open_source
@@ -328,11 +329,14 @@ def test_only_what_varies_along_time_is_offered_as_a_signal(tmp_path: Path) -> N
 def test_time_that_does_not_increase_is_named(tmp_path: Path) -> None:
     back = tmp_path / "back.csv"
     back.write_text("time,x\n0,1\n1,2\n2,0\n1.5,3\n2.5,1\n")
-    with pytest.raises(ValueError, match=r"'time' does not increase \(1.5 follows 2 at row 4\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"'time' does not increase \(1.5 follows 2 at row 4; 0 repeat the one before, 1 run",
+    ):
         ep.open_field(back)
     rounded = tmp_path / "rounded.csv"
     rounded.write_text("time,x\n99.9,1\n100,2\n100,0\n100,3\n101,1\n")
-    with pytest.raises(ValueError, match=r"\(100 follows 100 at row 3\).*give dt_s"):
+    with pytest.raises(ValueError, match=r"\(100 follows 100 at row 3; 2 repeat .*give dt_s"):
         ep.open_field(rounded)
     assert list(ep.open_field(rounded, dt_s=0.1)["x"].values) == [1, 2, 0, 3, 1]
 
@@ -357,3 +361,74 @@ def test_a_folder_says_the_way(tmp_path: Path, files: list[str], said: str) -> N
         (tmp_path / "runs" / name).write_text("t,x\n0,1\n")
     with pytest.raises(ValueError, match=said):
         ep.inspect_file(tmp_path / "runs")
+
+
+def test_times_rounded_to_few_digits_are_equal_steps_and_said(tmp_path: Path) -> None:
+    t = 99.0 + 0.35 * np.arange(NT)
+    path = tmp_path / "a.csv"
+    rows = [f"{a:.2E},{b:.4f}" for a, b in zip(t, WAVE[:, 0, 0], strict=True)]
+    path.write_text("time (ms),x\n" + "\n".join(rows))
+    assert "were rounded to 3 digits, so that some repeat" in " ".join(
+        ep.inspect_file(path).notes()
+    )
+    steps = np.diff(ep.open_field(path)["time"].values)
+    np.testing.assert_allclose(steps, 0.35e-3, rtol=0.05)
+    assert np.ptp(steps) < 1e-12
+
+
+def test_a_sample_that_stands_twice_is_no_rounding(tmp_path: Path) -> None:
+    t = np.r_[np.arange(20.0), 19.0, np.arange(20.0, 40.0)]
+    path = write_csv(tmp_path / "a.csv", t_s=t, x=np.sin(t))
+    with pytest.raises(
+        ValueError, match=r"19 follows 19 at row 21; 1 repeat the one before, 0 run"
+    ):
+        ep.open_field(path)
+
+
+@pytest.mark.parametrize("mark", [9.91e37, 9.9e37, 1e30, -999.0, -9999.0, 32767.0])
+def test_marks_of_overload_that_repeat_are_missing_samples_and_said(
+    tmp_path: Path, mark: float
+) -> None:
+    x = WAVE[:, 0, 0].copy()
+    x[[3, 9]] = mark
+    path = write_csv(tmp_path / "a.csv", t_s=T, x=x)
+    found = ep.inspect_file(path)
+    assert found.found.held[1].n_missing == 2
+    assert "'x': 2 samples are marks of an overload or of absence, and left out" in found.notes()
+    assert np.isnan(ep.open_field(path)["x"].values[[3, 9]]).all()
+    (run,) = trajectories_of(pd.read_csv(path))
+    assert run.n_samples == NT - 2
+
+
+def test_a_number_that_looks_like_a_mark_stays_among_its_like(tmp_path: Path) -> None:
+    x = np.where(np.arange(NT) % 2, 32767.0, 32000.0 * np.sin(np.arange(NT)))
+    path = write_csv(tmp_path / "a.csv", t_s=T, x=x)
+    np.testing.assert_array_equal(ep.open_field(path)["x"].values, x)
+
+
+def test_a_long_table_is_refused_by_name(tmp_path: Path) -> None:
+    t, z = np.repeat(T, NZ), np.tile(Z, NT)
+    path = write_csv(tmp_path / "a.csv", t_s=t, z=z, x=WAVE[:, :, 0].ravel())
+    with pytest.raises(ValueError, match="the table is long: 'z' runs through 7 values and starts"):
+        ep.open_field(path)
+
+
+@pytest.mark.parametrize("first", [0, 1, 22])
+def test_what_counts_samples_is_no_time(tmp_path: Path, first: int) -> None:
+    for name in ("cycle", "n"):
+        path = write_csv(tmp_path / "a.csv", **{name: first + np.arange(NT)}, x=WAVE[:, 0, 0])
+        with pytest.raises(ValueError, match="a field needs time: give the step between samples"):
+            ep.open_field(path)
+        field = ep.open_field(path, dt_s=2e-6)
+        assert field["time"].values[1] == 2e-6
+
+
+def test_one_bad_column_does_not_take_the_rest(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t_s,x,y\n0,1,2\n1,0,1\n2,2,oops\n3,5,1\n")
+    assert list(ep.open_field(tmp_path / "a.csv").data_vars) == ["x"]
+    assert "row 3 holds 'oops'" in " ".join(ep.inspect_file(tmp_path / "a.csv").notes())
+
+
+def test_a_capital_t_is_a_name_like_any_other(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "a.csv", t_s=T, T=WAVE[:, 0, 0])
+    assert list(ep.open_field(path).data_vars) == ["T"]

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ep2sindy.data.conversion import counted_in
-from ep2sindy.data.mapping import read_array
+from ep2sindy.data.mapping import N_MARKS, read_array
+from ep2sindy.data.numbers import digits_of_rounded, even_grid
 from ep2sindy.data.readers.source import FileSource
 from ep2sindy.data.readers.table_layout import unit_in_brackets
 
@@ -20,11 +21,14 @@ TEXT = "text or objects"  # problem of arrays that are not numbers
 class ArrayInfo:
     """Summary of one array in a file: shape, unit, range, missing values, spacing.
 
-    unit: "" if the file states none. low, high:
-    range of the finite values. n_missing: number of NaN or infinite values. step: median step of
-    an increasing vector, else None. even: True if the steps are equal. gap: where steps that are
-    otherwise even leave out samples, in words. falls: where a vector first does not
-    increase, in words. problem: reason why the array cannot be used, or "".
+    unit: "" if the file states none. low, high: range of the finite values. n_missing: number of
+    NaN or infinite values. n_marks: of these, marks of overload or absence. step: median step of an
+    increasing vector, else None. even: True if the steps are equal. digits: to how many the times
+    of equal steps were rounded, so that some repeat, else None. gap: where steps that are otherwise
+    even leave out samples, in words. falls: where and how often a vector does not increase, in
+    words. period: number of values through which a vector runs before it starts anew; block: number
+    of samples for which each value stays; 0 for other vectors. problem: reason why the array cannot
+    be used, or "".
     """
 
     name: str
@@ -35,10 +39,14 @@ class ArrayInfo:
     low: float = np.nan
     high: float = np.nan
     n_missing: int = 0
+    n_marks: int = 0
     step: float | None = None
     even: bool = False
+    digits: int | None = None
     gap: str = ""
     falls: str = ""
+    period: int = 0
+    block: int = 0
     problem: str = ""
 
     @property
@@ -63,17 +71,22 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     attribute = str(array.attrs.get("units", "") or source.units.get(name, ""))
     stated = counted_in(attribute) or unit_in_brackets(name)
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
-    is_vector = values.size in values.shape
-    steps = _steps(values.ravel()) if is_vector else np.empty(0)
+    points = values.ravel() if values.size in values.shape else np.empty(0)
+    digits = digits_of_rounded(points)
+    steps = _steps(points if digits is None else even_grid(points))
     return ArrayInfo(
         name, values.shape, str(array.dtype), stated, dims,
         float(finite.min()) if finite.size else np.nan,
         float(finite.max()) if finite.size else np.nan,
         int(values.size - finite.size),
+        int(array.attrs.get(N_MARKS, 0)),
         float(np.median(steps)) if steps.size else None,
         bool(steps.size and np.ptp(steps) <= 1e-3 * steps.mean()),
+        digits,
         _gap(steps),
-        _fall(values.ravel()) if is_vector else "",
+        "" if steps.size else _fall(points),
+        _period(points),
+        _block(points),
     )  # fmt: skip
 
 
@@ -82,12 +95,34 @@ def _short(text: str) -> str:
 
 
 def _fall(points: np.ndarray) -> str:
-    """Where points first do not increase, in words; empty if they do."""
-    falls = np.flatnonzero(np.diff(points) <= 0.0)
+    """Where points first do not increase, and how often, in words; empty if they do."""
+    steps = np.diff(points)
+    falls = np.flatnonzero(steps <= 0.0)
     if not falls.size:
         return ""
-    k = int(falls[0])
-    return f"{points[k + 1]:.9g} follows {points[k]:.9g} at row {k + 2}"
+    k, n_repeats = int(falls[0]), int((steps == 0.0).sum())
+    first = f"{points[k + 1]:.9g} follows {points[k]:.9g} at row {k + 2}"
+    return f"{first}; {n_repeats} repeat the one before, {falls.size - n_repeats} run back"
+
+
+def _period(points: np.ndarray) -> int:
+    """Number of increasing values through which points run before they start anew; 0 for others."""
+    falls = np.flatnonzero(np.diff(points) < 0.0)
+    n = int(falls[0]) + 1 if falls.size else 0
+    is_tiled = (
+        n > 1
+        and points.size % n == 0
+        and np.array_equal(points, np.resize(points[:n], points.size))
+    )
+    return n if is_tiled and (np.diff(points[:n]) > 0.0).all() else 0
+
+
+def _block(points: np.ndarray) -> int:
+    """Number of samples for which each value stays; 0 if not all stay for as many."""
+    changes = np.flatnonzero(np.diff(points))
+    n = int(changes[0]) + 1 if changes.size else 0
+    is_even = n > 1 and points.size % n == 0
+    return n if is_even and np.array_equal(points, np.repeat(points[::n], n)) else 0
 
 
 def _steps(points: np.ndarray) -> np.ndarray:

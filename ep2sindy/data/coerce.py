@@ -18,7 +18,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.export import CLOCK
-from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
+from ep2sindy.data.gaps import (
+    MissingSamples,
+    describe_gaps,
+    describe_missing,
+    present_rows,
+    without_marks,
+)
 from ep2sindy.data.numbers import check_nonnegative, count_dates, real_numbers, seconds
 from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
 from ep2sindy.library.library import Library
@@ -150,7 +156,8 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
     if wrong:
         way_out = "give time in s, as numbers or dates" if times[0] in wrong else "drop them"
         raise ValueError(f"columns of a table must hold real numbers: {wrong} came; {way_out}")
-    values = table[states].to_numpy(dtype=np.float64)
+    columns = [without_marks(table[name].to_numpy(dtype=np.float64)) for name in states]
+    values = np.column_stack(columns) if columns else np.empty((len(table), 0))
     t, clock = _elapsed(table[times[0]])
     absent = np.isnan(values)
     if not absent.any():

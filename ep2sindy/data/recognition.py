@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import count
+from itertools import count, product
 from math import isclose
 from shlex import quote
 
@@ -103,9 +103,7 @@ def recognise(
     problems.check(source)
     held = [describe_array(source, name) for name in source.names]
     usable = [each for each in held if not each.problem]
-    questions = [
-        f"{e.name!r} is left out: {e.problem}" for e in held if e.problem not in ("", TEXT)
-    ]
+    questions = _notes(held)
     axes = _axes(source, usable, named, questions)
     if dt_s is None:
         dt_s = _step_s(source, axes, usable, questions)
@@ -157,6 +155,17 @@ def _complete(
     return {axis: found[axis] for axis in axes}, {name: found[name] for name in variables}, no_unit
 
 
+def _notes(held: Sequence[ArrayInfo]) -> list[str]:
+    """Which arrays cannot be read, and which samples count as missing."""
+    bad = [f"{e.name!r} is left out: {e.problem}" for e in held if e.problem not in ("", TEXT)]
+    marked = [
+        f"{e.name!r}: {e.n_marks} samples are marks of an overload or of absence, and left out"
+        for e in held
+        if e.n_marks
+    ]
+    return bad + marked
+
+
 def _no_time(source: FileSource, held: Sequence[ArrayInfo]) -> str:
     """The question for the time of a file that says none."""
     text = f"a field needs time: give the step between samples, {STEP} in s"
@@ -165,6 +174,13 @@ def _no_time(source: FileSource, held: Sequence[ArrayInfo]) -> str:
             f"a field needs time: give the time of one step, of those numbered {source.steps[0]} "
             f"to {source.steps[-1]}, {STEP} in s"
         )
+    for inner, outer in product(held, held) if source.is_table else ():
+        if inner.period and inner.period == outer.block:
+            return (
+                f"the table is long: {inner.name!r} runs through {inner.period} values and starts "
+                f"anew at each {outer.name!r}; make a field of it in Python, table.set_index("
+                f"['{outer.name}', '{inner.name}']).to_xarray().to_netcdf('field.nc')"
+            )
     rising = [each.name for each in held if each.step is not None and not each.is_counter]
     if not source.is_table or not rising or is_counter_name(rising[0]):
         return text
@@ -196,8 +212,8 @@ def _axis(axis: str, held: Sequence[ArrayInfo], questions: list[str]) -> ArrayIn
     if axis == "time" and not options:
         options = [e for e in rising if converts(axis, e.unit)]
         questions += [] if options else [
-            f"{each.name!r} does not increase ({each.falls}): sort the rows, drop what repeats, or "
-            "give dt_s if the steps are equal and the times rounded"
+            f"{each.name!r} does not increase ({each.falls}): sort the rows and drop what repeats, "
+            "or give dt_s if no sample is one too many and the steps are equal"
             for each in named
             if each.falls
         ]  # fmt: skip
@@ -238,7 +254,11 @@ def _step_s(
     said_s = source.step_s or _stated_step_s(held)
     if time is not None or said_s is None:
         one = _of(held, time.name) if time is not None else None
-        return said_s if one is not None and one.is_counter else None
+        if time is None or one is None or said_s is None:
+            return None
+        usual_s = (one.step or 0.0) * conversion("time", time.unit or "s")[0]
+        is_rounded = one.digits is not None and isclose(usual_s, said_s, rel_tol=0.2)
+        return said_s if one.is_counter or is_rounded else None
     for each in held:
         if not (each.falls and axis_of(each.name) == "time"):
             continue
@@ -258,6 +278,11 @@ def _compare_step(
 ) -> None:
     """Note times that the step in the file's preamble contradicts, or that leave out samples."""
     said = "" if step_s is None else f", and the file says steps of {step_s:.6g} s beside them"
+    if one.digits is not None:
+        questions.append(
+            f"the times of {one.name!r} were rounded to {one.digits} digits, so that some repeat: "
+            "equal steps are taken"
+        )
     if one.gap:
         unit = f", in {time.unit}" if time.unit else ""
         questions.append(
