@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
-from ep2sindy.data.fields import COORDINATE_UNITS
 from ep2sindy.library.units import (
     PLAIN,
     check_unit,
@@ -18,6 +16,11 @@ from ep2sindy.library.units import (
     unit_errors,
     unit_product,
 )
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+COORDINATE_UNITS = {"time": "s", "z": "m", "r": "m"}
 
 # Units of our usual names. A unit of another dimension is a mistake in the mapping.
 KNOWN_UNITS = {

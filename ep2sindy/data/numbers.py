@@ -98,10 +98,13 @@ def digits_of_rounded(t: Float[np.ndarray, " samples"]) -> int | None:
     """Number of digits to which times of equal steps were rounded so that some repeat; or None.
 
     Each time must lie on the even grid within one unit of its last digit, and the steps must be
-    shorter than that: a row that was written twice makes no rounded times.
+    shorter than that: a row that was written twice makes no rounded times. Nor do fewer than five
+    different times.
     """
+    if len(t) < 8 or not np.isfinite(t).all():
+        return None
     steps = np.diff(t)
-    if len(t) < 8 or not np.isfinite(t).all() or (steps < 0).any() or (steps > 0).all():
+    if (steps < 0).any() or (steps > 0).all() or np.count_nonzero(steps) < 4:
         return None
     grid = np.linspace(t[0], t[-1], len(t))
     for digits in range(1, 7):

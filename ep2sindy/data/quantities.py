@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
-from ep2sindy.data.conversion import KNOWN_UNITS, converts
-from ep2sindy.data.fields import COORDINATE_UNITS
-from ep2sindy.library.units import time_unit_in
+from ep2sindy.data.conversion import (
+    COORDINATE_UNITS,
+    KNOWN_UNITS,
+    SUFFIX_UNITS,
+    conversion,
+    converts,
+)
+from ep2sindy.data.gaps import without_marks
+from ep2sindy.data.readers.table_layout import split_name
+from ep2sindy.library.units import is_count, time_unit_in
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 STEP_DOUBT = "step_doubt"  # attribute of a field: how dt_s contradicts the file's own times
 
@@ -198,3 +210,39 @@ def quantity_of(name: str, stated: str, *, plasma: bool) -> tuple[str, str] | No
         fits = converts(ours, unit, is_variable=True) if unit else is_full or plasma
         return (ours, unit) if fits else None
     return None
+
+
+def own_unit(ours: str, stated: str) -> str:
+    """Unit that a file states, or that the suffix of a name promises, if it converts; else "1".
+
+    A count of named things that the file states, such as `animals/ml`, stays as it is.
+    """
+    if is_count(stated):
+        return stated
+    suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
+    options = (stated, *suffixes)
+    return next((unit for unit in options if converts(ours, unit, is_variable=True)), "1")
+
+
+def columns_in_si(
+    table: pd.DataFrame,
+) -> tuple[Float[np.ndarray, "rows states"], dict[str, str]]:
+    """Samples of a table's columns by the units in their names, and state -> unit."""
+    values = np.empty(table.shape)
+    units: dict[str, str] = {}
+    for k, label in enumerate(table.columns):
+        name, stated = split_name(label)
+        name, unit = quantity_of(name, stated, plasma=False) or (name, own_unit(name, stated))
+        units[name] = unit or "1"
+        values[:, k] = without_marks(table[label].to_numpy(dtype=np.float64))
+        if not is_count(units[name]):
+            factor, zero, units[name] = conversion(name, units[name], is_variable=True)
+            values[:, k] = factor * values[:, k] + zero
+    return values, units
+
+
+def time_unit(name: object) -> str | None:
+    """Unit of a column of times that is called so, seconds by default; None for another column."""
+    if not isinstance(name, str) or axis_of(name) != "time":
+        return None
+    return axis_unit("time", name, split_name(name)[1]) or "s"

@@ -17,9 +17,9 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.arrays import TEXT, ArrayInfo, describe_array
-from ep2sindy.data.conversion import SUFFIX_UNITS, conversion, converts
+from ep2sindy.data.conversion import COORDINATE_UNITS, conversion, converts
 from ep2sindy.data.dimensions import fitting, time_length
-from ep2sindy.data.fields import COORDINATE_UNITS, DIMS
+from ep2sindy.data.fields import DIMS
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file
 from ep2sindy.data.quantities import (
     QUANTITIES,
@@ -27,11 +27,11 @@ from ep2sindy.data.quantities import (
     axis_unit,
     is_counter_name,
     last_of,
+    own_unit,
     quantity_of,
     step_said,
 )
 from ep2sindy.data.readers.source import FileSource
-from ep2sindy.library.units import is_count
 
 MAX_COLUMNS = 32  # an array of at most so many columns is split into separate signals
 
@@ -370,7 +370,7 @@ def _variables(
     for each in fit:
         if each.name not in named:
             ours = _own_name(each.name, used)
-            found[ours] = Variable(each.name, own_unit(ours, each))
+            found[ours] = Variable(each.name, own_unit(ours, each.unit))
             used.add(ours)
     for each in rest:
         parts = _columns(each, lengths, used)
@@ -437,7 +437,7 @@ def _columns(one: ArrayInfo, lengths: Mapping[str, int], taken: set[str]) -> dic
     for k in range(min(one.shape)):
         part = f"[:, {k}]" if samples_first else f"[{k}, :]"
         ours = _own_name(f"{one.name}_{k}", taken)
-        found[ours] = Variable(one.name + part, own_unit(ours, one))
+        found[ours] = Variable(one.name + part, own_unit(ours, one.unit))
     return found
 
 
@@ -448,15 +448,3 @@ def _own_name(name: str, taken: set[str]) -> str:
     ours = f"column_{ours}" if not ours or ours[0].isdigit() else ours
     numbers = (f"{ours}_{k}" for k in count(2))
     return ours if ours not in taken else next(name for name in numbers if name not in taken)
-
-
-def own_unit(ours: str, one: ArrayInfo) -> str:
-    """Unit that the file states, or that the suffix of a name promises, if it converts; else "1".
-
-    A count of named things that the file states, such as `animals/ml`, stays as it is.
-    """
-    if is_count(one.unit):
-        return one.unit
-    suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
-    options = (one.unit, *suffixes)
-    return next((unit for unit in options if converts(ours, unit, is_variable=True)), "1")

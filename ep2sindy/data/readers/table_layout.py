@@ -244,7 +244,7 @@ class Line:
 
     @property
     def begins_with_time(self) -> bool:
-        return bool(self.cells) and _split_name(self.cells[0])[0].lower() in TIMES
+        return bool(self.cells) and split_name(self.cells[0])[0].lower() in TIMES
 
 
 def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
@@ -310,7 +310,7 @@ def _units_said(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, ..
 
 def split_names(names: Sequence[str], units: Sequence[str] = ()) -> Header:
     """Header of columns whose names may hold units, as `Time (s)`; units: those said elsewhere."""
-    parted = [_split_name(name) for name in names]
+    parted = [split_name(name) for name in names]
     units = units if any(units) else [unit for _, unit in parted]
     return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)))
 
@@ -349,19 +349,19 @@ def _step_s(above: Sequence[Sequence[str]]) -> float | None:
     return None
 
 
-def _split_name(name: str) -> tuple[str, str]:
+def split_name(name: str) -> tuple[str, str]:
     """Split a name and its unit; a text in brackets that is not a unit stays in the name."""
     for pattern in WITH_UNIT:
         found = pattern.fullmatch(name)
         if found and unit_like(_plain(found[2])):
-            return found[1].strip(), found[2].strip()
+            return found[1].strip(), _plain(found[2])
     found = WITH_UNIT[0].fullmatch(name)
     return (found[1].strip(), found[2].strip()) if found and is_count(found[2]) else (name, "")
 
 
 def unit_in_brackets(name: str) -> str:
     """Unit at the end of a name, as in `Time (ms)` or `I_d [mA]`; "" if no unit stands there."""
-    return _plain(_split_name(name)[1]) if WITH_UNIT[0].fullmatch(name) else ""
+    return split_name(name)[1] if WITH_UNIT[0].fullmatch(name) else ""
 
 
 def _plain(unit: str) -> str:
