@@ -201,5 +201,5 @@ CSV = Reader(
     "text",
     read_csv,
     form="other",
-    endings=(".csv", ".tsv", ".txt", ".dat", ".asc", ".prn"),
+    endings=(".csv", ".tsv", ".txt", ".dat", ".asc", ".prn", ".lvm"),
 )

@@ -13,7 +13,7 @@ from ep2sindy.data.readers.hdf5 import HDF5
 from ep2sindy.data.readers.matlab import MATLAB, NPZ
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_at
-from ep2sindy.data.readers.tables import EXCEL, PARQUET
+from ep2sindy.data.readers.tables import EXCEL, NPY, PARQUET
 from ep2sindy.data.readers.tdms import TDMS
 from ep2sindy.data.readers.zarr import ZARR
 from ep2sindy.runtime.screen import joined
@@ -21,7 +21,7 @@ from ep2sindy.trust.guard import look_through_first
 from ep2sindy.trust.limits import check_kind
 
 # The order does not matter, since no two readers claim a file equally strongly.
-READERS = (NETCDF, HDF5, MATLAB, NPZ, EXCEL, PARQUET, TDMS, CSV, HALLTHRUSTER, ZARR)
+READERS = (NETCDF, HDF5, MATLAB, NPZ, NPY, EXCEL, PARQUET, TDMS, CSV, HALLTHRUSTER, ZARR)
 
 # First bytes of files other than HDF5 that C libraries parse: MATLAB up to v7, classic NetCDF with
 # 64-bit sizes, Parquet. A damaged one may crash the process.
