@@ -412,7 +412,10 @@ def test_hdf5_is_recognised_as_its_own_library_does(tmp_path: Path, name: str) -
     assert (look_at(tmp_path / name).form == "hdf5") is is_hdf5
 
 
-KNOWN = r"NetCDF, HDF5, MATLAB \(v5, v7.3\), npz, npy, Excel, Parquet or TDMS, or end in .csv, .* or .zarr: "
+KNOWN = (
+    r"NetCDF, HDF5, MATLAB \(v5, v7.3\), npz, npy, Excel, Parquet or TDMS, or end in .csv, .* or "
+    ".zarr: "
+)
 
 
 @pytest.mark.parametrize(
