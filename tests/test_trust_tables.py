@@ -5,7 +5,6 @@ import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -15,7 +14,6 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.app.compare import read_run
-from ep2sindy.data.readers import csv
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.readers.source import leaves
 from ep2sindy.library.library import named_terms
@@ -227,17 +225,6 @@ def test_null_spaces_of_hdf5_are_named(tmp_path: Path) -> None:
     assert "'/n' is empty: its dataspace is null" in held["n"].problem
     assert "_FillValue of 'y' must be a number: the attribute is empty" in held["y"].problem
     assert (held["x"].unit, held["x"].problem) == ("", "")
-
-
-def test_a_line_and_a_number_of_columns_are_counted_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(csv, "pd", SimpleNamespace())  # which would take the memory
-    path = tmp_path / "a.csv"
-    for text in ("1," * 10_000 + "1\n", "1 " * 10_001, "t,x\n0," + "1" * 10**6):
-        path.write_text(text)
-        with pytest.raises(ValueError, match="a table may have up to 10000 columns, in lines of"):
-            ep.inspect_file(path)
 
 
 def test_a_table_of_thousands_of_columns_is_read(tmp_path: Path) -> None:

@@ -26,9 +26,7 @@ class ArrayInfo:
     increasing vector, else None. even: True if the steps are equal. digits: to how many the times
     of equal steps were rounded, so that some repeat, else None. gap: where steps that are otherwise
     even leave out samples, in words. falls: where and how often a vector does not increase, in
-    words. period: number of values through which a vector runs before it starts anew; block: number
-    of samples for which each value stays; 0 for other vectors. problem: reason why the array cannot
-    be used, or "".
+    words. problem: reason why the array cannot be used, or "".
     """
 
     name: str
@@ -45,8 +43,6 @@ class ArrayInfo:
     digits: int | None = None
     gap: str = ""
     falls: str = ""
-    period: int = 0
-    block: int = 0
     problem: str = ""
 
     @property
@@ -73,7 +69,9 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
     points = values.ravel() if values.size in values.shape else np.empty(0)
     digits = digits_of_rounded(points)
-    steps = _steps(points if digits is None else even_grid(points))
+    steps = np.diff(points if digits is None else even_grid(points))
+    falls = _fall(points, steps)
+    steps = steps if steps.size > 1 and not falls else np.empty(0)
     return ArrayInfo(
         name, values.shape, str(array.dtype), stated, dims,
         float(finite.min()) if finite.size else np.nan,
@@ -84,9 +82,7 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
         bool(steps.size and np.ptp(steps) <= 1e-3 * steps.mean()),
         digits,
         _gap(steps),
-        "" if steps.size else _fall(points),
-        _period(points),
-        _block(points),
+        falls,
     )  # fmt: skip
 
 
@@ -94,41 +90,14 @@ def _short(text: str) -> str:
     return TEXT if "real numbers" in text else text
 
 
-def _fall(points: np.ndarray) -> str:
+def _fall(points: np.ndarray, steps: np.ndarray) -> str:
     """Where points first do not increase, and how often, in words; empty if they do."""
-    steps = np.diff(points)
-    falls = np.flatnonzero(steps <= 0.0)
+    falls = np.flatnonzero(~(steps > 0.0))
     if not falls.size:
         return ""
     k, n_repeats = int(falls[0]), int((steps == 0.0).sum())
     first = f"{points[k + 1]:.9g} follows {points[k]:.9g} at row {k + 2}"
     return f"{first}; {n_repeats} repeat the one before, {falls.size - n_repeats} run back"
-
-
-def _period(points: np.ndarray) -> int:
-    """Number of increasing values through which points run before they start anew; 0 for others."""
-    falls = np.flatnonzero(np.diff(points) < 0.0)
-    n = int(falls[0]) + 1 if falls.size else 0
-    is_tiled = (
-        n > 1
-        and points.size % n == 0
-        and np.array_equal(points, np.resize(points[:n], points.size))
-    )
-    return n if is_tiled and (np.diff(points[:n]) > 0.0).all() else 0
-
-
-def _block(points: np.ndarray) -> int:
-    """Number of samples for which each value stays; 0 if not all stay for as many."""
-    changes = np.flatnonzero(np.diff(points))
-    n = int(changes[0]) + 1 if changes.size else 0
-    is_even = n > 1 and points.size % n == 0
-    return n if is_even and np.array_equal(points, np.repeat(points[::n], n)) else 0
-
-
-def _steps(points: np.ndarray) -> np.ndarray:
-    """Steps of points that increase throughout; empty for others, and for fewer than three."""
-    steps = np.diff(points)
-    return steps if len(steps) > 1 and (steps > 0).all() else np.empty(0)
 
 
 def _gap(steps: np.ndarray) -> str:

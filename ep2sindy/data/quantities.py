@@ -217,7 +217,7 @@ def own_unit(ours: str, stated: str) -> str:
 
     A count of named things that the file states, such as `animals/ml`, stays as it is.
     """
-    if is_count(stated):
+    if stated and is_count(stated):
         return stated
     suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
     options = (stated, *suffixes)

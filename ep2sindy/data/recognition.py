@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import count, product
+from itertools import count, permutations
 from math import isclose
 from shlex import quote
 
@@ -98,9 +98,7 @@ def recognise(
     states none. plasma: names such as Te mean quantities without a unit, and what has no unit is
     in SI.
     """
-    problems = Problems()
-    named = in_file(given or {}, problems)
-    problems.check(source)
+    named = _named(given, source) if given and any(given.values()) else {}
     held = [describe_array(source, name) for name in source.names]
     usable = [each for each in held if not each.problem]
     questions = _notes(held)
@@ -111,7 +109,9 @@ def recognise(
     taken = {v.name for v in (*axes.values(), replaced) if v is not None}
     rest = [e for e in usable if e.name not in taken and axis_of(e.name) != "time"]
     if "time" in axes and (one := _of(held, axes["time"].name)):
-        axes["time"] = _unit_by_step(axes["time"], one, source.step_s or _stated_step_s(usable))
+        said_s = source.step_s or _stated_step_s(usable)
+        if not axes["time"].unit and said_s:
+            axes["time"] = _unit_by_step(axes["time"], one, said_s)
         _compare_step(axes["time"], one, source.step_s, questions)
     lengths = _lengths(axes, held, source, rest, questions)
     variables = _variables(rest, axes, held, lengths, questions, plasma=plasma)
@@ -123,6 +123,14 @@ def recognise(
     return Recognised(
         held, variables, axes, dt_s, no_time, no_unit, questions, lengths.get("time"), times
     )
+
+
+def _named(given: Mapping[str, Variable | Keys | None], source: FileSource) -> dict[str, Variable]:
+    """The coordinates that the user named; raises ValueError if keys are wrong."""
+    problems = Problems()
+    named = in_file(given, problems)
+    problems.check(source)
+    return named
 
 
 def _of(held: Sequence[ArrayInfo], name: str | None) -> ArrayInfo | None:
@@ -174,17 +182,30 @@ def _no_time(source: FileSource, held: Sequence[ArrayInfo]) -> str:
             f"a field needs time: give the time of one step, of those numbered {source.steps[0]} "
             f"to {source.steps[-1]}, {STEP} in s"
         )
-    for inner, outer in product(held, held) if source.is_table else ():
-        if inner.period and inner.period == outer.block:
-            return (
-                f"the table is long: {inner.name!r} runs through {inner.period} values and starts "
-                f"anew at each {outer.name!r}; make a field of it in Python, table.set_index("
-                f"['{outer.name}', '{inner.name}']).to_xarray().to_netcdf('field.nc')"
-            )
+    if source.is_table and (long := _long_table(source, held)):
+        return long
     rising = [each.name for each in held if each.step is not None and not each.is_counter]
     if not source.is_table or not rising or is_counter_name(rising[0]):
         return text
     return f"{text}, or, if {rising[0]!r} is time, 'data.time={{name:{rising[0]},unit:UNIT}}'"
+
+
+def _long_table(source: FileSource, held: Sequence[ArrayInfo]) -> str:
+    """That a column runs through its values and starts anew at each value of another, in words."""
+    columns = {each.name: source.read(each.name).values for each in held if each.falls}
+    for inner, outer in permutations(columns, 2):
+        starts = np.flatnonzero(np.diff(columns[outer])) + 1
+        n = int(starts[0]) if starts.size else 0
+        blocks, runs = (np.split(columns[name], range(n, len(columns[name]), n or 1))
+                        for name in (outer, inner))  # fmt: skip
+        stays = n > 1 and all(np.ptp(block) == 0.0 for block in blocks)
+        if stays and all(np.array_equal(run, runs[0]) for run in runs):
+            return (
+                f"the table is long: {inner!r} runs through {n} values and starts anew at each "
+                f"{outer!r}; make a field of it in Python, table.set_index(['{outer}', '{inner}'])"
+                ".to_xarray().to_netcdf('field.nc')"
+            )
+    return ""
 
 
 # Time, z and r.
@@ -229,12 +250,10 @@ def _in_units(time: Variable) -> list[Variable]:
     return [replace(time, unit=unit) for unit in ([time.unit] if time.unit else UNITS_OF_TIME)]
 
 
-def _unit_by_step(time: Variable, one: ArrayInfo, said_s: float | None) -> Variable:
+def _unit_by_step(time: Variable, one: ArrayInfo, said_s: float) -> Variable:
     """Times without a unit, in that in which their step is the one that the file says beside."""
-    if time.unit or not said_s or one.step is None:
-        return time
-    factors = {unit: conversion("time", unit)[0] for unit in UNITS_OF_TIME}
-    fit = [unit for unit, f in factors.items() if isclose(one.step * f, said_s, rel_tol=1e-3)]
+    steps = {unit: (one.step or 0.0) * conversion("time", unit)[0] for unit in UNITS_OF_TIME}
+    fit = [unit for unit, step in steps.items() if isclose(step, said_s, rel_tol=1e-3)]
     return replace(time, unit=fit[0]) if fit else time
 
 
@@ -319,6 +338,8 @@ def _lengths(
     questions: list[str],
 ) -> dict[str, int]:
     """Number of points of each axis; without a time array, samples are counted from the others."""
+    if source.is_table:
+        return {"time": max((e.shape[0] for e in (*rest, *held) if e.shape), default=0)}
     found = {axis: one.shape for axis, v in axes.items() if (one := _of(held, v.name))}
     lengths = {axis: int(np.prod(shape)) for axis, shape in found.items()}
     if "time" in axes or not rest:
@@ -373,7 +394,7 @@ def _variables(
             found[ours] = Variable(each.name, own_unit(ours, each.unit))
             used.add(ours)
     for each in rest:
-        parts = _columns(each, lengths, used)
+        parts = _columns(each, lengths, used) if len(each.lengths) > 1 else {}
         found |= parts
         used |= parts.keys()
     return found
@@ -405,6 +426,8 @@ def _fits(
     """
     if not one.lengths or one.low != one.low:
         return False
+    if lengths == {"time": one.shape[0]} and len(one.shape) == 1:
+        return True
     known = {_dim(variable, held, axis) for axis, variable in axes.items()}
     if one.dims and set(one.dims) <= known:
         return True
@@ -430,7 +453,7 @@ def _has_columns(one: ArrayInfo, lengths: Mapping[str, int]) -> bool:
 
 def _columns(one: ArrayInfo, lengths: Mapping[str, int], taken: set[str]) -> dict[str, Variable]:
     """Separate variables for the signals of an array that holds several side by side."""
-    if fitting(one.shape, lengths) or not _has_columns(one, lengths) or len(one.lengths) < 2:
+    if fitting(one.shape, lengths) or not _has_columns(one, lengths):
         return {}
     samples_first = one.shape[0] == lengths["time"]
     found = {}

@@ -97,9 +97,11 @@ def files_of(path: object) -> list[str]:
 
 def join_groups(source: FileSource) -> FileSource:
     """Join the groups of steps of a file along time; a file without such groups stays as it is."""
+    if source.is_table:
+        return source
     groups = step_groups(source.names)
     least = 2 if groups.words - {""} else LEAST_UNNAMED
-    if len(groups.numbers) < least or source.is_table or _has_times(source, groups):
+    if len(groups.numbers) < least or _has_times(source, groups):
         return source
     inside = {name for places in groups.arrays.values() for name in places.values()}
     shared = {name: (source, name) for name in source.names if name not in inside}
@@ -151,7 +153,7 @@ def are_steps(files: Sequence[str]) -> bool:
 
     A file without times is a step if its arrays have no axis besides those of z and r.
     """
-    if len(_numbers(files)) < len(files) or len(files) < 2:
+    if len(files) < 2 or len(_numbers(files)) < len(files):
         return False
     source = open_source(Path(files[0]))
     if source.is_table or source.step_s is not None or len(step_groups(source.names).numbers) > 1:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import re
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import TextIO
 
@@ -19,16 +20,11 @@ from ep2sindy.data.readers.table_layout import (
     GROUPED,
     MISSING,
     PARTED,
-    SEPARATORS,
     Layout,
     layout_of,
 )
 
-# Lines and characters examined to find the layout; no known preamble is longer.
-N_LOOKED_AT, CHARACTERS_LOOKED_AT = 2000, 10_000_000
-
-# Limits on what is passed to pandas, which needs hundreds of bytes for every column.
-LONGEST_LINE, MAX_COLUMNS = 1_000_000, 10_000
+N_LOOKED_AT = 2000  # lines examined to find the layout; no known preamble is longer
 
 # Times of day; dates of ISO 8601, perhaps with one; and dates that may be read in two ways.
 CLOCK = r"\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?\s?(?:[AaPp][Mm])?"
@@ -53,12 +49,13 @@ def read_csv(path: Path) -> FileSource:
 
 def text_source(path: Path, file: TextIO) -> FileSource:
     """Source of the table in a text, from its beginning; path: the file that the text is from."""
-    layout = layout_of(_first_lines(file))
+    layout = layout_of(list(islice(file, N_LOOKED_AT)))
     file.seek(0)
     frame = _frame(file, layout)
     header = layout.header
     columns = [j for j in range(frame.shape[1]) if j in layout.columns or _holds_numbers(frame[j])]
-    dates = _dates(frame, [j for j in range(frame.shape[1]) if j not in columns])
+    others = [j for j in range(frame.shape[1]) if j not in columns]
+    dates = _dates(frame, others) if others else {}
     kept = sorted({*columns, *dates})
     names = {header.names[j]: j for j in kept}
     places = {str(j): j for j in kept} | names
@@ -113,27 +110,6 @@ def _dates(frame: pd.DataFrame, others: Sequence[int]) -> dict[int, pd.Series]:
             frame.index
         )
     return found
-
-
-def _first_lines(file: TextIO) -> list[str]:
-    """Read the first lines; raise ValueError if one is too long or has too many cells."""
-    lines: list[str] = []
-    n_characters = 0
-    while len(lines) < N_LOOKED_AT and n_characters < CHARACTERS_LOOKED_AT:
-        line = file.readline(LONGEST_LINE + 1)
-        if not line:
-            break
-        lines.append(line)
-        n_characters += len(line)
-        n_cells = max(len(line.split(sign)) for sign in SEPARATORS)
-        if n_cells > MAX_COLUMNS or len(line) > LONGEST_LINE:
-            raise ValueError(
-                f"a table may have up to {MAX_COLUMNS} columns, in lines of up to "
-                f"{LONGEST_LINE} characters: line {len(lines)} has {n_cells} cells in its "
-                f"first {len(line)} characters; write one sample per line, and large arrays "
-                "as npz, HDF5 or NetCDF"
-            )
-    return lines
 
 
 def _encoding(path: Path) -> str:

@@ -76,13 +76,14 @@ def layout_of(lines: Sequence[str]) -> Layout:
         raise ValueError("it holds no rows of numbers")
     table = tables[separator]
     numbers = [row[j] for row in table for j in columns if j < len(row)]
-    decimal = _decimal(numbers, separator, decimal)
-    columns = _rate(filled[separator], decimal)[2]
+    if any("," in cell for cell in numbers):
+        decimal = _decimal(numbers, separator, decimal)
+        columns = _rate(filled[separator], decimal)[2]
     first = _first_row(table, lines, columns, decimal)
     below = [row for row in table[first:] if row]
     columns = _numeric(below, decimal)
     above = [
-        Line(k + 1, _split([without_mark(line)], separator)[0], is_comment(line))
+        Line(k + 1, _split([line.lstrip("#%!/ ").strip("\r\n ")], separator)[0], is_comment(line))
         for k, line in enumerate(lines[:first])
         if line.strip() and not RULE.fullmatch(line.strip("\r\n "))
     ]
@@ -113,11 +114,6 @@ def _split(lines: Sequence[str], separator: str | None) -> list[list[str]]:
 
 def is_comment(line: str) -> bool:
     return line.lstrip().startswith(COMMENTS)
-
-
-def without_mark(line: str) -> str:
-    """Remove the comment mark from a line: many programs write their header as a comment."""
-    return line.strip().lstrip("#%!/").strip() if is_comment(line) else line
 
 
 def _rate(table: Sequence[Sequence[str]], decimal: str) -> tuple[float, int, tuple[int, ...]]:
@@ -255,11 +251,11 @@ def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
     Raises ValueError if it does not, or if the last line could be a row with a word in it.
     """
     cells = [line.cells for line in above]
-    step_s = _step_s(cells)
+    step_s = _step_s(cells) if len(cells) > 1 else None
     numbered = Header(tuple(map(str, range(n_columns))), ("",) * n_columns, step_s)
     if not above:
         return numbered
-    if (counted := _rigol_header(cells, n_columns)) is not None:
+    if len(cells) > 1 and (counted := _rigol_header(cells, n_columns)) is not None:
         return counted
     has_units = len(above) > 1 and _are_units(cells[-1], cells[-2])
     names, units = (cells[-2], cells[-1]) if has_units else (cells[-1], [])
