@@ -67,7 +67,9 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     say("\n".join(found[0].lines(experiments(found[0]))) + "\n")
     if len(found) > 1:
         say("\n".join(compare_files(found[0], found[1:])) + "\n")
-    pattern = propose_pattern([path for path in paths if isinstance(path, str)])
+    pattern = None
+    if len(paths) > 1:
+        pattern = propose_pattern([path for path in paths if isinstance(path, str)])
     if pattern:
         say("\n".join(point_lines(pattern)))
     name = given.write or _word_for(found[0].path)
@@ -157,7 +159,7 @@ def record_commands(found: Inspection, data: list[str], *, are_several: bool) ->
     lines = []
     if not found.lacking(NEEDS["breathing"]):
         lines.append(["+exp=breathing", *data, *channel(found), *preparation(found)])
-    traces = [n for n, v in found.variables.items() if found.is_trace(v)]
+    traces = found.traces
     if traces and not are_several:
         signal = "I_d" if "I_d" in traces else traces[0]
         lines.append(["+exp=trace", *data, f"signal={signal}"])
@@ -170,7 +172,7 @@ def record_commands(found: Inspection, data: list[str], *, are_several: bool) ->
 
 def channel(found: Inspection) -> list[str]:
     """The setting of the channel's length, if a zone of it needs one that the file lacks."""
-    return [] if found.z is None or found.channel_m else ["data.channel_m=LENGTH"]
+    return [] if found.z is None or found.source.channel_m else ["data.channel_m=LENGTH"]
 
 
 def preparation(found: Inspection) -> list[str]:
