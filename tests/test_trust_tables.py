@@ -69,13 +69,13 @@ AMBIGUOUS = {
     "one column of decimal commas, or two": (
         "x\n1,5\n2,5\n3,5\n", r"it has 1 names, \['x'\], and the rows have 2 columns",
     ),
-    "a word in the first row": ("t,x\n0,bad\n1,2\n2,4\n", r"line 2, \['0', 'bad'\], is neither"),
+    "a word in the first row": ("t,x\n0,bad\n1,2\n2,4\n", r"the line \['0', 'bad'\] is neither"),
     "a word in the second row": ("t,x\n0,1\n1,bad\n2,4\n3,5\n", "line 3 is '1,bad'"),
     "words in the second row": ("t,x\n0,1\nover,load\n2,4\n3,5\n", "line 3 is 'over,load'"),
     "words in the first row": (
-        "t,x\nover,load\n1,2\n2,4\n", "lines 1 and 2 may both be names",
+        "t,x\nover,load\n1,2\n2,4\n", "may be names: leave one of these lines",
     ),
-    "a word in the first row, no header": ("0,bad\n1,2\n2,4\n", "line 1, .* is neither names nor"),
+    "a word in the first row, no header": ("0,bad\n1,2\n2,4\n", "the line .* is neither names nor"),
     "a word in the second row, no header": ("0,1\n1,bad\n2,4\n3,5\n", "line 2 is '1,bad'"),
     "names that no number helps": (
         "t,x,x,x.1\n" + "0,1,2,3\n" * 5, "must have names of their own: 'x.1' comes more than once",

@@ -68,7 +68,7 @@ def text_source(path: Path, file: TextIO) -> FileSource:
 
     aliases = tuple(number for number in places if number not in names)
     return FileSource(
-        path, [*names], read, aliases=aliases, words=_words(frame, layout, columns, dates),
+        path, [*names], read, aliases=aliases, words=_words(frame, layout, columns, dates, others),
         step_s=header.step_s, is_table=True,
     )  # fmt: skip
 
@@ -79,7 +79,11 @@ def _holds_numbers(column: pd.Series) -> bool:
 
 
 def _words(
-    frame: pd.DataFrame, layout: Layout, columns: Sequence[int], dates: Mapping[int, pd.Series]
+    frame: pd.DataFrame,
+    layout: Layout,
+    columns: Sequence[int],
+    dates: Mapping[int, pd.Series],
+    others: Sequence[int],
 ) -> str:
     """How the table was read, in words."""
     n_columns, names = len(columns), layout.header.names
@@ -89,22 +93,25 @@ def _words(
     words += ", decimal commas" * (layout.decimal == ",")
     words += ", marks between thousands" * layout.has_marks
     words += f", rows from line {layout.first + 1}"
-    taken = {*columns, *dates, *(j + 1 for j in dates)}
-    left = [j for j in range(len(names)) if j not in taken and frame[j].notna().any()]
+    left = [j for j in others if j not in dates and frame[j].notna().any()]
     words += f", left out: {', '.join(names[j] for j in left)}" * bool(left)
     has_dates = any(frame[j].astype(str).str.match(SLASHED).all() for j in left)
     return words + "; dates are read if written as 2024-01-31" * has_dates
 
 
-def _dates(frame: pd.DataFrame, others: Sequence[int]) -> dict[int, pd.Series]:
-    """Columns of dates, with their times of day if these stand in the next column."""
+def _dates(frame: pd.DataFrame, others: list[int]) -> dict[int, pd.Series]:
+    """Columns of dates, with their times of day if these stand in the next column.
+
+    others: columns of no numbers; those of times of day are taken out.
+    """
     texts = {j: frame[j].dropna().astype(str).str.strip() for j in others}
     are_dates = [j for j, text in texts.items() if len(text) and text.str.fullmatch(DATE).all()]
     found = {}
     for j in are_dates:
-        beside = texts.get(j + 1)
-        has_clock = beside is not None and len(beside) and beside.str.fullmatch(CLOCK).all()
-        text = texts[j] + " " + beside if beside is not None and has_clock else texts[j]
+        text, beside = texts[j], texts.get(j + 1, texts[j][:0])
+        if len(beside) and beside.str.fullmatch(CLOCK).all():
+            text = text + " " + beside
+            others.remove(j + 1)
         form = "mixed" if text.str.contains("[AP]M$", case=False).any() else "ISO8601"
         found[j] = pd.to_datetime(text.str.replace(",", "."), format=form, utc=True).reindex(
             frame.index

@@ -82,15 +82,14 @@ def layout_of(lines: Sequence[str]) -> Layout:
     first = _first_row(table, lines, columns, decimal)
     below = [row for row in table[first:] if row]
     columns = _numeric(below, decimal)
-    above = [
-        Line(k + 1, _split([line.lstrip("#%!/ ").strip("\r\n ")], separator)[0], is_comment(line))
-        for k, line in enumerate(lines[:first])
-        if line.strip() and not RULE.fullmatch(line.strip("\r\n "))
-    ]
+    shown_above = [line.strip("\r\n ") for line in lines[:first]]
+    shown_above = [line for line in shown_above if line and not RULE.fullmatch(line)]
+    above = _split([line.lstrip("#%!/ ") for line in shown_above], separator)
     n_columns = max(map(len, below))
-    if above and separator and len(above[-1].cells) == shown[first].count(separator) + 1:
-        n_columns = max(n_columns, len(above[-1].cells))  # the last ones are empty in these lines
-    header = header_of(above, n_columns, strict=separator is not None)
+    if above and separator and len(above[-1]) == shown[first].count(separator) + 1:
+        n_columns = max(n_columns, len(above[-1]))  # the last ones are empty in these lines
+    is_comment = bool(above) and shown_above[-1].startswith(COMMENTS)
+    header = header_of(above, n_columns, strict=separator is not None, is_comment=is_comment)
     if columns[0] > 1 and not any(header.units):
         header = _labels_beside(header, below, columns)
     has_marks = any(re.fullmatch(GROUPED[decimal], cell) for cell in numbers)
@@ -110,10 +109,6 @@ def _split(lines: Sequence[str], separator: str | None) -> list[list[str]]:
             cells.pop()
         table.append(cells)
     return table
-
-
-def is_comment(line: str) -> bool:
-    return line.lstrip().startswith(COMMENTS)
 
 
 def _rate(table: Sequence[Sequence[str]], decimal: str) -> tuple[float, int, tuple[int, ...]]:
@@ -226,39 +221,23 @@ class Header:
     step_s: float | None = None
 
 
-@dataclass(frozen=True)
-class Line:
-    """Cells of a line above the rows. number: line number in the file, from 1."""
-
-    number: int
-    cells: Sequence[str]
-    is_comment: bool = False
-
-    @property
-    def has_numbers(self) -> bool:
-        return any(NUMBER.fullmatch(cell) for cell in self.cells)
-
-    @property
-    def begins_with_time(self) -> bool:
-        return bool(self.cells) and split_name(self.cells[0])[0].lower() in TIMES
-
-
-def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
-    """Find the header in the lines above the rows.
+def header_of(
+    above: Sequence[Sequence[str]], n_columns: int, *, strict: bool, is_comment: bool
+) -> Header:
+    """Find the header in the cells of the lines above the rows.
 
     strict: a last line of several cells, or of one word, is taken as a header, so it must name
-    every column.
+    every column. is_comment: the last line is a comment, as programs write their header.
     Raises ValueError if it does not, or if the last line could be a row with a word in it.
     """
-    cells = [line.cells for line in above]
-    step_s = _step_s(cells) if len(cells) > 1 else None
+    step_s = _step_s(above) if len(above) > 1 else None
     numbered = Header(tuple(map(str, range(n_columns))), ("",) * n_columns, step_s)
     if not above:
         return numbered
-    if len(cells) > 1 and (counted := _rigol_header(cells, n_columns)) is not None:
+    if len(above) > 1 and (counted := _rigol_header(above, n_columns)) is not None:
         return counted
-    has_units = len(above) > 1 and _are_units(cells[-1], cells[-2])
-    names, units = (cells[-2], cells[-1]) if has_units else (cells[-1], [])
+    has_units = len(above) > 1 and _are_units(above[-1], above[-2])
+    names, units = (above[-2], above[-1]) if has_units else (above[-1], [])
     if len(names) != n_columns or all(NUMBER.fullmatch(name) for name in names):
         if strict and (len(names) > 1 or not re.search(r"\s", "".join(names))):
             raise ValueError(
@@ -267,13 +246,34 @@ def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
                 "name columns by their numbers, from 0; write numbers with decimal points"
             )
         return numbered
-    if not has_units:
-        _check_names(above, n_columns)
+    if not has_units and not is_comment:
+        _check_names(above)
     said = [_unit(cell) for cell in units]
     header = split_names(names, [*said, *[""] * n_columns][:n_columns])
     if header.names[0].lower() in TIMES and not any(header.units):
-        header = replace(header, units=_units_said(cells, n_columns))
+        header = replace(header, units=_units_said(above, n_columns))
     return replace(header, step_s=step_s)
+
+
+def _check_names(above: Sequence[Sequence[str]]) -> None:
+    """Raise ValueError if the last line above the rows might not be the column names.
+
+    It may be a faulty row, or follow a line that begins with a name for time. One that begins so
+    itself is accepted.
+    """
+    *_, before, last = [], *above
+    if split_name(last[0])[0].lower() in TIMES:
+        return
+    if any(NUMBER.fullmatch(cell) for cell in last):
+        raise ValueError(
+            f"the line {list(last)} is neither names nor a row of numbers: leave a cell empty "
+            "whose number is missing, and begin names with one for time, such as 't'"
+        )
+    if len(before) == len(last) > 1 and split_name(before[0])[0].lower() in TIMES:
+        raise ValueError(
+            f"both {list(before)} and {list(last)} may be names: leave one of these lines, or "
+            "begin it with #; a line of units stands in brackets, such as (s),(V)"
+        )
 
 
 def _labels_beside(header: Header, rows: Sequence[Sequence[str]], columns: Sequence[int]) -> Header:
@@ -309,32 +309,6 @@ def split_names(names: Sequence[str], units: Sequence[str] = ()) -> Header:
     parted = [split_name(name) for name in names]
     units = units if any(units) else [unit for _, unit in parted]
     return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)))
-
-
-def _check_names(above: Sequence[Line], n_columns: int) -> None:
-    """Raise ValueError if the last line above the rows might not be the column names.
-
-    It may be a faulty row, or follow a line that looks like names as well. A line that begins with
-    a name for time, or is a comment, is accepted. A line of a longer preamble may happen to have as
-    many cells as there are columns, and is no reason for doubt.
-    """
-    last, before = above[-1], above[-2:-1]
-    if last.begins_with_time or last.is_comment:
-        return
-    if last.has_numbers:
-        raise ValueError(
-            f"line {last.number}, {list(last.cells)}, is neither names nor a row of numbers: leave "
-            "a cell empty whose number is missing, and begin names with one for time, such as 't'"
-        )
-    for line in before:
-        may_be_names = 1 < len(line.cells) == n_columns and not line.has_numbers
-        is_first = line.begins_with_time or len(above) == 2
-        if may_be_names and is_first and not line.is_comment:
-            raise ValueError(
-                f"lines {line.number} and {last.number} may both be names, {list(line.cells)} and "
-                f"{list(last.cells)}: leave one of them, or begin it with #; a line of units "
-                "stands in brackets, such as (s),(V)"
-            )
 
 
 def _step_s(above: Sequence[Sequence[str]]) -> float | None:
