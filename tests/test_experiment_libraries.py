@@ -231,7 +231,7 @@ def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
 def test_a_record_too_short_for_forecasts_is_searched_without(tmp_path: Path) -> None:
     t = np.arange(21.0)
     table = np.column_stack([t, np.cos(0.5 * t), np.sin(0.5 * t)])
-    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="time,x,y", comments="")
+    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="time_s,x,y", comments="")
     found = computed(
         composed(
             "+exp=discover", "data=recognised", f"data.path={tmp_path / 'run.csv'}",

@@ -24,7 +24,7 @@ RUN = ep.Trajectory(
 def test_a_table_holds_the_samples_over_time_in_seconds() -> None:
     table = RUN.to_dataframe()
     assert list(table.columns) == ["n_i", "n_n", "V"]
-    assert table.index.name == "time"
+    assert table.index.name == "time_s"
     np.testing.assert_array_equal(table.index, RUN.t)
     np.testing.assert_array_equal(table.to_numpy(), RUN.values)
     (again,) = trajectories_of(table.drop(columns="V"))

@@ -187,11 +187,12 @@ def test_points_of_a_thruster_are_proposed_to_both_studies_of_points(
         table = pd.DataFrame(columns, columns=["n_i", "n_n", "R_ion", "u_iz"])
         table.insert(0, "time [s]", 1e-6 * np.arange(50))
         table.to_csv(folder / f"V{V}_m5.csv", index=False)
-    assert not ended("inspect", "V*.csv")
+    assert not ended("inspect", "V*.csv", "--plasma")
     assert re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out) == [
-        "+exp=parametric data=recognised 'points.files=V{V_D_V}_m5.csv' thesis=null 'trends=[]'",
-        "+exp=predict data=recognised 'points.files=V{V_D_V}_m5.csv' '~models.inflow' "
-        "'~models.conserving' '~models.leaving'",
+        "+exp=parametric data=recognised 'points.files=V{V_D_V}_m5.csv' data.plasma=true "
+        "thesis=null 'trends=[]'",
+        "+exp=predict data=recognised 'points.files=V{V_D_V}_m5.csv' data.plasma=true "
+        "'~models.inflow' '~models.conserving' '~models.leaving'",
     ]
 
 

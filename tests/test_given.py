@@ -116,3 +116,11 @@ def test_what_is_no_selection_is_refused_with_an_example(value: object) -> None:
     check_kind("selection", ep.EBIC(), Selection, "ep.EBIC()")
     with pytest.raises(ValueError, match=r"selection must be a Selection, such as ep.EBIC\(\): "):
         check_kind("selection", value, Selection, "ep.EBIC()")
+
+
+def test_units_in_the_names_of_a_table_are_those_of_a_file() -> None:
+    table = pd.DataFrame({"Time (ms)": 1e3 * T, "prey (mV)": X[:, 0], "n_i [cm^-3]": X[:, 1]})
+    (run,) = trajectories_of(table)
+    assert dict(run.units) == {"prey": "V", "n_i": "m^-3"}
+    np.testing.assert_allclose(run.t, T)
+    np.testing.assert_allclose(run.states, X * [1e-3, 1e6])

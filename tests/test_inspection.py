@@ -1,19 +1,20 @@
 """Files without a mapping: what they are taken for, what is asked, and what is made of it."""
 
 import json
-import warnings
 from pathlib import Path
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from scipy.io import savemat
 
 import ep2sindy as ep
 from ep2sindy.app.inspection import experiments
+from ep2sindy.data.coerce import trajectories_of
 from ep2sindy.data.conversion import conversion
-from ep2sindy.data.quantities import meant_by
+from ep2sindy.data.quantities import axis_of, axis_unit, quantity_of, split_unit
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.recognition import recognise
 
@@ -26,28 +27,70 @@ N_I, N_N, U_Z, T_E = 1e18 * WAVE, 5e18 * WAVE[::-1], 1e4 * WAVE, 20 * WAVE
 
 
 @pytest.mark.parametrize(
-    ("name", "ours"),
+    ("name", "unit", "ours"),
     [
-        ("n_i", "n_i"), ("ni", "n_i"), ("ionDensity", "n_i"), ("density_ion", "n_i"),
-        ("plasma/N_ion", "n_i"), ("nIon", "n_i"), ("ions.Xe.0.n", "n_i"), ("ni.0", "n_i"),
-        ("ni_1", "n_i"), ("ni_cm3", "n_i"), ("ions.Kr.0.u", "u_iz"), ("ui.0", "u_iz"),
-        ("Vel_ion_z", "u_iz"), ("nn", "n_n"), ("neutralDensity", "n_n"), ("neutrals.Ar.n", "n_n"),
-        ("Te", "T_e_eV"), ("Tev", "T_e_eV"), ("T_e_eV", "T_e_eV"), ("rate", "R_ion"),
-        ("electron_temperature", "T_e_eV"), ("ionization_rate", "R_ion"), ("Id", "I_d"),
-        ("discharge_current", "I_d"),
-        ("Vd", "V_d"), ("time", "time"), ("t_us", "time"), ("Time", "time"), ("grid", "z"),
-        ("mesh/axial_pos", "z"), ("radius", "r"),
+        ("n_i", "m^-3", "n_i"), ("ni", "cm^-3", "n_i"), ("plasma/N_ion", "m^-3", "n_i"),
+        ("nIon", "cm-3", "n_i"), ("ions.Xe.0.n", "m^-3", "n_i"), ("ni.0", "m^-3", "n_i"),
+        ("ni_1", "m^-3", "n_i"), ("ni_cm3", "", "n_i"), ("ions.Kr.0.u", "m/s", "u_iz"),
+        ("ui.0", "m/s", "u_iz"), ("nn", "m^-3", "n_n"), ("neutrals.Ar.n", "m^-3", "n_n"),
+        ("Te", "K", "T_e_eV"), ("Tev", "eV", "T_e_eV"), ("T_e_eV", "", "T_e_eV"),
+        ("rate", "cm^3/s", "R_ion"), ("Id", "mA", "I_d"), ("Vd", "V", "V_d"),
+        ("plasma dens.", "1e17 m^-3", "n_i"),
     ],
 )  # fmt: skip
-def test_names_of_many_codes_are_known(name: str, ours: str) -> None:
-    assert meant_by(name) == {ours}
+def test_a_short_name_needs_a_unit_that_fits(name: str, unit: str, ours: str) -> None:
+    found = quantity_of(name, unit, plasma=False)
+    assert found is not None
+    assert found[0] == ours
+    assert quantity_of(name, "kg", plasma=True) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "ours"),
+    [
+        ("ionDensity", "n_i"), ("density_ion", "n_i"), ("neutralDensity", "n_n"),
+        ("Vel_ion_z", "u_iz"), ("electron_temperature", "T_e_eV"), ("ionization_rate", "R_ion"),
+        ("discharge_current", "I_d"), ("Discharge voltage", "V_d"),
+    ],
+)  # fmt: skip
+def test_a_full_name_stands_for_itself(name: str, ours: str) -> None:
+    found = quantity_of(name, "", plasma=False)
+    assert found is not None
+    assert found[0] == ours
+    assert quantity_of(name, "m^3", plasma=False) is None
+
+
+@pytest.mark.parametrize("name", ["te", "rate", "id", "na", "n_i", "vi", "I_d", "current"])
+def test_a_short_name_without_a_unit_is_the_users_unless_all_is_plasma(name: str) -> None:
+    assert quantity_of(name, "", plasma=False) is None
+    assert quantity_of(name, "", plasma=True) is not None
 
 
 @pytest.mark.parametrize(
     "name", ["ions.Xe.1.n", "ni.1", "ni_2", "foo", "n", "thrust", "neutrals.Xe.u", "B", "ne", "phi"]
 )
 def test_other_names_mean_nothing_of_ours(name: str) -> None:
-    assert not meant_by(name)
+    assert quantity_of(name, "", plasma=True) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "axis", "unit"),
+    [
+        ("time", "time", ""), ("t_us", "time", "us"), ("Time", "time", ""),
+        ("Year", "time", "year"),
+        ("grid", "z", ""), ("mesh/axial_pos", "z", ""), ("radius", "r", ""), ("z_mm", "z", "mm"),
+        ("T", None, ""), ("T (h)", None, ""), ("frame", None, ""),
+    ],
+)  # fmt: skip
+def test_axes_go_by_their_names(name: str, axis: str | None, unit: str) -> None:
+    assert axis_of(name) == axis
+    if axis is not None:
+        assert axis_unit(axis, name, "") == unit
+
+
+def test_the_case_of_a_unit_counts() -> None:
+    assert split_unit("c_mM") == ("c_mM", "")
+    assert split_unit("x_mm") == ("x", "mm")
 
 
 def odd_hdf5(path: Path, *, units: bool) -> None:
@@ -68,7 +111,7 @@ def odd_hdf5(path: Path, *, units: bool) -> None:
 
 def test_an_odd_file_that_names_its_units_opens_with_its_step_alone(tmp_path: Path) -> None:
     odd_hdf5(tmp_path / "a.h5", units=True)
-    with pytest.raises(ValueError, match="a field needs time: give its step dt_s"):
+    with pytest.raises(ValueError, match="a field needs time: give the step between samples"):
         ep.open_field(tmp_path / "a.h5")
     field = ep.open_field(tmp_path / "a.h5", dt_s=1.5e-6)
     expected = {"n_i": N_I, "n_n": N_N, "T_e_eV": T_E, "u_iz": U_Z, "time": T, "z": Z, "r": R}
@@ -77,43 +120,70 @@ def test_an_odd_file_that_names_its_units_opens_with_its_step_alone(tmp_path: Pa
     assert field["n_i"].dims == ("time", "z", "r")
 
 
-def test_units_that_are_only_likely_are_asked_and_inspect_takes_them(tmp_path: Path) -> None:
-    odd_hdf5(tmp_path / "a.h5", units=False)
-    with pytest.raises(ValueError, match=r"n_i .*in cm\^-3, and it names no unit: give it; n_n"):
-        ep.open_field(tmp_path / "a.h5", dt_s=1.5e-6)
-    found = ep.inspect_file(tmp_path / "a.h5")
-    units = {name: variable.unit for name, variable in found.variables.items()}
-    assert units == {"n_i": "cm^-3", "n_n": "cm^-3", "u_iz": "m/s", "T_e_eV": "K"}
-    field = ep.open_field(
-        tmp_path / "a.h5", variables=found.variables, z=found.z, r=found.r, dt_s=1.5e-6
-    )
-    np.testing.assert_allclose(field["T_e_eV"].values, T_E, rtol=1e-9)
-
-
 def test_an_inspection_says_what_is_there_and_what_lacks(tmp_path: Path) -> None:
-    odd_hdf5(tmp_path / "a.h5", units=False)
+    odd_hdf5(tmp_path / "a.h5", units=True)
     found = ep.inspect_file(tmp_path / "a.h5")
     text = repr(found)
     for part in (
-        "out/ionDens", "(5, 7, 40)", "n_i in cm^-3", "no time: give the step", "data.dt_s=STEP",
+        "out/ionDens", "(5, 7, 40)", "n_i in cm-3", "give the step between samples, data.dt_s=STEP",
         "R_ion is made by ep2sindy.thruster.ionization_rate from T_e_eV", "z in cm, 0.5 apart",
         "no length of the channel",
     ):  # fmt: skip
         assert part in text, part
     assert found.lacking(["n_i", "R_ion", "V_d"]) == ("V_d",)  # R_ion can be made
     (ready,) = experiments(found)
-    assert "all but the time is there for +exp=breathing" in ready
+    assert "all but what is asked is there for +exp=breathing" in ready
     assert "<table>" in ep.inspect_file(tmp_path / "a.h5")._repr_html_()
 
 
+def test_without_units_short_names_stay_and_what_is_plasma_is_offered(tmp_path: Path) -> None:
+    odd_hdf5(tmp_path / "a.h5", units=False)
+    found = ep.inspect_file(tmp_path / "a.h5")
+    units = {name: variable.unit for name, variable in found.variables.items()}
+    assert units == {"n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "Te": "1"}
+    assert found.lacking(["T_e_eV"])
+    said = "data.plasma=true takes 'out/Te' for T_e_eV, and what has no unit for SI"
+    assert said in found.notes()
+    assert "T_e_eV" in ep.inspect_file(tmp_path / "a.h5", plasma=True).variables
+
+
+HEART = {"rate": 70.0 + WAVE[:, 0, 0], "te": 60.0 + WAVE[:, 1, 0]}
+
+
+def write_csv(path: Path, **columns: np.ndarray) -> Path:
+    pd.DataFrame(columns).to_csv(path, index=False)
+    return path
+
+
+def test_the_users_own_names_stay(tmp_path: Path) -> None:
+    """A heart's rate is no ionization rate, whatever its size."""
+    field = ep.open_field(write_csv(tmp_path / "a.csv", time_s=T, **HEART))
+    assert {n: field[n].attrs["units"] for n in field.data_vars} == {"rate": "1", "te": "1"}
+
+
+def test_a_time_without_a_unit_is_asked_for_and_counters_are_no_signals(tmp_path: Path) -> None:
+    path = write_csv(
+        tmp_path / "a.csv", time=T, id=np.arange(NT) % 7, x=HEART["rate"], na=WAVE[:, 0, 0]
+    )
+    found = ep.inspect_file(path)
+    assert list(found.variables) == ["id", "x", "na"]
+    assert found.signals == ["x", "na"]
+    with pytest.raises(
+        ValueError, match=r"names no unit: give it, such as 'data.units=\{time:s\}'"
+    ):
+        ep.open_field(path)
+    field = ep.open_field(path, units={"time": "ms"})
+    np.testing.assert_allclose(field["time"].values, 1e-3 * T)
+
+
 def test_columns_of_one_array_are_signals_of_their_own(tmp_path: Path) -> None:
-    savemat(tmp_path / "a.mat", {"probe": WAVE[:, :2, 0], "t": T, "fs": 1.0})
+    savemat(tmp_path / "a.mat", {"probe": WAVE[:, :2, 0], "t_s": T, "fs": 1.0})
     field = ep.open_field(tmp_path / "a.mat")
     np.testing.assert_array_equal(field["probe_1"].values, WAVE[:, 1, 0])
     one = ep.open_field(
         tmp_path / "a.mat",
         variables={"I_d": ep.Variable("probe[:, 1]", "mA")},
-        time=ep.Variable("t", "s"),
+        time=ep.Variable("t_s", "s"),
     )
     np.testing.assert_allclose(one["I_d"].values, 1e-3 * WAVE[:, 1, 0])
 
@@ -153,7 +223,7 @@ def test_a_rate_beside_a_time_says_its_unit(tmp_path: Path, factor: float, unit:
 def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
     square = 1e18 * np.repeat(WAVE[:, :, :1], NZ, axis=2)
     np.savez(tmp_path / "a.npz", t=T, z=Z, r=R[0] + Z, ni=square, I_d=WAVE[:, 0, 0])
-    found = recognise(open_source(tmp_path / "a.npz"))
+    found = recognise(open_source(tmp_path / "a.npz"), plasma=True)
     assert "n_i" not in found.variables
     said = "'ni' of shape (40, 7, 7) may be [time,z,r] or [time,r,z]"
     assert any(said in question for question in found.questions)
@@ -161,7 +231,7 @@ def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
 
 def test_two_names_for_one_quantity_are_asked(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=T, ni=N_I[:, 0, 0], ion_density=N_I[:, 1, 0])
-    found = recognise(open_source(tmp_path / "a.npz"))
+    found = recognise(open_source(tmp_path / "a.npz"), plasma=True)
     assert "n_i may be 'ni' or 'ion_density': name one" in found.questions
 
 
@@ -229,20 +299,6 @@ def test_all_that_is_wrong_with_a_mapping_is_told_at_once(tmp_path: Path) -> Non
         assert part in text, part
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e-6, "cm^-3"), (1.0, None)])
-def test_numbers_that_look_like_another_unit_are_told(
-    tmp_path: Path, factor: float, unit: str | None
-) -> None:
-    np.savez(tmp_path / "a.npz", t=T, ni=factor * N_I[:, 0, 0])
-    given = {"variables": {"n_i": ep.Variable("ni", "m^-3")}, "time": ep.Variable("t", "s")}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        ep.open_field(tmp_path / "a.npz", **given)
-    texts = [str(w.message) for w in caught if w.category is ep.warnings.DoubtfulUnit]
-    assert len(texts) == (unit is not None)
-    assert all(f"as if the file counted in {unit}" in text for text in texts)
-
-
 def test_temperatures_in_kelvin_become_those_in_eV() -> None:
     factor, zero, unit = conversion("T_e_eV", "K")
     assert (zero, unit) == (0.0, "eV")
@@ -251,31 +307,12 @@ def test_temperatures_in_kelvin_become_those_in_eV() -> None:
 
 def test_whole_numbers_are_samples(tmp_path: Path) -> None:
     counts = np.arange(NT) % 7
-    np.savez(tmp_path / "a.npz", time=T, counts=counts)
+    np.savez(tmp_path / "a.npz", time_s=T, counts=counts)
     field = ep.open_field(tmp_path / "a.npz")
     assert field["counts"].dtype == np.float64
     own = xr.Dataset({"c": ("time", counts, {"units": "1"})}, coords={"time": T})
     run = ep.zone_average(own, None, states=["c"])
     np.testing.assert_array_equal(run.states[:, 0], counts)
-
-
-@pytest.mark.parametrize(("factor", "unit"), [(1e6, "us"), (1e3, "ms"), (1e9, "ns"), (1.0, "s")])
-def test_the_steps_of_a_plasmas_record_show_the_unit_of_time(
-    tmp_path: Path, factor: float, unit: str
-) -> None:
-    np.savez(tmp_path / "a.npz", t=factor * T, ni=N_I[:, 0, 0], x=WAVE[:, 0, 0])
-    found = ep.inspect_file(tmp_path / "a.npz")
-    assert found.time == ep.Variable("t", unit)
-    assert ("time" in found.found.guesses) is (unit != "s")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        given = {"n_i": ep.Variable("ni", "m^-3")}
-        ep.open_field(tmp_path / "a.npz", variables=given, time=ep.Variable("t", "s"))
-    assert [f"data.time.unit={unit}" in str(w.message) for w in caught] == [True] * (unit != "s")
-    slow = {"x": ep.Variable("x", "1")}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        ep.open_field(tmp_path / "a.npz", variables=slow, time=ep.Variable("t", "s"))
 
 
 def test_only_what_varies_along_time_is_offered_as_a_signal(tmp_path: Path) -> None:
@@ -285,67 +322,22 @@ def test_only_what_varies_along_time_is_offered_as_a_signal(tmp_path: Path) -> N
         V_d=np.full(NT, 300.0),
     )  # fmt: skip
     found = ep.inspect_file(tmp_path / "a.npz")
-    signals = [name for name, variable in found.variables.items() if found.is_trace(variable)]
-    assert signals == ["I_d"]
+    assert found.traces == ["I_d"]
 
 
 def test_time_that_does_not_increase_is_named(tmp_path: Path) -> None:
     back = tmp_path / "back.csv"
     back.write_text("time,x\n0,1\n1,2\n2,0\n1.5,3\n2.5,1\n")
-    with pytest.raises(ValueError, match=r"'time' does not increase \(1.5 follows 2 at row 4\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"'time' does not increase \(1.5 follows 2 at row 4; 0 repeat the one before, 1 run",
+    ):
         ep.open_field(back)
     rounded = tmp_path / "rounded.csv"
     rounded.write_text("time,x\n99.9,1\n100,2\n100,0\n100,3\n101,1\n")
-    with pytest.raises(ValueError, match=r"\(100 follows 100 at row 3\).*give dt_s"):
+    with pytest.raises(ValueError, match=r"\(100 follows 100 at row 3; 2 repeat .*give dt_s"):
         ep.open_field(rounded)
     assert list(ep.open_field(rounded, dt_s=0.1)["x"].values) == [1, 2, 0, 3, 1]
-
-
-F, G = N_I[:, :, 0], N_N[:, :, 0]
-
-
-@pytest.mark.parametrize("names", [("arr_0", "arr_1", "arr_2", "arr_3"), ("n_i", "n_n", "p", "q")])
-def test_axes_without_names_are_matched_by_their_lengths_and_confirmed(
-    tmp_path: Path, names: tuple[str, ...]
-) -> None:
-    np.savez(tmp_path / "a.npz", **dict(zip(names, (F, G, T, Z), strict=True)))
-    found = ep.inspect_file(tmp_path / "a.npz")
-    assert found.time == ep.Variable(names[2], "s")
-    assert found.z == ep.Variable(names[3], "m")
-    assert list(found.variables) == list(names[:2])
-    with pytest.raises(ValueError, match=f"time is likely '{names[2]}', of the longest axis: give"):
-        ep.open_field(tmp_path / "a.npz")
-    field = ep.open_field(tmp_path / "a.npz", variables=found.variables, time=found.time, z=found.z)
-    np.testing.assert_array_equal(field[names[0]].values, F)
-
-
-def test_a_last_axis_without_a_name_is_certain(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", n_i=N_I, z=Z, t=T, q=R)
-    np.testing.assert_array_equal(ep.open_field(tmp_path / "a.npz")["r"].values, R)
-    np.savez(tmp_path / "b.npz", n_i=F, z=Z, q=T)
-    np.testing.assert_array_equal(ep.open_field(tmp_path / "b.npz")["time"].values, T)
-
-
-def test_without_coordinates_the_middle_over_the_longest_axis_is_proposed(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", ni=F.T, nn=G.T)
-    found = ep.inspect_file(tmp_path / "a.npz")
-    assert found.variables["n_i"] == ep.Variable("ni[3, :]", "m^-3")
-    text = " ".join(found.notes())
-    assert "time is likely the axis of 40 samples, the longest" in text
-    assert "n_i is taken at the middle, ni[3, :], as an axis has no coordinate" in text
-    assert all(map(found.is_trace, found.variables.values()))
-    field = ep.open_field(tmp_path / "a.npz", variables=found.variables, dt_s=1e-6)
-    np.testing.assert_array_equal(field["n_i"].values, F[:, 3])
-
-
-def test_axes_that_lengths_do_not_tell_apart_are_asked_for(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", ni=F[:NZ], p=T[:NZ], q=Z)
-    found = ep.inspect_file(tmp_path / "a.npz")
-    assert "the 2 axes of 7 points of 'ni' may be 'p' or 'q': name time, z and r" in found.notes()
-    assert "missing a signal for +exp=trace, +exp=discover" in experiments(found)
-    np.savez(tmp_path / "b.npz", ni=N_I, t=T, p=Z, q=R)
-    notes = ep.inspect_file(tmp_path / "b.npz").notes()
-    assert "which of 'p' and 'q' is z and which is r cannot be told: name them" in notes
 
 
 def test_long_lists_are_cut(tmp_path: Path) -> None:
@@ -368,3 +360,74 @@ def test_a_folder_says_the_way(tmp_path: Path, files: list[str], said: str) -> N
         (tmp_path / "runs" / name).write_text("t,x\n0,1\n")
     with pytest.raises(ValueError, match=said):
         ep.inspect_file(tmp_path / "runs")
+
+
+def test_times_rounded_to_few_digits_are_equal_steps_and_said(tmp_path: Path) -> None:
+    t = 99.0 + 0.35 * np.arange(NT)
+    path = tmp_path / "a.csv"
+    rows = [f"{a:.2E},{b:.4f}" for a, b in zip(t, WAVE[:, 0, 0], strict=True)]
+    path.write_text("time (ms),x\n" + "\n".join(rows))
+    assert "were rounded to 3 digits, so that some repeat" in " ".join(
+        ep.inspect_file(path).notes()
+    )
+    steps = np.diff(ep.open_field(path)["time"].values)
+    np.testing.assert_allclose(steps, 0.35e-3, rtol=0.05)
+    assert np.ptp(steps) < 1e-12
+
+
+def test_a_sample_that_stands_twice_is_no_rounding(tmp_path: Path) -> None:
+    t = np.r_[np.arange(20.0), 19.0, np.arange(20.0, 40.0)]
+    path = write_csv(tmp_path / "a.csv", t_s=t, x=np.sin(t))
+    with pytest.raises(
+        ValueError, match=r"19 follows 19 at row 21; 1 repeat the one before, 0 run"
+    ):
+        ep.open_field(path)
+
+
+@pytest.mark.parametrize("mark", [9.91e37, 9.9e37, 1e30, -999.0, -9999.0, 32767.0])
+def test_marks_of_overload_that_repeat_are_missing_samples_and_said(
+    tmp_path: Path, mark: float
+) -> None:
+    x = WAVE[:, 0, 0].copy()
+    x[[3, 9]] = mark
+    path = write_csv(tmp_path / "a.csv", t_s=T, x=x)
+    found = ep.inspect_file(path)
+    assert found.found.held[1].n_missing == 2
+    assert "'x': 2 samples are marks of an overload or of absence, and left out" in found.notes()
+    assert np.isnan(ep.open_field(path)["x"].values[[3, 9]]).all()
+    (run,) = trajectories_of(pd.read_csv(path))
+    assert run.n_samples == NT - 2
+
+
+def test_a_number_that_looks_like_a_mark_stays_among_its_like(tmp_path: Path) -> None:
+    x = np.where(np.arange(NT) % 2, 32767.0, 32000.0 * np.sin(np.arange(NT)))
+    path = write_csv(tmp_path / "a.csv", t_s=T, x=x)
+    np.testing.assert_array_equal(ep.open_field(path)["x"].values, x)
+
+
+def test_a_long_table_is_refused_by_name(tmp_path: Path) -> None:
+    t, z = np.repeat(T, NZ), np.tile(Z, NT)
+    path = write_csv(tmp_path / "a.csv", t_s=t, z=z, x=WAVE[:, :, 0].ravel())
+    with pytest.raises(ValueError, match="the table is long: 'z' runs through 7 values and starts"):
+        ep.open_field(path)
+
+
+@pytest.mark.parametrize("first", [0, 1, 22])
+def test_what_counts_samples_is_no_time(tmp_path: Path, first: int) -> None:
+    for name in ("cycle", "n"):
+        path = write_csv(tmp_path / "a.csv", **{name: first + np.arange(NT)}, x=WAVE[:, 0, 0])
+        with pytest.raises(ValueError, match="a field needs time: give the step between samples"):
+            ep.open_field(path)
+        field = ep.open_field(path, dt_s=2e-6)
+        assert field["time"].values[1] == 2e-6
+
+
+def test_one_bad_column_does_not_take_the_rest(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t_s,x,y\n0,1,2\n1,0,1\n2,2,oops\n3,5,1\n")
+    assert list(ep.open_field(tmp_path / "a.csv").data_vars) == ["x"]
+    assert "row 3 holds 'oops'" in " ".join(ep.inspect_file(tmp_path / "a.csv").notes())
+
+
+def test_a_capital_t_is_a_name_like_any_other(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "a.csv", t_s=T, T=WAVE[:, 0, 0])
+    assert list(ep.open_field(path).data_vars) == ["T"]

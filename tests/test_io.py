@@ -414,7 +414,8 @@ def test_hdf5_is_recognised_as_its_own_library_does(tmp_path: Path, name: str) -
 
 
 KNOWN = (
-    r"NetCDF, HDF5, MATLAB \(v5, v7.3\), npz, Excel, Parquet or TDMS, or end in .csv, .* or .zarr: "
+    r"NetCDF, HDF5, MATLAB \(v5, v7.3\), npz, npy, Excel, Parquet or TDMS, or end in .csv, .* or "
+    ".zarr: "
 )
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.io import savemat
 
 from tests.programs import ended
 
@@ -66,17 +65,6 @@ def file_per_step(folder: Path) -> str:
     return "dump_*.npz"
 
 
-def nameless_axes(folder: Path) -> str:
-    np.savez(folder / "run.npz", *(x[:, None] * p for x, p in zip(X, PROFILE, strict=True)), T, Z)
-    return "run.npz"
-
-
-def no_axes(folder: Path) -> str:
-    fields = (1e18 * p[:, None] * x for x, p in zip(X, PROFILE, strict=True))
-    savemat(folder / "run.mat", dict(zip(("ni", "nn"), fields, strict=True)))
-    return "run.mat"
-
-
 def excel(folder: Path) -> str:
     table = pd.DataFrame({"Time (us)": 1e6 * T, "prey (V)": X[0], "predator (V)": X[1]})
     table.to_excel(folder / "lab.xlsx", index=False)
@@ -89,9 +77,7 @@ def parquet(folder: Path) -> str:
     return "lab.parquet"
 
 
-FILES = [
-    scope_with_a_gap, group_per_step, file_per_step, nameless_axes, no_axes, excel, parquet,
-]  # fmt: skip
+FILES = [scope_with_a_gap, group_per_step, file_per_step, excel, parquet]
 
 
 @pytest.mark.slow

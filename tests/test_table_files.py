@@ -107,7 +107,7 @@ def test_durations_are_times(tmp_path: Path) -> None:
 def test_dates_that_may_be_read_in_two_ways_are_left_out(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("date,x\n01/02/2024,1\n02/02/2024,3\n03/02/2024,2\n")
     found = ep.inspect_file(tmp_path / "a.csv")
-    assert "left out, with few numbers: date" in found.words
+    assert "left out: date; dates are read if written as 2024-01-31" in found.words
     assert list(found.variables) == ["x"]
 
 
@@ -165,3 +165,34 @@ def test_damaged_parquet_ends_in_one_message(tmp_path: Path, part: float) -> Non
     (tmp_path / "a.parquet").write_bytes(content)
     with pytest.raises(ValueError, match="a.parquet cannot be read: "):
         ep.open_field(tmp_path / "a.parquet")
+
+
+def test_an_array_of_numpy_is_opened(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.column_stack([X, 2 * X]))
+    field = ep.open_field(tmp_path / "a.npy", dt_s=1.5e-6)
+    np.testing.assert_array_equal(field["column_1"].values, 2 * X)
+    named = np.rec.fromarrays([1e6 * T, X], names="t_us,x")
+    np.save(tmp_path / "b.npy", named)
+    np.testing.assert_allclose(ep.open_field(tmp_path / "b.npy")["time"].values, T, atol=1e-18)
+
+
+LVM = """LabVIEW Measurement\t
+Writer_Version\t2
+Separator\tTab
+X_Dimension\tTime\t
+X0\t0.0\t
+Delta_X\t0.0000015\t
+***End_of_Header***\t\t
+X_Value\tVoltage\tComment
+"""
+
+
+def test_a_measurement_file_of_labview_asks_for_its_time_alone(tmp_path: Path) -> None:
+    rows = "".join(f"{t:.7f}\t{x:.6f}\t\n" for t, x in zip(T, X, strict=True))
+    (tmp_path / "a.lvm").write_text(LVM + rows)
+    with pytest.raises(
+        ValueError, match=r"if 'X_Value' is time, 'data.time=\{name:X_Value,unit:UN"
+    ):
+        ep.open_field(tmp_path / "a.lvm")
+    field = ep.open_field(tmp_path / "a.lvm", time=ep.Variable("X_Value", "s"))
+    np.testing.assert_allclose(field["Voltage"].values, X, atol=1e-6)

@@ -131,7 +131,7 @@ FAULTS = {
         f"t,x\n{MANY}3000,1,7\n", "as many cells as the first, 2: row 3001 has 3",
     ),
     "a word among the rows": (
-        "t,x\n0,1\n1,2\nover,load\n3,4\n4,5\n", "line 4 is 'over,load'",
+        "t,x\n0,1\n1,2\nover,load\n3,4\n4,5\n", "'t' must hold numbers: row 3 holds 'over'",
     ),
     "a word far below": (f"t,x\n{MANY}3000,over\n", "'x' must hold numbers: row 3001 holds 'over'"),
     "a header alone": ("t,x\n", "holds no rows of numbers"),
@@ -215,7 +215,7 @@ def test_stretches_that_a_file_joins_are_not_made_even(tmp_path: Path) -> None:
     ],
 )
 def test_a_slash_in_a_unit_is_no_path(tmp_path: Path, name: str, column: str, unit: str) -> None:
-    (tmp_path / "a.csv").write_text(f"t,{name}\n" + rows(T, X))
+    (tmp_path / "a.csv").write_text(f"t_s,{name}\n" + rows(T, X))
     assert inspect_file(tmp_path / "a.csv").variables[column].unit == unit
     field = open_field(tmp_path / "a.csv")
     assert field[column].attrs["units"] == unit
@@ -251,10 +251,13 @@ def test_the_name_of_a_column_says_the_unit_of_time(
     assert clock_of(field).unit == unit
 
 
-def test_a_first_column_of_another_name_is_time_and_said_to_be(tmp_path: Path) -> None:
+def test_a_first_column_of_another_name_is_no_time_unless_the_user_says_so(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("frame,x\n" + rows(np.arange(30.0), X))
     (note,) = inspect_file(tmp_path / "a.csv").notes()
-    assert note.startswith("time is taken from 'frame', which is the first column, and rises even")
+    assert note == "a field needs time: give the step between samples, data.dt_s=STEP in s"
+    (tmp_path / "b.csv").write_text("when,x\n" + rows(0.5 * np.arange(30.0), X))
+    (note,) = inspect_file(tmp_path / "b.csv").notes()
+    assert note.endswith("or, if 'when' is time, 'data.time={name:when,unit:UNIT}'")
 
 
 def test_a_preamble_beside_the_rows_says_units(tmp_path: Path) -> None:
@@ -267,3 +270,41 @@ def test_a_preamble_beside_the_rows_says_units(tmp_path: Path) -> None:
     assert found.time == Variable("3", "s")
     assert not found.notes()
     np.testing.assert_allclose(open_field(tmp_path / "a.csv")["column_4"].values, 1e-3 * X)
+
+
+def test_the_whole_file_decides_which_columns_are_kept(tmp_path: Path) -> None:
+    """A column may end long before the others, or begin beyond the lines that are looked at."""
+    n = 3000
+    ends, begins = (["1.5"] * 50 + [""] * (n - 50)), ([""] * 2500 + ["2.5"] * (n - 2500))
+    lines = [f"{k},{a},{b}" for k, (a, b) in enumerate(zip(ends, begins, strict=True))]
+    (tmp_path / "a.csv").write_text("t_s,ends,begins\n" + "\n".join(lines) + "\n")
+    held = {each.name: each for each in inspect_file(tmp_path / "a.csv").found.held}
+    assert (held["ends"].n_missing, held["begins"].n_missing) == (n - 50, 2500)
+
+
+def test_a_line_of_separators_and_marks_of_clipping_are_missing_samples(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t_s,x\n0,1\n,\n1,∞\n2,****\n3,2\n")
+    field = open_field(tmp_path / "a.csv")
+    np.testing.assert_array_equal(field["time"].values, [0, 1, 2, 3])
+    np.testing.assert_array_equal(field["x"].values, [1, np.nan, np.nan, 2])
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        ["2024-01-31,11:59:58", "2024-01-31,11:59:59.5", "2024-01-31,12:00:01"],
+        ["2024-01-31,11:59:58 AM", "2024-01-31,11:59:59.5 AM", "2024-01-31,12:00:01 PM"],
+        ["2024-01-31 11:59:58 AM,", "2024-01-31 11:59:59.5 AM,", "2024-01-31 12:00:01 PM,"],
+    ],
+)
+def test_the_time_of_day_may_stand_beside_the_date(tmp_path: Path, stamps: list[str]) -> None:
+    lines = [f"{stamp},{k % 2}" for k, stamp in enumerate(stamps)]
+    (tmp_path / "a.csv").write_text("date,clock,x\n" + "\n".join(lines) + "\n")
+    np.testing.assert_allclose(open_field(tmp_path / "a.csv")["time"].values, [0.0, 1.5, 3.0])
+
+
+def test_a_unit_with_a_factor_stands_in_the_name(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t [us],plasma dens. [1e17 m^-3],c (mM)\n" + rows(T, X, X))
+    field = open_field(tmp_path / "a.csv")
+    np.testing.assert_allclose(field["n_i"].values, 1e17 * X, rtol=1e-8)
+    assert inspect_file(tmp_path / "a.csv").variables["c"].unit == "mM"

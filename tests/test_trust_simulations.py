@@ -53,6 +53,6 @@ def test_a_run_that_broke_at_once_is_no_data() -> None:
 @pytest.mark.parametrize("status", ["diverged", "steady", "decaying"])
 def test_a_file_of_a_simulation_says_what_it_is(status: str, tmp_path: Path) -> None:
     ep.write_field(simulation(status).assign_attrs(channel_m=0.025), tmp_path / "run.nc")
-    field = ep.open_field(tmp_path / "run.nc")
+    field = ep.open_field(tmp_path / "run.nc", plasma=True)
     assert is_simulation(field.attrs)
     assert amiss(field.attrs) == amiss(simulation(status).attrs)

@@ -5,7 +5,6 @@ import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -15,7 +14,6 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.app.compare import read_run
-from ep2sindy.data.readers import csv
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.readers.source import leaves
 from ep2sindy.library.library import named_terms
@@ -68,20 +66,16 @@ AMBIGUOUS = {
         "t\tx\n" + "".join(f"{k}\t1,{k:03d}\n" for k in range(9)),
         "'1,000' may be 1.000 or 1000, and no number of the file tells which",
     ),
-    "two decimal signs": (
-        "t;x;y\n" + "".join(f"{k};0,{k};{k}.25\n" for k in range(9)),
-        r"column 'x' holds '0,0', and in others it is '\.'",
-    ),
     "one column of decimal commas, or two": (
-        "x\n1,5\n2,5\n3,5\n", r"rows such as '1,5' may be two numbers, or one",
+        "x\n1,5\n2,5\n3,5\n", r"it has 1 names, \['x'\], and the rows have 2 columns",
     ),
-    "a word in the first row": ("t,x\n0,bad\n1,2\n2,4\n", r"line 2, \['0', 'bad'\], is neither"),
+    "a word in the first row": ("t,x\n0,bad\n1,2\n2,4\n", r"the line \['0', 'bad'\] is neither"),
     "a word in the second row": ("t,x\n0,1\n1,bad\n2,4\n3,5\n", "line 3 is '1,bad'"),
     "words in the second row": ("t,x\n0,1\nover,load\n2,4\n3,5\n", "line 3 is 'over,load'"),
     "words in the first row": (
-        "t,x\nover,load\n1,2\n2,4\n", "lines 1 and 2 may both be names",
+        "t,x\nover,load\n1,2\n2,4\n", "may be names: leave one of these lines",
     ),
-    "a word in the first row, no header": ("0,bad\n1,2\n2,4\n", "line 1, .* is neither names nor"),
+    "a word in the first row, no header": ("0,bad\n1,2\n2,4\n", "the line .* is neither names nor"),
     "a word in the second row, no header": ("0,1\n1,bad\n2,4\n3,5\n", "line 2 is '1,bad'"),
     "names that no number helps": (
         "t,x,x,x.1\n" + "0,1,2,3\n" * 5, "must have names of their own: 'x.1' comes more than once",
@@ -108,7 +102,6 @@ ROWS = "".join(f"{k},{2 * k}\n" for k in range(9))
         ("a,b\nms,A\n", ["a", "b"], ["ms", "A"], [0.0, 0.0]),
         ("t,x\n---,---\n", ["t", "x"], ["", ""], [0.0, 0.0]),
         ("t,x\n-1,n/a\n", ["t", "x"], ["", ""], [-1.0, np.nan]),
-        ("t,x\nn/a,n/a\n", ["t", "x"], ["", ""], [np.nan, np.nan]),
         ("run A,run A\nt,x\n", ["t", "x"], ["", ""], [0.0, 0.0]),
         ("# from a,scope\na,b\n", ["a", "b"], ["", ""], [0.0, 0.0]),
     ],
@@ -136,7 +129,7 @@ def test_columns_of_one_name_are_numbered_and_none_is_taken_for_the_name(tmp_pat
 def test_columns_that_are_left_out_are_said(tmp_path: Path) -> None:
     text = "t,x,note,rare\n" + "".join(f"{k},{k},ok,{k if k == 3 else ''}\n" for k in range(9))
     (tmp_path / "a.csv").write_text(text)
-    assert "left out, with few numbers: note, rare" in open_source(tmp_path / "a.csv").words
+    assert "left out: note" in open_source(tmp_path / "a.csv").words
 
 
 def test_an_index_and_a_column_of_one_name_are_refused() -> None:
@@ -232,17 +225,6 @@ def test_null_spaces_of_hdf5_are_named(tmp_path: Path) -> None:
     assert "'/n' is empty: its dataspace is null" in held["n"].problem
     assert "_FillValue of 'y' must be a number: the attribute is empty" in held["y"].problem
     assert (held["x"].unit, held["x"].problem) == ("", "")
-
-
-def test_a_line_and_a_number_of_columns_are_counted_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(csv, "pd", SimpleNamespace())  # which would take the memory
-    path = tmp_path / "a.csv"
-    for text in ("1," * 10_000 + "1\n", "1 " * 10_001, "t,x\n0," + "1" * 10**6):
-        path.write_text(text)
-        with pytest.raises(ValueError, match="a table may have up to 10000 columns, in lines of"):
-            ep.inspect_file(path)
 
 
 def test_a_table_of_thousands_of_columns_is_read(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import yaml
 from ep2sindy.data.conversion import KNOWN_UNITS
 from ep2sindy.data.inspection import Inspection, compare_files, inspect_file, unlike
 from ep2sindy.data.mapping import Variable
+from ep2sindy.data.recognition import STEP
 from ep2sindy.data.steps import records_of
 from ep2sindy.operating.file_names import FilePattern, propose_pattern
 from ep2sindy.operating.records import point_label
@@ -56,13 +57,19 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         metavar="NAME",
         help="write conf/data/NAME.yaml for data=NAME; by default the name of the first file",
     )
+    parser.add_argument(
+        "--plasma", action="store_true",
+        help="names such as Te are quantities without a unit, too; what has no unit is in SI",
+    )  # fmt: skip
     given = parser.parse_args(arguments)
     paths = records_of(given.path[0] if len(given.path) == 1 else given.path)
-    found = [inspect_file(path) for path in paths]
+    found = [inspect_file(path, plasma=given.plasma) for path in paths]
     say("\n".join(found[0].lines(experiments(found[0]))) + "\n")
     if len(found) > 1:
         say("\n".join(compare_files(found[0], found[1:])) + "\n")
-    pattern = propose_pattern([path for path in paths if isinstance(path, str)])
+    pattern = None
+    if len(paths) > 1:
+        pattern = propose_pattern([path for path in paths if isinstance(path, str)])
     if pattern:
         say("\n".join(point_lines(pattern)))
     name = given.write or _word_for(found[0].path)
@@ -70,11 +77,8 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         say(text)
         return
     if given.write is None:
-        if all(each.is_certain or each.found.lacks_only_time for each in found):
-            say_next(commands(found, "recognised", pattern, path=_hydra(given.path)))
-        else:  # what is only likely must be looked at in the written config
-            write = ["ep2sindy", "inspect", *given.path, "--write"]
-            say_next([shlex.join(write), *commands(found, name, pattern)])
+        more = ["data.plasma=true"] if given.plasma else []
+        say_next(commands(found, "recognised", pattern, path=_hydra(given.path), more=more))
         say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
         return
     if text := unlike(found):
@@ -105,15 +109,24 @@ def point_lines(pattern: FilePattern) -> list[str]:
 
 
 def commands(
-    found: Sequence[Inspection], group: str, pattern: FilePattern | None, *, path: str = ""
+    found: Sequence[Inspection],
+    group: str,
+    pattern: FilePattern | None,
+    *,
+    path: str = "",
+    more: Sequence[str] = (),
 ) -> list[str]:
     """Commands that can be run with the data; placeholders in capitals are for the user.
 
     group: name in the data group. pattern: of files that are operating points, which are studied as
-    such where an experiment has all that it needs. path: for a group that names no file.
+    such where an experiment has all that it needs. path: for the group `recognised`, which
+    names no file, and in which `more` and units are given too.
     """
     first = found[0]
-    step = [] if first.has_time else ["data.dt_s=STEP"]
+    units = ",".join(f"{name}:UNIT" for name in first.found.no_unit)
+    step = [STEP] * bool(first.found.no_time)
+    if group == "recognised":
+        step += [*more, *[f"data.units={{{units}}}"] * bool(units)]
     lines = []
     if pattern is not None:
         data = [f"data={group}", f"points.files={pattern.text}", *step]
@@ -146,7 +159,7 @@ def record_commands(found: Inspection, data: list[str], *, are_several: bool) ->
     lines = []
     if not found.lacking(NEEDS["breathing"]):
         lines.append(["+exp=breathing", *data, *channel(found), *preparation(found)])
-    traces = [n for n, v in found.variables.items() if found.is_trace(v)]
+    traces = found.traces
     if traces and not are_several:
         signal = "I_d" if "I_d" in traces else traces[0]
         lines.append(["+exp=trace", *data, f"signal={signal}"])
@@ -159,7 +172,7 @@ def record_commands(found: Inspection, data: list[str], *, are_several: bool) ->
 
 def channel(found: Inspection) -> list[str]:
     """The setting of the channel's length, if a zone of it needs one that the file lacks."""
-    return [] if found.z is None or found.channel_m else ["data.channel_m=LENGTH"]
+    return [] if found.z is None or found.source.channel_m else ["data.channel_m=LENGTH"]
 
 
 def preparation(found: Inspection) -> list[str]:
@@ -190,7 +203,7 @@ def experiments(found: Inspection) -> list[str]:
     for name, needed in NEEDS.items():
         lacking = found.lacking(needed) or (() if found.signals else ("a signal",))
         groups.setdefault(lacking, []).append(f"+exp={name}")
-    ready = "all there" if found.has_time else "all but the time is there"
+    ready = "all but what is asked is there" if found.found.asked else "all there"
     return [
         f"{'missing ' + ', '.join(lacking) if lacking else ready} for {', '.join(names)}"
         for lacking, names in groups.items()
@@ -208,7 +221,7 @@ def own_config(name: str, conf: Path) -> Path:
 
 
 def config_text(found: Sequence[Inspection], paths: Sequence[str | list[str]]) -> str:
-    """The config of the data group, with a comment on every entry that is only likely."""
+    """The config of the data group, with a comment on every unit that the file does not name."""
     first = found[0]
     variables = {n: Variable(None, u) for n, u in {**KNOWN_UNITS, "T_e_eV": "eV"}.items()}
     variables |= first.variables
@@ -257,4 +270,4 @@ def _flow(value: Any) -> str:
 
 
 def _word(found: Inspection, name: str) -> str:
-    return "  # likely: check it" if name in found.found.guesses else ""
+    return "  # the file names no unit: put it right" if name in found.found.no_unit else ""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ep2sindy.data.conversion import counted_in
-from ep2sindy.data.mapping import read_array
-from ep2sindy.data.quantities import typical
+from ep2sindy.data.mapping import N_MARKS, read_array
+from ep2sindy.data.numbers import digits_of_rounded, even_grid
 from ep2sindy.data.readers.source import FileSource
 from ep2sindy.data.readers.table_layout import unit_in_brackets
 
@@ -21,11 +21,12 @@ TEXT = "text or objects"  # problem of arrays that are not numbers
 class ArrayInfo:
     """Summary of one array in a file: shape, unit, range, missing values, spacing.
 
-    unit: "" if the file states none. low, high: range of the finite values. size: median magnitude
-    of the nonzero values. n_missing: number of NaN or infinite values. step: median step of
-    an increasing vector, else None. even: True if the steps are equal. gap: where steps that are
-    otherwise even leave out samples, in words. falls: where a vector first does not
-    increase, in words. problem: reason why the array cannot be used, or "".
+    unit: "" if the file states none. low, high: range of the finite values. n_missing: number of
+    NaN or infinite values. n_marks: of these, marks of overload or absence. step: median step of an
+    increasing vector, else None. even: True if the steps are equal. digits: to how many the times
+    of equal steps were rounded, so that some repeat, else None. gap: where steps that are otherwise
+    even leave out samples, in words. falls: where and how often a vector does not increase, in
+    words. problem: reason why the array cannot be used, or "".
     """
 
     name: str
@@ -35,10 +36,11 @@ class ArrayInfo:
     dims: tuple[str, ...] = ()
     low: float = np.nan
     high: float = np.nan
-    size: float = 0.0
     n_missing: int = 0
+    n_marks: int = 0
     step: float | None = None
     even: bool = False
+    digits: int | None = None
     gap: str = ""
     falls: str = ""
     problem: str = ""
@@ -50,8 +52,8 @@ class ArrayInfo:
 
     @property
     def is_counter(self) -> bool:
-        """True for a vector that merely numbers the samples, 0, 1, 2 ..., in no unit."""
-        return self.even and self.step == 1.0 and self.low in (0.0, 1.0) and self.unit in ("", "1")
+        """True for a vector without a unit that may number the samples, from 0, 1 or 22."""
+        return self.even and self.step == 1.0 and self.low % 1.0 == 0.0 and self.unit in ("", "1")
 
 
 def describe_array(source: FileSource, name: str) -> ArrayInfo:
@@ -65,17 +67,22 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     attribute = str(array.attrs.get("units", "") or source.units.get(name, ""))
     stated = counted_in(attribute) or unit_in_brackets(name)
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
-    is_vector = values.size in values.shape
-    steps = _steps(values.ravel()) if is_vector else np.empty(0)
+    points = values.ravel() if values.size in values.shape else np.empty(0)
+    digits = digits_of_rounded(points)
+    steps = np.diff(points if digits is None else even_grid(points))
+    falls = _fall(points, steps)
+    steps = steps if steps.size > 1 and not falls else np.empty(0)
     return ArrayInfo(
         name, values.shape, str(array.dtype), stated, dims,
         float(finite.min()) if finite.size else np.nan,
         float(finite.max()) if finite.size else np.nan,
-        typical(values), int(values.size - finite.size),
+        int(values.size - finite.size),
+        int(array.attrs.get(N_MARKS, 0)),
         float(np.median(steps)) if steps.size else None,
         bool(steps.size and np.ptp(steps) <= 1e-3 * steps.mean()),
+        digits,
         _gap(steps),
-        _fall(values.ravel()) if is_vector else "",
+        falls,
     )  # fmt: skip
 
 
@@ -83,19 +90,14 @@ def _short(text: str) -> str:
     return TEXT if "real numbers" in text else text
 
 
-def _fall(points: np.ndarray) -> str:
-    """Where points first do not increase, in words; empty if they do."""
-    falls = np.flatnonzero(np.diff(points) <= 0.0)
+def _fall(points: np.ndarray, steps: np.ndarray) -> str:
+    """Where points first do not increase, and how often, in words; empty if they do."""
+    falls = np.flatnonzero(~(steps > 0.0))
     if not falls.size:
         return ""
-    k = int(falls[0])
-    return f"{points[k + 1]:.9g} follows {points[k]:.9g} at row {k + 2}"
-
-
-def _steps(points: np.ndarray) -> np.ndarray:
-    """Steps of points that increase throughout; empty for others, and for fewer than three."""
-    steps = np.diff(points)
-    return steps if len(steps) > 1 and (steps > 0).all() else np.empty(0)
+    k, n_repeats = int(falls[0]), int((steps == 0.0).sum())
+    first = f"{points[k + 1]:.9g} follows {points[k]:.9g} at row {k + 2}"
+    return f"{first}; {n_repeats} repeat the one before, {falls.size - n_repeats} run back"
 
 
 def _gap(steps: np.ndarray) -> str:

@@ -20,12 +20,13 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.export import CLOCK
 from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
 from ep2sindy.data.numbers import check_nonnegative, count_dates, real_numbers, seconds
+from ep2sindy.data.quantities import axis_of, columns_in_si, time_unit
 from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import Relation, complete, relations_of
 from ep2sindy.library.roles import Roles
-from ep2sindy.library.units import SECONDS, Clock, seconds_in, time_unit_in
+from ep2sindy.library.units import SECONDS, Clock, seconds_in
 from ep2sindy.runtime.values import check_kind, check_list
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ def _trajectory(run: object, which: str, partial: bool) -> Trajectory:
 
 
 def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
+    """Convert a Dataset over time to a trajectory; see `_from_table`."""
     if tuple(field.dims) != ("time",):
         raise ValueError(
             "a Dataset must have the dimension time alone to be a run: "
@@ -124,8 +126,13 @@ def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
 
 
 def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
-    if _time_unit(table.index.name) or table.index.dtype.kind in "mM":
-        if not _time_unit(table.index.name):
+    """Convert a table with a column or an index of times to a trajectory, in SI.
+
+    Names, their units and marks of missing samples are read as those of a file are. partial: a row
+    that lacks some of the states stays, and these count as missing.
+    """
+    if time_unit(table.index.name) or table.index.dtype.kind in "mM":
+        if not time_unit(table.index.name):
             table = table.rename_axis(index=TIMES[0])  # dates are times, whatever they are called
         table = table.reset_index(allow_duplicates=True)
     table = table.set_axis([_word(name) for name in table.columns], axis="columns")
@@ -135,7 +142,7 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
             "or drop those that repeat"
         )
     times = [name for name in table.columns if name in TIMES]
-    times = times or [name for name in table.columns if _time_unit(name)]
+    times = times or [name for name in table.columns if axis_of(name) == "time"]
     if len(times) != 1:
         raise ValueError(
             f"a table must have one time column, called one of {list(TIMES)}, in s, or by its unit "
@@ -150,18 +157,21 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
     if wrong:
         way_out = "give time in s, as numbers or dates" if times[0] in wrong else "drop them"
         raise ValueError(f"columns of a table must hold real numbers: {wrong} came; {way_out}")
-    values = table[states].to_numpy(dtype=np.float64)
+    values, units = columns_in_si(table[states])
+    states = list(units)
     t, clock = _elapsed(table[times[0]])
     absent = np.isnan(values)
     if not absent.any():
-        return Trajectory(t, values, states, clock=clock)
+        return Trajectory(t, values, states, units=units, clock=clock)
     if partial and not absent.all(axis=0).any():
         kept = ~absent.all(axis=1)
-        run = Trajectory(t[kept], values[kept], states, missing=absent[kept], clock=clock)
+        run = Trajectory(
+            t[kept], values[kept], states, missing=absent[kept], units=units, clock=clock
+        )
         words = describe_missing(t, dict(zip(states, absent.T, strict=True)))
     else:
         kept = present_rows(dict(zip(states, values.T, strict=True)))
-        run = Trajectory(t[kept], values[kept], states, clock=clock)
+        run = Trajectory(t[kept], values[kept], states, units=units, clock=clock)
         words = describe_gaps(t[kept], len(table))
     warnings.warn(words, MissingSamples, stacklevel=5)
     return run
@@ -172,17 +182,12 @@ def _word(label: object) -> str:
     return f"x{label}" if isinstance(label, int | np.integer) else str(label)
 
 
-def _time_unit(name: object) -> str | None:
-    """Unit of a column of times that is called so; None for another column."""
-    return "s" if name in TIMES else time_unit_in(name) if isinstance(name, str) else None
-
-
 def _elapsed(column: pd.Series) -> tuple[Float[np.ndarray, " rows"], Clock]:
     """Times of a column in s, and their clock: the unit in its name; of dates, by their steps."""
     if column.dtype.kind in "mM":
         t, unit = count_dates(column)
         return t, Clock.of(unit)
-    unit = _time_unit(str(column.name)) or "s"
+    unit = time_unit(str(column.name)) or "s"
     t = seconds(column.to_numpy())
     return (t, SECONDS) if unit == "s" else (t * seconds_in(unit), Clock.of(unit))
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
-from ep2sindy.data.fields import COORDINATE_UNITS
 from ep2sindy.library.units import (
     PLAIN,
     check_unit,
@@ -18,6 +16,11 @@ from ep2sindy.library.units import (
     unit_errors,
     unit_product,
 )
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+COORDINATE_UNITS = {"time": "s", "z": "m", "r": "m"}
 
 # Units of our usual names. A unit of another dimension is a mistake in the mapping.
 KNOWN_UNITS = {
@@ -55,7 +58,12 @@ def to_si(array: xr.DataArray, ours: str, unit: str, *, is_variable: bool = Fals
 
 
 def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[float, float, str]:
-    """Factor, offset and target unit that convert numbers in `unit` to the unit of our name."""
+    """Factor, offset and target unit that convert numbers in `unit` to the unit of our name.
+
+    A variable without a unit stays a pure number, whatever it is called.
+    """
+    if is_variable and unit == "1":
+        return 1.0, 0.0, unit
     suffixes = (u for suffix, u in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}"))
     known = KNOWN_UNITS if is_variable else COORDINATE_UNITS | KNOWN_UNITS
     target = known.get(ours) or next(suffixes, None)
@@ -85,6 +93,17 @@ def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[floa
         named = (u for u in NAMED_UNITS if registry().Quantity(1, u).check(ruler.dimensionality))
         target = next(named, plain)
     return factor, zero, unit_product([(target, 1)])
+
+
+def converts(ours: str, unit: str, *, is_variable: bool = False) -> bool:
+    """True for a unit, other than that of a pure number, which converts to that of our name."""
+    if unit in ("", "1"):
+        return False
+    try:
+        conversion(ours, unit, is_variable=is_variable)
+    except ValueError:
+        return False
+    return True
 
 
 def same_unit(unit: str, stated: str) -> bool:

@@ -1,7 +1,6 @@
 """Assignment of an array's axes to time, z and r.
 
-The dimension names of the user or of the file decide, or else the lengths of the axes. Vectors
-without a known name are matched to axes by their lengths as well.
+The dimension names of the user or of the file decide, or else the lengths of the axes.
 """
 
 from __future__ import annotations
@@ -13,9 +12,8 @@ from itertools import permutations
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.arrays import ArrayInfo
 from ep2sindy.data.conversion import to_si
-from ep2sindy.data.fields import DIMS, SPACE
+from ep2sindy.data.fields import DIMS
 from ep2sindy.data.mapping import Problems, Variable, read_array
 from ep2sindy.data.numbers import even_grid
 from ep2sindy.data.readers.source import FileSource
@@ -153,49 +151,3 @@ def fitting(shape: Sequence[int], lengths: Mapping[str, int]) -> list[tuple[str,
         for option in permutations([d for d in lengths if lengths[d] > 1], len(longer))
         if tuple(lengths[d] for d in option) == longer
     ]
-
-
-def match_axes(
-    held: Sequence[ArrayInfo],
-    known: Mapping[str, ArrayInfo],
-    *,
-    has_step: bool,
-    questions: list[str],
-    guesses: dict[str, str],
-) -> dict[str, ArrayInfo]:
-    """Vectors for the axes of the arrays that have none: axis -> the only one of its length.
-
-    held: arrays whose names say nothing of axes, and those of `known`, the axes that are named.
-    has_step: True if times are built from a step. Of several axes the longest is likely time, and
-    an axis of space is likely z: both come with a message in `guesses`.
-    """
-    widest = max(held, key=lambda each: len(each.lengths), default=None)
-    if widest is None or len(widest.lengths) < 2:
-        return {}
-    left = Counter(widest.lengths) - Counter(n for one in known.values() for n in one.lengths)
-    named = {one.name for one in known.values()}
-    vectors = [e for e in held if e.step is not None and e.name not in named]
-    fits = {n: [each for each in vectors if each.lengths == (n,)] for n in left}
-    for n, options in fits.items():
-        if options and (len(options) > 1 or left[n] > 1):
-            names = " or ".join(repr(each.name) for each in options)
-            axes = f"{left[n]} axes" if left[n] > 1 else "axis"
-            questions.append(
-                f"the {axes} of {n} points of {widest.name!r} may be {names}: name time, z and r"
-            )
-            return {}
-    needs_time = "time" not in known and not has_step
-    n_time = max(left, default=0) if needs_time else 0
-    found = {"time": fits[n_time][0]} if fits.get(n_time) else {}
-    space = [options[0] for n, options in fits.items() if options and n != n_time]
-    open_axes = [axis for axis in SPACE if axis not in known]
-    if len(space) > 1 or len(space) > len(open_axes):
-        names = " and ".join(repr(each.name) for each in space)
-        questions.append(f"which of {names} is z and which is r cannot be told: name them")
-        space = []
-    found |= dict(zip(open_axes, space, strict=False))
-    if "time" in found and len(left) > 1:
-        guesses["time"] = f"time is likely {found['time'].name!r}, of the longest axis: give it"
-    if space and len(open_axes) > 1:
-        guesses["z"] = f"z is likely {space[0].name!r}, by its length, though it may be r: give it"
-    return found

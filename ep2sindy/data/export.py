@@ -22,10 +22,10 @@ def as_dataframe(
     values: Float[np.ndarray, "samples variables"],
     names: Sequence[str],
 ) -> pd.DataFrame:
-    """A column per variable, in SI, over an index `time` in s; `ep.discover` takes it as a run."""
+    """A column per variable, in SI, over an index `time_s`; `ep.discover` takes it as a run."""
     import pandas as pd  # takes time to import, and few ask for it
 
-    return pd.DataFrame(values, index=pd.Index(t, name="time"), columns=list(names))
+    return pd.DataFrame(values, index=pd.Index(t, name="time_s"), columns=list(names))
 
 
 def as_dataset(

@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.conversion import COORDINATE_UNITS
 from ep2sindy.data.export import CLOCK
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.library.units import Clock
@@ -25,8 +26,6 @@ from ep2sindy.runtime.files import read_json, write_bytes
 DIMS = ("time", "z", "r")
 
 SPACE = ("z", "r")
-
-COORDINATE_UNITS = {"time": "s", "z": "m", "r": "m"}
 
 
 def check_field(field: xr.Dataset) -> None:

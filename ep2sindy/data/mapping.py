@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from ep2sindy.data.gaps import without_marks
 from ep2sindy.data.readers.source import FileSource, damage_named
 from ep2sindy.library.names import check_variable
 from ep2sindy.runtime.screen import near_words
+
+N_MARKS = "n_marks"  # attribute of an array: number of samples that were marks of overload
 
 N_LISTED = 100  # largest number of names listed in an error
 
@@ -115,7 +118,12 @@ def read_array(source: FileSource, ours: str, name: str) -> xr.DataArray:
         ) from error
     if (unit := source.units.get(whole)) and not array.attrs.get("units"):
         array = array.assign_attrs(units=unit)
-    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+    array = array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+    if not source.is_table:
+        return array
+    values = without_marks(array.values)
+    n_marks = int(np.isnan(values).sum() - np.isnan(array.values).sum())
+    return array.copy(data=values).assign_attrs({N_MARKS: n_marks} if n_marks else {})
 
 
 def _split_selection(source: FileSource, name: str) -> tuple[str | None, tuple[int | slice, ...]]:

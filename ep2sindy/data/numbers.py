@@ -48,7 +48,7 @@ def real_numbers(values: object, what: str) -> np.ndarray:
 def seconds(t: object) -> np.ndarray:
     """Convert times to s: numbers are taken as s, dates are counted from the first one.
 
-    Single-precision times that lie on an even grid within their rounding are moved onto that grid.
+    Rounded times are moved onto their even grid, see `even_grid`.
     Raises ValueError for anything but numbers and dates.
     """
     array = t if isinstance(t, np.ma.MaskedArray) else np.asarray(t)
@@ -56,8 +56,7 @@ def seconds(t: object) -> np.ndarray:
         array = array - array.flat[0]
     if array.dtype.kind == "m":
         return np.where(np.isnat(array), np.nan, array / np.timedelta64(1, "s"))
-    is_short = array.ndim == 1 and array.dtype in (np.float16, np.float32)
-    return even_grid(array) if is_short else real_numbers(array, "t")
+    return even_grid(array) if array.ndim == 1 else real_numbers(array, "t")
 
 
 def count_dates(dates: pd.Series) -> tuple[Float[np.ndarray, " rows"], str]:
@@ -73,12 +72,17 @@ def count_dates(dates: pd.Series) -> tuple[Float[np.ndarray, " rows"], str]:
 
 
 def even_grid(t: Shaped[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """Convert times to float64; in a shorter type, times even within rounding become exactly even.
+    """Convert times to float64; those that are even within rounding become exactly even.
 
-    Other times keep their values.
+    These are times of a shorter type, and times that repeat because they were written with few
+    digits. Other times keep their values.
     """
     times = real_numbers(t, "t")
-    if len(times) < 3 or t.dtype not in (np.float16, np.float32):
+    if len(times) < 3:
+        return times
+    if digits_of_rounded(times) is not None:
+        return np.linspace(times[0], times[-1], len(times))
+    if t.dtype not in (np.float16, np.float32):
         return times
     largest = np.abs(t).max()
     grid = np.linspace(times[0], times[-1], len(times))
@@ -88,6 +92,27 @@ def even_grid(t: Shaped[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"
     rounding = 2.0 * float(np.spacing(largest))  # rounding of a sample plus that of the grid's ends
     is_rounded = rounding <= 0.5 * step and np.abs(times - grid).max() <= rounding
     return grid if is_rounded else times
+
+
+def digits_of_rounded(t: Float[np.ndarray, " samples"]) -> int | None:
+    """Number of digits to which times of equal steps were rounded so that some repeat; or None.
+
+    Each time must lie on the even grid within one unit of its last digit, and the steps must be
+    shorter than that: a row that was written twice makes no rounded times. Nor do fewer than five
+    different times.
+    """
+    if len(t) < 8 or not np.isfinite(t).all():
+        return None
+    steps = np.diff(t)
+    if (steps < 0).any() or (steps > 0).all() or np.count_nonzero(steps) < 4:
+        return None
+    grid = np.linspace(t[0], t[-1], len(t))
+    for digits in range(1, 7):
+        if np.array_equal(t, [float(f"{value:.{digits - 1}e}") for value in t.tolist()]):
+            unit = 10.0 ** (np.floor(np.log10(np.abs(t).max())) - digits + 1)
+            fits = np.abs(t - grid).max() <= unit and 0.02 * unit < grid[1] - grid[0] < 0.9 * unit
+            return digits if fits else None
+    return None
 
 
 def rounding_s(t: Float[np.ndarray, " samples"]) -> float:

@@ -20,7 +20,7 @@ from ep2sindy.data.export import CLOCK
 from ep2sindy.data.fields import DIMS, check_field, mask_outside, write_netcdf
 from ep2sindy.data.gaps import usual_step
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
-from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit, unit_doubts
+from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import reader_of
 from ep2sindy.data.readers.source import UNDECODED, FileSource, damage_named, file_named
@@ -38,6 +38,8 @@ def open_field(
     dt_s: float | None = None,
     mask: Variable | Keys | None = None,
     channel_m: float | None = None,
+    units: Mapping[str, str] | None = None,
+    plasma: bool = False,
     chunks: Mapping[str, int] | None = None,
 ) -> xr.Dataset:
     """Open a file as a field, with our names, dimensions and units.
@@ -45,16 +47,17 @@ def open_field(
     path: a file of any kind in docs/data.md; of a code that writes a file per step, a pattern such
         as `dump_*.h5`, or a list. Steps are joined along time, those in groups of one file too.
     variables: our name -> location in the file, as a `Variable` or the same keys from a config;
-        those with name None are left out. None: every quantity that names, units and shapes
-        identify without doubt, see `ep2sindy.inspect_file`; time, z and r are then found as well.
+        those with name None are left out. None: all that `ep2sindy.inspect_file` is sure of.
     time, z, r: the coordinates; None, or name None, if the file has none.
     dt_s: time step in s, taken instead of `time`; of a run in numbered steps, the time of one.
     mask: array that is nonzero where there is plasma; elsewhere values become NaN.
     channel_m: length of the channel from z = 0, stored as an attribute; None: as in the file.
+    units: our name -> unit, where the file states none. plasma: names such as Te are a plasma's
+        quantities without a unit, too, and what has no unit is in SI. Both without `variables`.
     chunks: our dimension -> length, to stream data that exceed memory (needs dask; NetCDF, Zarr).
     Values from NetCDF and Zarr are read when they are used; without dask, this holds for variables
     in SI without a mask. Other kinds of file are read at once.
-    Warns with `DoubtfulUnit` if numbers look like another unit, or dt_s contradicts the times.
+    Warns with `DoubtfulUnit` if dt_s contradicts the file's times.
     Raises one ValueError for all names not in the file, shapes that do not fit their dimensions,
     and units that cannot be converted; also for a missing or damaged file, or one of another kind.
 
@@ -63,21 +66,18 @@ def open_field(
     'm^-3'
     """
     source = open_record(path)
-    axes = {"time": time, "z": z, "r": r}
-    times = [*in_file({"time": time}, Problems()).values()]
+    axes: Mapping[str, Variable | Keys | None] = {"time": time, "z": z, "r": r}
+    times: Sequence[Variable] = [*in_file({"time": time}, Problems()).values()]
     if variables is None:
-        found = recognise(source, dt_s=dt_s, given={n: v for n, v in axes.items() if v})
+        found = recognise(source, dt_s=dt_s, given=axes, units=units, plasma=plasma)
         found.check(source)
-        variables, dt_s, times = found.variables, found.dt_s, times or found.replaced
-        axes = {axis: given or found.axes.get(axis) for axis, given in axes.items()}
+        variables, axes, dt_s, times = found.variables, found.axes, found.dt_s, found.replaced
     with file_named(source.path):
         field = _field(source, variables, axes, dt_s, mask, chunks)
-    doubt = _step_doubt(source, times, field, dt_s)
+    if doubt := _step_doubt(source, times, field, dt_s):
+        warnings.warn(doubt, DoubtfulUnit, stacklevel=2)
     said = {"channel_m": channel_m or source.channel_m, "file": str(source.path), STEP_DOUBT: doubt}
-    field.attrs |= {name: value for name, value in said.items() if value}
-    for text in unit_doubts(field):
-        warnings.warn(text, DoubtfulUnit, stacklevel=2)
-    return field
+    return field.assign_attrs({name: value for name, value in said.items() if value})
 
 
 def _step_doubt(

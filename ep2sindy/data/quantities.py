@@ -1,111 +1,115 @@
-"""Known quantities of a thruster: units, typical sizes and aliases of our usual names."""
+"""Names in files: the quantities of a thruster, the axes, counters, and units at a name's end."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
+from jaxtyping import Float
 
-from ep2sindy.data.conversion import KNOWN_UNITS, conversion
-from ep2sindy.data.fields import COORDINATE_UNITS
+from ep2sindy.data.conversion import (
+    COORDINATE_UNITS,
+    KNOWN_UNITS,
+    SUFFIX_UNITS,
+    conversion,
+    converts,
+)
+from ep2sindy.data.gaps import without_marks
+from ep2sindy.data.readers.table_layout import split_name
+from ep2sindy.library.units import is_count, time_unit_in
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 STEP_DOUBT = "step_doubt"  # attribute of a field: how dt_s contradicts the file's own times
 
 
 class DoubtfulUnit(UserWarning):
-    """Warns that numbers look like another unit than the stated one, or contradict a step."""
+    """Warns that a step contradicts the file's own times."""
 
 
 @dataclass(frozen=True)
 class KnownQuantity:
     """One quantity of a thruster.
 
-    low, high: range of the median magnitude, in `unit`. others: further units that files often
-    use. words: aliases, each a sorted tuple of words as `words_of` returns it.
+    full: names that say by themselves what they are. short: names that other things bear too, which
+    count only beside a unit that fits. Each is a sorted tuple of words as `words_of` returns it.
     """
 
     unit: str
-    low: float
-    high: float
-    others: tuple[str, ...]
-    words: frozenset[tuple[str, ...]]
-
-    def fits(self, size: float, factor: float = 1.0) -> bool:
-        """True if a median magnitude is plausible for this quantity; 0 (all zeros) always is."""
-        return size == 0.0 or self.low <= factor * size <= self.high
+    full: frozenset[tuple[str, ...]]
+    short: frozenset[tuple[str, ...]]
 
 
 def _names(*texts: str) -> frozenset[tuple[str, ...]]:
     return frozenset(tuple(sorted(text.split())) for text in texts)
 
 
-_SI = COORDINATE_UNITS | KNOWN_UNITS
 QUANTITIES: dict[str, KnownQuantity] = {
     "n_i": KnownQuantity(
-        _SI["n_i"], 1e14, 1e21, ("cm^-3",),
-        _names("n i", "ni", "i n0 n", "i dens", "n_i", "nion", "n plasma", "dens plasma"),
+        KNOWN_UNITS["n_i"], _names("ion density", "plasma density"),
+        _names("n i", "ni", "n ion", "nion", "n plasma", "i density"),
     ),
     "n_n": KnownQuantity(
-        _SI["n_n"], 1e15, 1e24, ("cm^-3",),
-        _names("n n", "nn", "n neutral", "nneutral", "neutral dens", "na", "n a", "ng", "n g"),
+        KNOWN_UNITS["n_n"], _names("neutral density"),
+        _names("n n", "nn", "n neutral", "nneutral", "na", "n a", "ng", "n g"),
     ),
     "u_iz": KnownQuantity(
-        _SI["u_iz"], 50.0, 2e5, ("km/s",),
-        _names("u i z", "uiz", "u i", "ui", "viz", "vi", "u z", "uz", "vz", "i z u", "i vel z"),
+        KNOWN_UNITS["u_iz"], _names("ion velocity z", "ion axial velocity", "ion velocity"),
+        _names("u i z", "uiz", "u i", "ui", "v i z", "viz", "v i", "vi", "u z", "uz", "v z", "vz"),
     ),
     "u_ir": KnownQuantity(
-        _SI["u_ir"], 1.0, 2e5, ("km/s",),
-        _names("u i r", "uir", "vir", "u r", "ur", "vr"),
+        KNOWN_UNITS["u_ir"], _names("ion velocity r", "ion radial velocity"),
+        _names("u i r", "uir", "v i r", "vir", "u r", "ur", "v r", "vr"),
     ),
     "T_e_eV": KnownQuantity(
-        "eV", 0.1, 300.0, ("K",),
-        _names("t e", "te", "tev", "t electron", "e temp", "electron temp", "temp e"),
+        "eV", _names("electron temperature"),
+        _names("t e", "te", "tev", "t e ev", "t electron", "e temperature"),
     ),
     "R_ion": KnownQuantity(
-        _SI["R_ion"], 0.0, 1e-11, ("cm^3/s",),
-        _names("r i", "rion", "kion", "k i", "rate", "i rate", "kiz", "k iz", "iz rate"),
+        KNOWN_UNITS["R_ion"], _names("ionization rate"),
+        _names("r i", "r ion", "rion", "k ion", "kion", "k i", "rate", "i rate", "k iz", "kiz",
+               "iz rate"),
     ),
     "I_d": KnownQuantity(
-        _SI["I_d"], 1e-3, 300.0, ("mA",),
-        _names("i d", "id", "d current", "current", "d i", "idis", "i discharge"),
+        KNOWN_UNITS["I_d"], _names("discharge current"),
+        _names("i d", "id", "d current", "current", "idis", "i discharge"),
     ),
     "V_d": KnownQuantity(
-        _SI["V_d"], 1.0, 2e4, ("kV", "mV"),
-        _names("u d", "vd", "ud", "d voltage", "voltage", "vdis", "udis"),
+        KNOWN_UNITS["V_d"], _names("discharge voltage"),
+        _names("v d", "vd", "u d", "ud", "d voltage", "voltage", "vdis", "udis"),
     ),
 }  # fmt: skip
 
-AXES: dict[str, KnownQuantity] = {
-    "time": KnownQuantity(
-        "s", 0.0, np.inf, ("us", "ms", "ns"),
-        _names("t", "time", "times", "timestamp", "tvec", "seconds", "sec"),
-    ),
-    "z": KnownQuantity("m", 1e-4, 1.0, ("mm", "cm"), _names("z", "axial", "zz")),
-    "r": KnownQuantity("m", 1e-4, 1.0, ("mm", "cm"), _names("r", "radial", "rr")),
-}  # fmt: skip
+AXIS_NAMES = {
+    "time": _names("t", "time", "times", "timestamp", "tvec", "seconds", "sec"),
+    "z": _names("z", "axial", "zz"),
+    "r": _names("r", "radial", "rr"),
+}
+
+# Names of what numbers or labels samples: no time without a step, and no signal.
+COUNTERS = frozenset({
+    "cycle", "step", "iteration", "iter", "it", "frame", "index", "idx", "sample", "samples",
+    "counter", "count", "sequence", "seq", "row", "record", "id", "ids", "no", "nr",
+})  # fmt: skip
 
 # Variables that can be computed if a file lacks them: name -> (source variable, step of `prepare`).
 MADE_FROM = {"R_ion": ("T_e_eV", "ep2sindy.thruster.ionization_rate")}
 
-PLASMA = frozenset({"n_i", "n_n", "u_iz", "u_ir", "T_e_eV", "R_ion"})
-LONGEST_STEP_S = 1e-3  # longest plausible time step of plasma records: ten breathing periods
-
 # Words found in names -> their meaning; "" marks a word without meaning.
 WORDS = {
-    **dict.fromkeys(("density", "densities", "number"), "dens"),
-    **dict.fromkeys(("ion", "ions", "plus"), "i"),
-    **dict.fromkeys(("neutrals", "neut", "atom", "atoms", "gas"), "neutral"),
-    **dict.fromkeys(("v", "velocity", "vel", "speed"), "u"),
+    **dict.fromkeys(("densities", "dens", "number"), "density"),
+    **dict.fromkeys(("ions",), "ion"),
+    **dict.fromkeys(("neutrals", "neut", "atom", "atoms"), "neutral"),
+    **dict.fromkeys(("vel", "speed"), "velocity"),
     **dict.fromkeys(("radius", "rad"), "radial"),
-    **dict.fromkeys(("temperature",), "temp"),
-    **dict.fromkeys(("electrons", "el", "elec"), "electron"),
-    **dict.fromkeys(("discharge", "dis", "anode"), "d"),
+    **dict.fromkeys(("temp",), "temperature"),
+    **dict.fromkeys(("electrons", "elec"), "electron"),
+    **dict.fromkeys(("anode",), "discharge"),
     **dict.fromkeys(("curr",), "current"),
-    **dict.fromkeys(("volt", "volts", "potential"), "voltage"),
-    **dict.fromkeys(("ionization", "ionisation", "iz", "ioniz"), "iz"),
+    **dict.fromkeys(("ionisation",), "ionization"),
     **dict.fromkeys(("coefficient", "coeff", "coef"), ""),
     **dict.fromkeys(("grid", "pos", "position", "coord", "coordinate", "coords", "points"), ""),
     **dict.fromkeys(("cells", "centers", "centres", "axis", "vec", "vector", "cell"), ""),
@@ -124,32 +128,33 @@ HALLTHRUSTER = {
 STEPS = frozenset({"dt", "dts", "deltat", "timestep", "sampletime", "samplinginterval"})
 RATES = frozenset({"fs", "samplingrate", "samplerate", "samplingfrequency", "fshz"})
 
-# Units written at the end of a name.
+# Units written at the end of a name. Their case counts: `mM` is no millimetre.
 ENDINGS = {
-    "s": "s", "ms": "ms", "us": "us", "ns": "ns", "m": "m", "cm": "cm", "mm": "mm", "ev": "eV",
-    "k": "K", "a": "A", "ma": "mA", "v": "V", "mv": "mV", "kv": "kV", "m3": "m^-3", "cm3": "cm^-3",
-    "m_s": "m/s", "km_s": "km/s", "m3_s": "m^3/s", "cm3_s": "cm^3/s",
+    "s": "s", "ms": "ms", "us": "us", "ns": "ns", "m": "m", "cm": "cm", "mm": "mm", "eV": "eV",
+    "ev": "eV", "K": "K", "A": "A", "mA": "mA", "V": "V", "mV": "mV", "kV": "kV", "m3": "m^-3",
+    "cm3": "cm^-3", "m_s": "m/s", "km_s": "km/s", "m3_s": "m^3/s", "cm3_s": "cm^3/s",
 }  # fmt: skip
 
 
-def split_unit(name: str) -> tuple[str, str | None]:
-    """Split a unit off the end of a name: `t_us` gives `t` and `us`; the unit is None if absent."""
+def split_unit(name: str) -> tuple[str, str]:
+    """Split a unit off the end of a name: `t_us` gives `t` and `us`; the unit is "" if absent."""
     for ending in sorted(ENDINGS, key=len, reverse=True):
-        if name.lower().endswith(f"_{ending}") and len(name) > len(ending) + 1:
+        if name.endswith(f"_{ending}") and len(name) > len(ending) + 1:
             return name[: -len(ending) - 1], ENDINGS[ending]
-    return name, None
+    return name, ""
 
 
 def last_of(name: str) -> str:
     """Last part of a path such as `plasma/n_i`; a slash in brackets, as in `x (1/ml)`, is none."""
-    return re.split(r"[/.]", re.sub(r"(?<=.)\s*[(\[].*?[)\]]", "", name))[-1]
+    return re.split(r"[/.]", re.sub(r"(?<=.)\s*[(\[].*?[)\]]", "", name).rstrip(". "))[-1]
 
 
 def words_of(name: str) -> tuple[str, ...]:
-    """Meanings of the words in a name, sorted: `ionDensity` and `density_ion` give the same."""
-    parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)
-    said = [WORDS.get(part.lower(), part.lower()) for part in parts]
-    return tuple(sorted(word for word in said if word))
+    """Words of a name, sorted: `ionDensity` and `density_ion` give the same. T alone is no t."""
+    if name == "T":
+        return ("T",)
+    parts = (part.lower() for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name))
+    return tuple(sorted(word for word in (WORDS.get(part, part) for part in parts) if word))
 
 
 def step_said(name: str, value: float) -> float | None:
@@ -161,75 +166,83 @@ def step_said(name: str, value: float) -> float | None:
     return value if plain in STEPS else 1.0 / value if plain in RATES else None
 
 
-def meant_by(name: str) -> set[str]:
-    """Our names that a name in a file may stand for, judged by its last part or its whole path."""
-    known = QUANTITIES | AXES
-    if name in known:
-        return {name}
-    exact = {ours for pattern, ours in HALLTHRUSTER.items() if re.fullmatch(pattern, name)}
-    if exact:
-        return exact
+def is_counter_name(name: str) -> bool:
+    """True for the name of what numbers samples, or labels them: `frame`, `id`, `Sample_No`."""
+    words = words_of(last_of(name))
+    return bool(words) and {*words} <= COUNTERS
+
+
+def axis_of(name: str) -> str | None:
+    """The axis that a name in a file says, with or without a unit at its end; None for none."""
     last = last_of(name)
-    for text in (last, split_unit(last)[0], name, split_unit(name)[0]):
-        if last.isdigit():
-            break
-        if said := words_of(text):
-            found = {ours for ours, quantity in known.items() if said in quantity.words}
-            if found:
-                return found
-    return set()
+    for pattern, ours in HALLTHRUSTER.items():
+        if ours in AXIS_NAMES and re.fullmatch(pattern, name):
+            return ours
+    for axis, names in AXIS_NAMES.items():
+        if {words_of(last), words_of(split_unit(last)[0])} & names:
+            return axis
+    return "time" if time_unit_in(last) else None
 
 
-def typical(values: np.ndarray) -> float:
-    """Median magnitude of the values that are neither zero nor missing; 0 if there are none."""
-    sizes = np.abs(values[np.isfinite(values) & (values != 0)])
-    return float(np.median(sizes)) if sizes.size else 0.0
+def axis_unit(axis: str, name: str, stated: str) -> str:
+    """Unit of an axis: the stated one, or that in its name; "" if neither is given."""
+    in_name = (time_unit_in(last_of(name)) or "") if axis == "time" else ""
+    options = (stated, in_name, split_unit(last_of(name))[1])
+    unit = COORDINATE_UNITS[axis]
+    return next((each for each in options if each == unit or converts(axis, each)), "")
 
 
-def likely_time_unit(step: float, names: Iterable[str]) -> str | None:
-    """Unit of time in which a plasma's record has steps near 1 us; None if seconds are plausible.
+def quantity_of(name: str, stated: str, *, plasma: bool) -> tuple[str, str] | None:
+    """Our name for an array, and the unit it has, "" for none; None if it keeps its own name.
 
-    step: time step in the file's numbers. names: variables of the record. Without a plasma
-    variable the result is None, since a current alone may be logged once a second.
+    A short name needs a unit that fits, stated or at its end; a full one stands for itself, unless
+    its unit contradicts it. stated: "" for none. plasma: short names stand for themselves too.
     """
-    if step <= LONGEST_STEP_S or not PLASMA & {*names}:
+    last = last_of(name)
+    base, ending = split_unit(last)
+    unit = stated or ending
+    spelled = {words_of(text) for text in (name, last, base)} if not last.isdigit() else set()
+    exact = next((ours for text, ours in HALLTHRUSTER.items() if re.fullmatch(text, name)), None)
+    for ours, quantity in QUANTITIES.items():
+        is_full = bool(spelled & quantity.full)
+        if not (is_full or ours in (exact, last, base) or spelled & quantity.short):
+            continue
+        fits = converts(ours, unit, is_variable=True) if unit else is_full or plasma
+        return (ours, unit) if fits else None
+    return None
+
+
+def own_unit(ours: str, stated: str) -> str:
+    """Unit that a file states, or that the suffix of a name promises, if it converts; else "1".
+
+    A count of named things that the file states, such as `animals/ml`, stays as it is.
+    """
+    if stated and is_count(stated):
+        return stated
+    suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
+    options = (stated, *suffixes)
+    return next((unit for unit in options if converts(ours, unit, is_variable=True)), "1")
+
+
+def columns_in_si(
+    table: pd.DataFrame,
+) -> tuple[Float[np.ndarray, "rows states"], dict[str, str]]:
+    """Samples of a table's columns by the units in their names, and state -> unit."""
+    values = np.empty(table.shape)
+    units: dict[str, str] = {}
+    for k, label in enumerate(table.columns):
+        name, stated = split_name(label)
+        name, unit = quantity_of(name, stated, plasma=False) or (name, own_unit(name, stated))
+        units[name] = unit or "1"
+        values[:, k] = without_marks(table[label].to_numpy(dtype=np.float64))
+        if not is_count(units[name]):
+            factor, zero, units[name] = conversion(name, units[name], is_variable=True)
+            values[:, k] = factor * values[:, k] + zero
+    return values, units
+
+
+def time_unit(name: object) -> str | None:
+    """Unit of a column of times that is called so, seconds by default; None for another column."""
+    if not isinstance(name, str) or axis_of(name) != "time":
         return None
-    factors = {unit: conversion("time", unit)[0] for unit in AXES["time"].others}
-    return min(factors, key=lambda unit: abs(np.log10(step * factors[unit] / 1e-6)))
-
-
-def unit_doubts(field: xr.Dataset) -> list[str]:
-    """Messages about quantities whose numbers look like another unit.
-
-    Densities of 1e12 m^-3, for example, suggest that the file uses cm^-3. On a grid only the
-    middle sample in time is examined. A step that contradicts the file's times comes first.
-    """
-    found = [str(field.attrs[STEP_DOUBT])] if STEP_DOUBT in field.attrs else []
-    step = float(np.diff(field["time"].values[:2])[0])
-    if (unit := likely_time_unit(step, map(str, field.data_vars))) is not None:
-        found.append(
-            f"time goes in steps of {step:.2g} s, as if the file counted in {unit}: give its unit, "
-            f"data.time.unit={unit}, or leave this aside if it is right"
-        )
-    for name, quantity in (QUANTITIES | AXES).items():
-        # A variable z without that axis is a state of another system.
-        if name not in (field.dims if name in AXES else field.data_vars):
-            continue
-        array = field[name]
-        if "time" in array.dims and array.ndim > 1:
-            array = array.isel(time=array.sizes["time"] // 2)
-        size = typical(np.asarray(array.values, dtype=np.float64))
-        if quantity.fits(size):
-            continue
-        looks = [unit for unit in quantity.others if quantity.fits(size, conversion(name, unit)[0])]
-        if looks:
-            found.append(
-                f"{name} is about {size:.2g} {quantity.unit}, as if the file counted in "
-                f"{' or '.join(looks)}: give its unit, data{_place(name)}.unit={looks[0]}, or "
-                "leave this aside if it is right"
-            )
-    return found
-
-
-def _place(name: str) -> str:
-    return f".{name}" if name in AXES else f".variables.{name}"
+    return axis_unit("time", name, split_name(name)[1]) or "s"

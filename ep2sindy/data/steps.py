@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.quantities import meant_by, step_said
+from ep2sindy.data.quantities import axis_of, step_said
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.readers.source import FileSource, damage_named
 
@@ -97,9 +97,11 @@ def files_of(path: object) -> list[str]:
 
 def join_groups(source: FileSource) -> FileSource:
     """Join the groups of steps of a file along time; a file without such groups stays as it is."""
+    if source.is_table:
+        return source
     groups = step_groups(source.names)
     least = 2 if groups.words - {""} else LEAST_UNNAMED
-    if len(groups.numbers) < least or source.is_table or _has_times(source, groups):
+    if len(groups.numbers) < least or _has_times(source, groups):
         return source
     inside = {name for places in groups.arrays.values() for name in places.values()}
     shared = {name: (source, name) for name in source.names if name not in inside}
@@ -135,7 +137,7 @@ def _has_times(source: FileSource, groups: StepGroups) -> bool:
     first = {places[number] for places in groups.arrays.values() for number in [min(places)]}
     inside = {name for places in groups.arrays.values() for name in places.values()}
     looked_at = [name for name in source.names if name in first or name not in inside]
-    return any(_size(source, name) > 1 for name in looked_at if "time" in meant_by(name))
+    return any(_size(source, name) > 1 for name in looked_at if axis_of(name) == "time")
 
 
 def _size(source: FileSource, name: str) -> int:
@@ -151,18 +153,18 @@ def are_steps(files: Sequence[str]) -> bool:
 
     A file without times is a step if its arrays have no axis besides those of z and r.
     """
-    if len(_numbers(files)) < len(files) or len(files) < 2:
+    if len(files) < 2 or len(_numbers(files)) < len(files):
         return False
     source = open_source(Path(files[0]))
     if source.is_table or source.step_s is not None or len(step_groups(source.names).numbers) > 1:
         return False
     with damage_named(source.path):
         arrays = {name: source.read(name) for name in source.names}
-    meant = {name: meant_by(name) for name in arrays}
-    times = [array for name, array in arrays.items() if "time" in meant[name]]
+    axes = {name: axis_of(name) for name in arrays}
+    times = [array for name, array in arrays.items() if axes[name] == "time"]
     if times:
         return all(array.size == 1 for array in times)
-    grid = {n for name, array in arrays.items() if meant[name] & {"z", "r"} for n in array.shape}
+    grid = {n for name, array in arrays.items() if axes[name] in ("z", "r") for n in array.shape}
     lengths = {n for array in arrays.values() for n in array.shape if n > 1}
     return bool(grid) and lengths <= grid
 

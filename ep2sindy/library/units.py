@@ -28,6 +28,7 @@ _ONE = rf"(?:{_NUMBER}|[^\W\d]\w*(?:-\d{{1,2}}(?!\d))?|°\s?\w+|%){_POWER}"
 _JOIN = r"(?:\s*[*/.·×]\s*|\s+)"
 _FACTOR = rf"(?:{_ONE}|\({_ONE}(?:{_JOIN}{_ONE})*\){_POWER})"
 _UNIT = re.compile(rf"\s*{_FACTOR}(?:{_JOIN}{_FACTOR})*\s*")
+_FACTOR_BEFORE = re.compile(rf"{_NUMBER}\s+(?=[^\W\d])")  # of `1e17 m^-3`
 LONGEST = 60  # largest number of characters in a unit
 
 
@@ -92,10 +93,11 @@ def _plain_powers(unit: str) -> dict[str, float] | None:
 
 @cache
 def unit_like(text: str, like: str | None = None) -> bool:
-    """True if a text is a unit; with `like`, if it also converts to that unit."""
+    """True if a text is a unit, perhaps with a factor; with `like`, if it converts to that unit."""
     try:
         check_unit(text)
-        parsed = registry().parse_units(netcdf_powers(text)) if text.strip() else None
+        plain = _FACTOR_BEFORE.sub("", text.strip())
+        parsed = registry().parse_units(netcdf_powers(plain)) if plain else None
     except unit_errors():
         return False
     if parsed is None or like is None:
@@ -156,8 +158,10 @@ CALENDAR = ("day", "h", "min", "s")
 def time_unit_in(name: str) -> str | None:
     """Unit of time that a name says: `Year` gives `year`, `Time (h)` gives `h`; else None.
 
-    A short unit such as `h` counts only beside a word for time.
+    A short unit such as `h` counts only beside a word for time; T is none.
     """
+    if re.match(r"T\b", name):
+        return None
     words = re.findall(r"[^\W\d_]+", name.lower())
     units = [word for word in words if word not in TIME_WORDS]
     if len(units) != 1:

@@ -8,7 +8,7 @@ from functools import partial
 from itertools import product
 from typing import Annotated, Any
 
-from ep2sindy.data.quantities import unit_doubts
+from ep2sindy.data.quantities import STEP_DOUBT
 from ep2sindy.data.trajectory import ConstantStateError
 from ep2sindy.operating.file_names import FilePattern
 from ep2sindy.operating.records import OperatingRecord, naming, point_label
@@ -108,7 +108,8 @@ class PointSource:
                     return OperatingRecord(self.parameters, None, status)
                 sampling = self.source.trajectory
                 run = sampling.trajectory(field, inputs=inputs, label=self.label)
-                notes = amiss(field.attrs) if is_simulation(field.attrs) else unit_doubts(field)
+                doubts = [field.attrs[STEP_DOUBT]] if STEP_DOUBT in field.attrs else []
+                notes = amiss(field.attrs) if is_simulation(field.attrs) else doubts
                 words = [field.attrs.get("file", ""), sampling.place(field)]
                 used = "; ".join(word for word in words if word)
                 return OperatingRecord(self.parameters, run, notes=notes, used=used)

@@ -11,7 +11,7 @@ import xarray as xr
 
 from ep2sindy.data.fields import clock_of, grid_points
 from ep2sindy.data.gaps import describe_breaks, describe_gaps, usual_step
-from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
+from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit
 from ep2sindy.data.sampling import ZoneAverage
 from ep2sindy.data.steps import records_of
 from ep2sindy.data.trajectory import Trajectory
@@ -164,10 +164,9 @@ def say_field(run: Run, field: xr.Dataset) -> None:
 
 
 def say_doubts(run: Run, field: xr.Dataset) -> None:
-    """Warn of numbers in a file that look like another unit."""
-    if "file" in field.attrs:
-        for text in unit_doubts(field):
-            run.warn(text)
+    """Warn of a step that contradicts the file's own times."""
+    if STEP_DOUBT in field.attrs:
+        run.warn(field.attrs[STEP_DOUBT])
 
 
 def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import codecs
 import re
-from functools import partial
+from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import TextIO
 
@@ -13,15 +14,22 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
-from ep2sindy.data.readers.notation import remove_grouping
 from ep2sindy.data.readers.source import FileSource, Reader, counted_dates
-from ep2sindy.data.readers.table_layout import COMMENTS, MISSING, SEPARATORS, Layout, layout_of
+from ep2sindy.data.readers.table_layout import (
+    COMMENTS,
+    GROUPED,
+    MISSING,
+    PARTED,
+    Layout,
+    layout_of,
+)
 
-# Lines and characters examined to find the layout; no known preamble is longer.
-N_LOOKED_AT, CHARACTERS_LOOKED_AT = 2000, 10_000_000
+N_LOOKED_AT = 2000  # lines examined to find the layout; no known preamble is longer
 
-# Limits on what is passed to pandas, which needs hundreds of bytes for every column.
-LONGEST_LINE, MAX_COLUMNS = 1_000_000, 10_000
+# Times of day; dates of ISO 8601, perhaps with one; and dates that may be read in two ways.
+CLOCK = r"\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?\s?(?:[AaPp][Mm])?"
+DATE = rf"\d{{4}}-\d\d-\d\d(?:[ T]{CLOCK}(?:Z|[+-]\d\d:?\d\d)?)?"
+SLASHED = r"\d{1,2}[/.-]\d{1,2}[/.-]\d{2,4}\b"
 
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
@@ -31,8 +39,9 @@ def read_csv(path: Path) -> FileSource:
 
     Decimal commas, thousands separators, a preamble and a line of units are recognised from the
     content; a header is optional. A column's name is the header's without its unit, or else its
-    number from 0; names that repeat become x.0, x.1. ISO dates are counted from the first one.
-    Columns of other text are left out, and an empty cell is NaN.
+    number from 0; names that repeat become x.0, x.1. ISO dates, perhaps with the time of day in the
+    next column, are counted from the first one. Columns of other text are left out, and an empty
+    cell is NaN.
     """
     with path.open(encoding=_encoding(path), newline=None) as file:
         return text_source(path, file)
@@ -40,47 +49,74 @@ def read_csv(path: Path) -> FileSource:
 
 def text_source(path: Path, file: TextIO) -> FileSource:
     """Source of the table in a text, from its beginning; path: the file that the text is from."""
-    layout = layout_of(_first_lines(file))
+    layout = layout_of(list(islice(file, N_LOOKED_AT)))
     file.seek(0)
     frame = _frame(file, layout)
     header = layout.header
-    names = {header.names[j]: j for j in layout.columns if j < len(header.names)}
-    numbered = {str(j): j for j in layout.columns}
-    places = numbered | names
+    columns = [j for j in range(frame.shape[1]) if j in layout.columns or _holds_numbers(frame[j])]
+    others = [j for j in range(frame.shape[1]) if j not in columns]
+    dates = _dates(frame, others) if others else {}
+    kept = sorted({*columns, *dates})
+    names = {header.names[j]: j for j in kept}
+    places = {str(j): j for j in kept} | names
 
     def read(name: str) -> xr.DataArray:
         j = places[name]
-        if j in layout.dates:
-            return counted_dates(pd.to_datetime(frame[j], format="ISO8601", utc=True))
-        values = _numbers(frame[j], name, layout)
-        return xr.DataArray(values, attrs={"units": header.units[j]})
+        if j in dates:
+            return counted_dates(dates[j])
+        return xr.DataArray(_numbers(frame[j], name, layout), attrs={"units": header.units[j]})
 
-    aliases = tuple(number for number in numbered if number not in names)
+    aliases = tuple(number for number in places if number not in names)
     return FileSource(
-        path, [*names], read, aliases=aliases, words=layout.words, step_s=header.step_s,
-        is_table=True,
+        path, [*names], read, aliases=aliases, words=_words(frame, layout, columns, dates, others),
+        step_s=header.step_s, is_table=True,
     )  # fmt: skip
 
 
-def _first_lines(file: TextIO) -> list[str]:
-    """Read the first lines; raise ValueError if one is too long or has too many cells."""
-    lines: list[str] = []
-    n_characters = 0
-    while len(lines) < N_LOOKED_AT and n_characters < CHARACTERS_LOOKED_AT:
-        line = file.readline(LONGEST_LINE + 1)
-        if not line:
-            break
-        lines.append(line)
-        n_characters += len(line)
-        n_cells = max(len(line.split(sign)) for sign in SEPARATORS)
-        if n_cells > MAX_COLUMNS or len(line) > LONGEST_LINE:
-            raise ValueError(
-                f"a table may have up to {MAX_COLUMNS} columns, in lines of up to "
-                f"{LONGEST_LINE} characters: line {len(lines)} has {n_cells} cells in its "
-                f"first {len(line)} characters; write one sample per line, and large arrays "
-                "as npz, HDF5 or NetCDF"
-            )
-    return lines
+def _holds_numbers(column: pd.Series) -> bool:
+    """True for a column of numbers that begins beyond the lines that the layout is told from."""
+    return column.dtype.kind in "fiu" and bool(column.notna().any())
+
+
+def _words(
+    frame: pd.DataFrame,
+    layout: Layout,
+    columns: Sequence[int],
+    dates: Mapping[int, pd.Series],
+    others: Sequence[int],
+) -> str:
+    """How the table was read, in words."""
+    n_columns, names = len(columns), layout.header.names
+    words = f"{n_columns} column{'s' * (n_columns > 1)} of numbers"
+    words += f", {len(dates)} of dates" * bool(dates)
+    words += f" between {PARTED[layout.separator]}" * (n_columns + len(dates) > 1)
+    words += ", decimal commas" * (layout.decimal == ",")
+    words += ", marks between thousands" * layout.has_marks
+    words += f", rows from line {layout.first + 1}"
+    left = [j for j in others if j not in dates and frame[j].notna().any()]
+    words += f", left out: {', '.join(names[j] for j in left)}" * bool(left)
+    has_dates = any(frame[j].astype(str).str.match(SLASHED).all() for j in left)
+    return words + "; dates are read if written as 2024-01-31" * has_dates
+
+
+def _dates(frame: pd.DataFrame, others: list[int]) -> dict[int, pd.Series]:
+    """Columns of dates, with their times of day if these stand in the next column.
+
+    others: columns of no numbers; those of times of day are taken out.
+    """
+    texts = {j: frame[j].dropna().astype(str).str.strip() for j in others}
+    are_dates = [j for j, text in texts.items() if len(text) and text.str.fullmatch(DATE).all()]
+    found = {}
+    for j in are_dates:
+        text, beside = texts[j], texts.get(j + 1, texts[j][:0])
+        if len(beside) and beside.str.fullmatch(CLOCK).all():
+            text = text + " " + beside
+            others.remove(j + 1)
+        form = "mixed" if text.str.contains("[AP]M$", case=False).any() else "ISO8601"
+        found[j] = pd.to_datetime(text.str.replace(",", "."), format=form, utc=True).reindex(
+            frame.index
+        )
+    return found
 
 
 def _encoding(path: Path) -> str:
@@ -99,12 +135,12 @@ def _encoding(path: Path) -> str:
 
 
 def _frame(file: TextIO, layout: Layout) -> pd.DataFrame:
-    """Read the rows; raise ValueError for a row with more cells than the first."""
+    """Read the rows; raise ValueError for a row with more cells than the header."""
     missing = sorted({*MISSING, *map(str.upper, MISSING), "NaN", "Inf", "-Inf"} - {""})
     for _ in range(layout.first):  # skipped here: pandas would pair quotes in a preamble
         file.readline()
     try:
-        return pd.read_csv(
+        frame = pd.read_csv(
             file,
             sep=layout.separator or r"\s+",
             decimal=layout.decimal,
@@ -122,15 +158,17 @@ def _frame(file: TextIO, layout: Layout) -> pd.DataFrame:
             f"every row must have as many cells as the first, {found[1]}: row {found[2]} has "
             f"{found[3]}"
         ) from error
+    frame = frame.dropna(how="all").reset_index(drop=True)  # a line of commas is no sample
+    return frame.reindex(columns=range(len(layout.header.names)))
 
 
 def _numbers(column: pd.Series, name: str, layout: Layout) -> Float[np.ndarray, " rows"]:
     """Convert a column to numbers; raise ValueError with the row of a cell that is not a number."""
     if column.dtype.kind in "fiu":
         return column.to_numpy(dtype=np.float64)
-    text = column.astype("string").str.strip()
-    if layout.has_marks:
-        text = text.map(partial(remove_grouping, decimal=layout.decimal), na_action="ignore")
+    text = column.astype("string").str.strip(" \t\"'")
+    is_grouped = text.str.fullmatch(GROUPED[layout.decimal]).fillna(value=False)
+    text = text.mask(is_grouped, text.str.replace(f"[^-+\\d{layout.decimal}]", "", regex=True))
     text = text.str.replace(layout.decimal, ".", regex=False)
     text = text.str.replace(r"[dD](?=[+-]?\d+$)", "e", regex=True)  # Fortran's exponents
     values = pd.to_numeric(text, errors="coerce")
@@ -146,5 +184,5 @@ CSV = Reader(
     "text",
     read_csv,
     form="other",
-    endings=(".csv", ".tsv", ".txt", ".dat", ".asc", ".prn"),
+    endings=(".csv", ".tsv", ".txt", ".dat", ".asc", ".prn", ".lvm"),
 )

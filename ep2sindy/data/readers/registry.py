@@ -13,12 +13,12 @@ from ep2sindy.data.readers.hdf5 import HDF5
 from ep2sindy.data.readers.matlab import MATLAB, NPZ
 from ep2sindy.data.readers.netcdf import NETCDF, ZARR
 from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_at
-from ep2sindy.data.readers.tables import EXCEL, PARQUET
+from ep2sindy.data.readers.tables import EXCEL, NPY, PARQUET
 from ep2sindy.data.readers.tdms import TDMS
 from ep2sindy.runtime.screen import joined
 
 # The order does not matter, since no two readers claim a file equally strongly.
-READERS = (NETCDF, HDF5, MATLAB, NPZ, EXCEL, PARQUET, TDMS, CSV, HALLTHRUSTER, ZARR)
+READERS = (NETCDF, HDF5, MATLAB, NPZ, NPY, EXCEL, PARQUET, TDMS, CSV, HALLTHRUSTER, ZARR)
 
 
 def open_source(path: Path) -> FileSource:

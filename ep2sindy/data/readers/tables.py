@@ -1,4 +1,4 @@
-"""Readers of tables that are no text: workbooks of Excel, and Parquet."""
+"""Readers of tables that are no text: workbooks of Excel, Parquet, and arrays of NumPy."""
 
 from __future__ import annotations
 
@@ -103,5 +103,24 @@ def read_parquet(path: Path) -> FileSource:
     )
 
 
+def read_npy(path: Path) -> FileSource:
+    """Read an array saved with `numpy.save`: its fields if it is structured, or else "array".
+
+    The columns of an array of two axes are called by their numbers, from 0, as those of a table
+    without a header.
+    """
+    array = np.load(path, allow_pickle=False)
+    if array.dtype.names:
+        arrays = {name: array[name] for name in array.dtype.names}
+    elif array.ndim == 2:
+        arrays = {str(j): column for j, column in enumerate(array.T)}
+    else:
+        arrays = {"array": array}
+    return FileSource(
+        path, [*arrays], lambda name: xr.DataArray(arrays[name]), is_table=array.ndim < 3
+    )
+
+
 EXCEL = Reader("Excel", read_excel, first_bytes=(OLD_EXCEL,), form="workbook", package="openpyxl")
 PARQUET = Reader("Parquet", read_parquet, first_bytes=(b"PAR1",), package="pyarrow")
+NPY = Reader("npy", read_npy, first_bytes=(b"\x93NUMPY",))
