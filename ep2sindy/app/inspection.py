@@ -73,16 +73,17 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     if pattern:
         say("\n".join(point_lines(pattern)))
     name = given.write or _word_for(found[0].path)
-    if given.write is None and (text := unlike(found)):
-        say(text)
+    differing = unlike(found) if len(found) > 1 else ""
+    if given.write is None and differing:
+        say(differing)
         return
     if given.write is None:
         more = ["data.plasma=true"] if given.plasma else []
         say_next(commands(found, "recognised", pattern, path=_hydra(given.path), more=more))
         say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
         return
-    if text := unlike(found):
-        raise ValueError(f"no mapping is written: {text}")
+    if differing:
+        raise ValueError(f"no mapping is written: {differing}")
     name = re.sub(r"\W+", "_", name).strip("_")
     path = own_config(name, conf)
     write_text(path, config_text(found, paths))

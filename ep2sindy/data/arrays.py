@@ -65,7 +65,7 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     values = np.asarray(array.values, dtype=np.float64)
     finite = values[np.isfinite(values)]
     attribute = str(array.attrs.get("units", "") or source.units.get(name, ""))
-    stated = counted_in(attribute) or unit_in_brackets(name)
+    stated = counted_in(attribute) if attribute else unit_in_brackets(name)
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
     points = values.ravel() if values.size in values.shape else np.empty(0)
     digits = digits_of_rounded(points)

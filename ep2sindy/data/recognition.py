@@ -112,10 +112,11 @@ def recognise(
         said_s = source.step_s or _stated_step_s(usable)
         if not axes["time"].unit and said_s:
             axes["time"] = _unit_by_step(axes["time"], one, said_s)
-        _compare_step(axes["time"], one, source.step_s, questions)
+        if one.gap or one.digits or source.step_s:
+            _compare_step(axes["time"], one, source.step_s, questions)
     lengths = _lengths(axes, held, source, rest, questions)
     variables = _variables(rest, axes, held, lengths, questions, plasma=plasma)
-    if not plasma and (texts := _only_of_plasma(rest, variables)):
+    if not plasma and {*variables} & {*QUANTITIES} and (texts := _only_of_plasma(rest)):
         questions.append(f"data.plasma=true takes {texts}, and what has no unit for SI")
     axes, variables, no_unit = _complete(axes, variables, units or {}, plasma=plasma)
     no_time = "" if dt_s is not None or "time" in axes else _no_time(source, usable)
@@ -400,13 +401,8 @@ def _variables(
     return found
 
 
-def _only_of_plasma(held: Sequence[ArrayInfo], found: Mapping[str, Variable]) -> str:
-    """Which names without a unit would mean quantities if all is of a plasma, in words.
-
-    Empty unless a variable has the name of one: of ordinary words alone, nothing is said.
-    """
-    if not {*found} & {*QUANTITIES}:
-        return ""
+def _only_of_plasma(held: Sequence[ArrayInfo]) -> str:
+    """Which names without a unit would mean quantities if all is of a plasma, in words."""
     bare = [each.name for each in held if each.unit in ("", "1")]
     meant = {name: quantity_of(name, "", plasma=True) for name in bare
              if quantity_of(name, "", plasma=False) is None}  # fmt: skip

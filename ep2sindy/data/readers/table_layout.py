@@ -337,7 +337,7 @@ def unit_in_brackets(name: str) -> str:
 def _plain(unit: str) -> str:
     """Normalise a unit: `Volt` and `μs` become `volt` and `us`."""
     unit = unit.strip().replace("µ", "u").replace("μ", "u")
-    return unit if unit_like(unit) or not unit_like(unit.lower()) else unit.lower()
+    return unit if not unit or unit_like(unit) or not unit_like(unit.lower()) else unit.lower()
 
 
 def _unit(cell: str) -> str:
