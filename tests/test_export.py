@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import trajectories_of
+from ep2sindy.data.runs import trajectories_of
 
 RUN = ep.Trajectory(
     t=np.linspace(0.0, 2e-3, 40),
@@ -110,10 +110,9 @@ def test_a_field_over_a_grid_is_no_run_and_the_error_says_what_makes_one() -> No
         trajectories_of(field)
 
 
-@pytest.mark.parametrize("coords", [{}, {"time": ("time", np.arange(5.0), {"units": "ms"})}])
-def test_a_dataset_without_times_in_seconds_is_refused(coords: dict) -> None:
-    field = xr.Dataset({"x": ("time", np.arange(5.0) ** 2)}, coords=coords)
-    with pytest.raises(ValueError, match="needs a coordinate time in s, .*: (none|ms) came"):
+def test_a_dataset_without_times_is_refused() -> None:
+    field = xr.Dataset({"x": ("time", np.arange(5.0) ** 2)})
+    with pytest.raises(ValueError, match="needs a coordinate time, in s or another unit"):
         trajectories_of(field)
 
 

@@ -1,9 +1,10 @@
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import trajectories_of
+from ep2sindy.data.runs import trajectories_of
 from ep2sindy.runtime.values import check_kind
 from ep2sindy.selection.rule import Selection
 
@@ -69,7 +70,7 @@ def test_a_list_holds_several_runs_of_any_kind() -> None:
     [
         ([], "at least one run is needed: an empty list came"),
         ([T, X], "a run must be a Trajectory, a pandas DataFrame .* run 0 of the list is of type"),
-        (X, "run is of type ndarray; several runs go into a list"),
+        (X, "run is of type ndarray; an array needs t="),
         (pd.DataFrame({"x": T}), r"must have one time column, .* its columns are \['x'\]"),
         (pd.DataFrame({"t": T, "time": T, "x": T}), "must have one time column"),
         (pd.DataFrame({"t": T, "x": ["a"] * len(T)}), "must hold real numbers: {'x': .*; drop"),
@@ -124,3 +125,96 @@ def test_units_in_the_names_of_a_table_are_those_of_a_file() -> None:
     assert dict(run.units) == {"prey": "V", "n_i": "m^-3"}
     np.testing.assert_allclose(run.t, T)
     np.testing.assert_allclose(run.states, X * [1e-3, 1e6])
+
+
+PREY = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+TIMES, SAMPLES = PREY.t, PREY.states
+
+
+@pytest.mark.parametrize(
+    ("runs", "given"),
+    [
+        (SAMPLES, {"t": TIMES}),
+        (SAMPLES, {"t": PREY.dt_s}),
+        (pd.DataFrame(SAMPLES, columns=["x0", "x1"]), {"t": TIMES}),
+        (pd.DataFrame(SAMPLES, columns=["x0", "x1"]), {"t": PREY.dt_s}),
+        (pd.DataFrame({"time (ms)": 1e3 * TIMES, "x0": SAMPLES[:, 0], "x1": SAMPLES[:, 1]}), {}),
+        (
+            xr.Dataset(
+                {"x0": ("time", SAMPLES[:, 0]), "x1": ("time", SAMPLES[:, 1])},
+                coords={"time": ("time", 1e3 * TIMES, {"units": "ms"})},
+            ),
+            {},
+        ),
+    ],
+    ids=["array", "step", "table", "table and step", "table in ms", "Dataset in ms"],
+)
+def test_times_come_with_samples_or_beside_them(runs: object, given: dict) -> None:
+    (run,) = trajectories_of(runs, **given)
+    np.testing.assert_allclose(run.t, TIMES, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(run.states, SAMPLES)
+    assert list(run.state_names) == ["x0", "x1"]
+
+
+def test_several_arrays_take_times_for_each_or_one_step() -> None:
+    parts = [SAMPLES[:400], SAMPLES[500:]]
+    by_times = trajectories_of(parts, t=[TIMES[:400], TIMES[500:]])
+    by_step = trajectories_of(parts, t=PREY.dt_s)
+    for run, part in zip([*by_times, *by_step], parts + parts, strict=True):
+        np.testing.assert_array_equal(run.states, part)
+    with pytest.raises(ValueError, match="t must hold times for each run: 1 came for 2"):
+        trajectories_of(parts, t=[TIMES])
+
+
+def test_a_dict_labels_its_runs() -> None:
+    first, second = trajectories_of({"300 V": (TIMES, SAMPLES), "400 V": (TIMES, SAMPLES + 1.0)})
+    assert (first.label, second.label) == ("300 V", "400 V")
+
+
+def test_columns_may_be_inputs() -> None:
+    table = pd.DataFrame(
+        {"time": TIMES, "x": SAMPLES[:, 0], "u": np.sin(TIMES), "y": SAMPLES[:, 1]}
+    )
+    (run,) = trajectories_of(table, inputs=["u"])
+    assert (list(run.state_names), list(run.input_names)) == (["x", "y"], ["u"])
+    np.testing.assert_array_equal(run.states, SAMPLES)
+    np.testing.assert_array_equal(run.inputs[:, 0], np.sin(TIMES))
+    assert trajectories_of(run, inputs=["u"])[0].input_names == run.input_names
+    found = ep.discover(table, inputs=["u"])
+    assert set(found.model.states) == {"x", "y"}
+    with pytest.raises(ValueError, match=r"unknown inputs \['v'\]; the run has"):
+        trajectories_of(table, inputs=["v"])
+
+
+def test_arrays_lack_samples_as_tables_do() -> None:
+    holes = SAMPLES.copy()
+    holes[7, 0] = np.nan
+    holes[9] = np.nan
+    table = pd.DataFrame({"time": TIMES, "x0": holes[:, 0], "x1": holes[:, 1]})
+    for partial in (False, True):
+        with pytest.warns(ep.warnings.MissingSamples, match="NaN"):
+            (ours,) = trajectories_of((TIMES, holes), partial=partial)
+        with pytest.warns(ep.warnings.MissingSamples):
+            (theirs,) = trajectories_of(table, partial=partial)
+        assert ours.n_samples == len(TIMES) - (1 if partial else 2)
+        np.testing.assert_array_equal(ours.states, theirs.states)
+    with (
+        pytest.warns(ep.warnings.MissingSamples),
+        pytest.raises(ValueError, match=r"an input needs a value at every sample: \['x0'\] lack"),
+    ):
+        trajectories_of(table, inputs=["x0"], partial=True)
+
+
+@pytest.mark.parametrize(
+    ("runs", "t", "message"),
+    [
+        (SAMPLES, "time", "t must be times or a step in s: 'time' came"),
+        (SAMPLES, -0.1, "t must be positive and finite: -0.1 came"),
+        (pd.DataFrame(SAMPLES), TIMES[:5], r"a time for each of \d+ rows: \(5,\) came"),
+        (PREY, TIMES, "t is for arrays and tables without times: a Trajectory came"),
+        (SAMPLES, None, r"an array needs t=\.\.\., its times or its step"),
+    ],
+)
+def test_times_that_cannot_be_are_refused(runs: object, t: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        trajectories_of(runs, t=t)

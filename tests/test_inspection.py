@@ -12,11 +12,11 @@ from scipy.io import savemat
 
 import ep2sindy as ep
 from ep2sindy.app.inspection import experiments
-from ep2sindy.data.coerce import trajectories_of
 from ep2sindy.data.conversion import conversion
 from ep2sindy.data.quantities import axis_of, axis_unit, quantity_of, split_unit
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.recognition import recognise
+from ep2sindy.data.runs import trajectories_of
 
 NT, NZ, NR = 40, 7, 5
 T = np.arange(NT) * 1.5e-6

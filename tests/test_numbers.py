@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ep2sindy.data.coerce import trajectories_of
 from ep2sindy.data.numbers import check_magnitude, column_norms, real_numbers, rounding_s, seconds
+from ep2sindy.data.runs import trajectories_of
 from ep2sindy.regression.test_functions import is_even
 from ep2sindy.signals.spectrum import is_uniform
 

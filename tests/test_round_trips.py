@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
-from ep2sindy.data.coerce import trajectories_of
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.numbers import real_numbers, seconds
 from ep2sindy.data.open import open_field
+from ep2sindy.data.runs import trajectories_of
 
 FEW = settings(max_examples=15, deadline=None, derandomize=True)
 TYPES = st.sampled_from(["f8", "f4", ">f8", ">f4", "i4", "i2", "u2"])

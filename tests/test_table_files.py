@@ -10,8 +10,8 @@ import pytest
 from nptdms import ChannelObject, TdmsWriter
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import trajectories_of
 from ep2sindy.data.fields import clock_of
+from ep2sindy.data.runs import trajectories_of
 
 T = np.arange(40) * 1.5e-6
 X = 2.0 + np.sin(1e5 * T)

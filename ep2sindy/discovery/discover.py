@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ep2sindy.data.coerce import Runs, Task, trajectories_of
+from ep2sindy.data.coerce import Task
+from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import noise_test
 from ep2sindy.discovery.method import (
@@ -32,6 +33,8 @@ def discover(
     library: Library | None = None,
     method: DiscoveryMethod | None = None,
     *,
+    t: object = None,
+    inputs: Sequence[str] = (),
     relations: Sequence[Relation | str] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
     roles: Roles | None = None,
@@ -44,11 +47,12 @@ def discover(
 
     The method makes candidates, chooses one per equation, and fits it: a `TrajectorySearch` by the
     likelihood of whole trajectories, a `Regression` by rows.
-    runs: one run or a list: Trajectory, DataFrame or (t, x), see `trajectories_of`. library: None
-    means every product of the first run's variables and of hidden states up to degree 2. method:
-    None means TrajectorySearch(), the best method we know for noisy data. relations: between
-    coefficients, such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in the search, in the
-    selection and in the model. terms: for each state whose equation is known but for its
+    runs: one run, or a list or dict of runs: Trajectory, DataFrame, Dataset, (t, x), or x with t,
+    its times or its step in s; inputs: columns that are inputs; see `trajectories_of`. library:
+    None means every product of the first run's variables and of hidden states up to degree 2.
+    method: None means TrajectorySearch(), the best method we know for noisy data. relations:
+    between coefficients, such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in the search,
+    in the selection and in the model. terms: for each state whose equation is known but for its
     coefficients, all terms of that equation. roles: of terms, for equations that conserve what
     states exchange (`Roles`); for a `Regression` by FreeRunScore or RefinedScore. hidden: names of
     states that nobody measured; they and their equations are found with the others', by a
@@ -58,7 +62,7 @@ def discover(
     that the method cannot keep, runs whose states or units differ, states or samples that repeat.
     """
     method = method or TrajectorySearch()
-    trajectories = trajectories_of(runs, partial=True)
+    trajectories = trajectories_of(runs, t=t, inputs=inputs, partial=True)
     names = dict.fromkeys([*trajectories[0].names, *hidden])
     library = polynomial(list(names)) if library is None else library
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")

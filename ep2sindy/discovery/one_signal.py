@@ -12,7 +12,8 @@ from functools import partial
 
 import numpy as np
 
-from ep2sindy.data.coerce import Run, Task, trajectory_of
+from ep2sindy.data.coerce import Task
+from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ep2sindy._stubs import dotted_names, place_of
-from ep2sindy.data.coerce import Run
+from ep2sindy.data.runs import Run
 from ep2sindy.discovery.choice import LeftOver, NoiseTest
 from ep2sindy.discovery.method import DiscoveryMethod
 from ep2sindy.estimation.estimate import Estimate

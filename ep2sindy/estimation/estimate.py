@@ -12,7 +12,8 @@ from itertools import compress
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.coerce import Runs, Task, check_domain, trajectories_of
+from ep2sindy.data.coerce import Task, check_domain
+from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import Watch, check_limit_s, check_size, growing_parts
 from ep2sindy.estimation.explanation import Explanation, explain

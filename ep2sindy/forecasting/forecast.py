@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ep2sindy.data.coerce import Run, trajectory_of
+from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.forecasting.bands import Forecast, forecasts
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.tracking import track

@@ -9,8 +9,8 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.data.coerce import Run, trajectory_of
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.bands import LEVEL, Forecast
 from ep2sindy.forecasting.baselines import Autoregression, Baseline, Harmonics, Persistence

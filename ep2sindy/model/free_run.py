@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.coerce import Run, trajectory_of
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Verdict, record_of
 from ep2sindy.model.fixed_point import RestPoint, rest_point

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
-from ep2sindy.data.coerce import Run, is_run, trajectory_of
+from ep2sindy.data.runs import Run, is_run, trajectory_of
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import SECONDS, Clock

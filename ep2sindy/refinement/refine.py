@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.coerce import Runs, is_run, trajectories_of
+from ep2sindy.data.runs import Runs, is_run, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.display import model_html, model_lines
