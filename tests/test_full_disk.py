@@ -4,6 +4,7 @@ import os
 import pickle
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,14 @@ import xarray as xr
 
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
-from ep2sindy.runtime.files import WriteError, replacing, sweep, write_bytes, write_text
+from ep2sindy.runtime.files import (
+    LEFT_AFTER_S,
+    WriteError,
+    replacing,
+    sweep,
+    write_bytes,
+    write_text,
+)
 
 resource = pytest.importorskip("resource", reason="limits of a process need POSIX")
 
@@ -77,23 +85,20 @@ def test_a_board_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         Board(tmp_path / "taken" / "board").scalars({"x": 1.0}, step=0)
 
 
-def test_only_what_dead_processes_left_is_swept(tmp_path: Path) -> None:
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
+def test_only_what_killed_processes_left_is_swept(tmp_path: Path) -> None:
     deeper = tmp_path / "run" / "figures"
     deeper.mkdir(parents=True)
     with replacing(deeper / "a.b.nc") as living:
         living.write_text("being written")
-        left = living.with_name(living.name.replace(f"-{os.getpid()}-", f"-{dead.pid}-"))
-        elsewhere = left.with_name(left.name.replace(left.name.split("-")[-3], "0" * 8))
-        for path in (left, elsewhere, deeper / ".hidden-0-1.nc", deeper / "mine.nc"):
+        left = living.with_name(living.name.replace("a.b", "c"))
+        others = [deeper / ".hidden-0-1.nc", deeper / "mine.nc"]
+        then = time.time() - 1.1 * LEFT_AFTER_S
+        for path in (left, *others):
             path.write_text("x")
+            os.utime(path, (then, then))
         sweep(tmp_path)
-        assert not left.exists()
         assert living.exists()
-    assert sorted(p.name for p in deeper.iterdir()) == sorted(
-        [elsewhere.name, ".hidden-0-1.nc", "a.b.nc", "mine.nc"]
-    )
+    assert sorted(deeper.iterdir()) == sorted([*others, deeper / "a.b.nc"])
 
 
 def test_bytes_are_written_whole(tmp_path: Path) -> None:

@@ -6,17 +6,14 @@ import hashlib
 import json
 import math
 import os
-import platform
 import re
+import time
 import uuid
-import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
-
-import psutil
 
 
 class WriteError(OSError):
@@ -52,7 +49,7 @@ def replacing(path: Path) -> Iterator[Path]:
     The temporary keeps the suffix, since writers choose the format by it. If the block ends early
     (an error, Ctrl-C), a file at `path` stays as it was. Raises WriteError, an OSError.
     """
-    temporary = path.with_name(f".{path.stem}-{_maker()}-{uuid.uuid4().hex[:8]}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}-{uuid.uuid4().hex}{path.suffix}")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -74,26 +71,20 @@ def _sync(path: Path) -> None:
         os.close(number)
 
 
-def _maker() -> str:
-    """Identifier of machine and process, which marks the owner of a temporary file."""
-    return f"{zlib.crc32(platform.node().encode()):08x}-{os.getpid()}"
-
-
-TEMPORARY = re.compile(r"\..+-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}(\.\w+)?")
+TEMPORARY = re.compile(r"\..+-[0-9a-f]{32}(\.\w+)?")
+LEFT_AFTER_S = 86400.0  # nobody writes on one file for a day
 
 
 def sweep(folder: Path) -> None:
-    """Remove half-written files that killed processes of this machine left in a folder.
+    """Remove half-written files, a day old or more, that killed processes left in a folder.
 
-    Subfolders are swept as well. Files of a living process, or of another machine, stay.
+    Subfolders are swept as well.
     """
-    ours = _maker().partition("-")[0]
     for place, _, names in os.walk(folder):
-        for name in names:
-            found = TEMPORARY.fullmatch(name)
-            if found and found[1] == ours and not psutil.pid_exists(int(found[2])):
-                with suppress(OSError):  # another process may sweep at the same time
-                    os.unlink(os.path.join(place, name))
+        for path in (Path(place, name) for name in names if TEMPORARY.fullmatch(name)):
+            with suppress(OSError):  # another process may sweep at the same time
+                if time.time() - path.stat().st_mtime > LEFT_AFTER_S:
+                    path.unlink()
 
 
 def write_bytes(path: Path, content: bytes | memoryview) -> None:

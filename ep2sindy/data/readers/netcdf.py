@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -25,8 +26,11 @@ def read_netcdf(path: Path) -> FileSource:
     """
     with path.open("rb") as file:
         head = file.read(4)
-    # In a truncated classic file the netCDF library reads on, whereas SciPy raises.
-    engine: Literal["scipy", "netcdf4"] = "scipy" if head in (b"CDF\x01", b"CDF\x02") else "netcdf4"
+    if head == b"CDF\x05" and find_spec("netCDF4") is None:
+        raise ValueError("it is CDF-5, which an extra reads: pip install 'ep2sindy[files]'")
+    engine: Literal["scipy", "h5netcdf", "netcdf4"] = "h5netcdf"
+    if head.startswith(b"CDF"):  # in a truncated file the netCDF library reads on; SciPy raises
+        engine = "netcdf4" if head == b"CDF\x05" else "scipy"
     dataset = xr.open_dataset(path, engine=engine, decode_cf=False)
     size = path.stat().st_size
     if head.startswith(b"CDF") and dataset.nbytes > size:
@@ -43,7 +47,7 @@ def read_netcdf(path: Path) -> FileSource:
 def read_zarr(path: Path) -> FileSource:
     """Open a Zarr store in a folder, with named dimensions as xarray writes it.
 
-    Pickled objects are refused by numcodecs, from the release on that pyproject.toml asks for.
+    Pickled objects are refused by numcodecs, from the release on that the extra asks for.
     """
     dataset = xr.open_dataset(path, engine="zarr", consolidated=False, decode_cf=False)
     return dataset_source(path, dataset)
@@ -52,4 +56,4 @@ def read_zarr(path: Path) -> FileSource:
 NETCDF = Reader(
     "NetCDF", read_netcdf, first_bytes=(b"CDF",), form="hdf5", endings=(".nc", ".nc4", ".cdf")
 )
-ZARR = Reader("Zarr", read_zarr, form="folder", endings=(".zarr",))
+ZARR = Reader("Zarr", read_zarr, form="folder", endings=(".zarr",), package="zarr")
