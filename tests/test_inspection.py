@@ -431,3 +431,10 @@ def test_one_bad_column_does_not_take_the_rest(tmp_path: Path) -> None:
 def test_a_capital_t_is_a_name_like_any_other(tmp_path: Path) -> None:
     path = write_csv(tmp_path / "a.csv", t_s=T, T=WAVE[:, 0, 0])
     assert list(ep.open_field(path).data_vars) == ["T"]
+
+
+def test_the_density_of_electrons_is_offered_as_that_of_ions(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "a.csv", t_s=T, n_e=N_I[:, 0, 0], n_n=N_N[:, 0, 0])
+    assert "in a quasi-neutral plasma 'n_e' is n_i: say so in" in " ".join(
+        ep.inspect_file(path).notes()
+    )

@@ -1,5 +1,6 @@
 """Tables as text, in the layouts of oscilloscopes, programs and people."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -308,3 +309,30 @@ def test_a_unit_with_a_factor_stands_in_the_name(tmp_path: Path) -> None:
     field = open_field(tmp_path / "a.csv")
     np.testing.assert_allclose(field["n_i"].values, 1e17 * X, rtol=1e-8)
     assert inspect_file(tmp_path / "a.csv").variables["c"].unit == "mM"
+
+
+CELLS = (
+    "1", "2.5", "-3e4", "", "nan", "x", "time", "t (s)", "V", "(s)", "1,5", "1.000,5", "2024-01-31",
+    "10:00:01", "10:00:01 PM", "01/02/2024", "# a b", "---", "∞", "****", "1'000", "Increment",
+    "Sample Interval", "1e-6", "Vertical Units", "mV", "9.91e37", "id", "µs", "[1e17 m^-3]",
+)  # fmt: skip
+OF_PYTHON = re.compile(r"out of range|NoneType|unpack|zip\(\)|attribute|argument|convert string")
+
+
+@pytest.mark.parametrize("sep", [",", ";", "\t", " ", "|"])
+def test_no_table_ends_in_words_of_python(tmp_path: Path, sep: str) -> None:
+    rng = np.random.default_rng(ord(sep))
+    for _ in range(40):
+        above = [rng.choice(CELLS, rng.integers(6)) for _ in range(rng.integers(5))]
+        n = int(rng.integers(1, 5))
+        below = [[str(k), *rng.choice(CELLS[:5], n)] for k in range(rng.integers(9))]
+        for row in below:
+            if rng.random() < 0.2:
+                row[rng.integers(len(row))] = str(rng.choice(CELLS))
+        (tmp_path / "a.csv").write_text("\n".join(map(sep.join, [*above, *below])) + "\n")
+        said = ""
+        try:
+            open_field(tmp_path / "a.csv")
+        except ValueError as error:
+            said = str(error)
+        assert not OF_PYTHON.search(said), said

@@ -164,9 +164,12 @@ def record_commands(found: Inspection, data: list[str], *, are_several: bool) ->
     if traces and not are_several:
         signal = "I_d" if "I_d" in traces else traces[0]
         lines.append(["+exp=trace", *data, f"signal={signal}"])
-    states = traces[:3] if len(traces) > 1 else [n for n in ("n_i", "n_n") if n in found.variables]
-    states = states or [n for n in found.signals if n not in NOT_STATES][:2] * (not traces)
-    if states:
+    # One state alone cannot oscillate.
+    for names in (traces, ["n_i", "n_n"], found.signals):
+        states = [n for n in names if n in found.signals and n not in NOT_STATES]
+        if len(states) > 1:
+            break
+    if len(states) > 1:
         lines.append(["+exp=discover", *data, f"trajectory.states=[{','.join(states)}]"])
     return lines
 

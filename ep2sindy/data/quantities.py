@@ -83,6 +83,8 @@ QUANTITIES: dict[str, KnownQuantity] = {
     ),
 }  # fmt: skip
 
+ELECTRONS = _names("n e", "ne", "electron density")  # their density is n_i where no charge is left
+
 AXIS_NAMES = {
     "time": _names("t", "time", "times", "timestamp", "tvec", "seconds", "sec"),
     "z": _names("z", "axial", "zz"),

@@ -22,6 +22,7 @@ from ep2sindy.data.dimensions import fitting, time_length
 from ep2sindy.data.fields import DIMS
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file
 from ep2sindy.data.quantities import (
+    ELECTRONS,
     QUANTITIES,
     axis_of,
     axis_unit,
@@ -30,6 +31,7 @@ from ep2sindy.data.quantities import (
     own_unit,
     quantity_of,
     step_said,
+    words_of,
 )
 from ep2sindy.data.readers.source import FileSource
 
@@ -118,6 +120,12 @@ def recognise(
     variables = _variables(rest, axes, held, lengths, questions, plasma=plasma)
     if not plasma and {*variables} & {*QUANTITIES} and (texts := _only_of_plasma(rest)):
         questions.append(f"data.plasma=true takes {texts}, and what has no unit for SI")
+    if "n_i" not in variables:
+        questions += [
+            f"in a quasi-neutral plasma {e.name!r} is n_i: say so in the mapping that --write makes"
+            for e in rest
+            if words_of(last_of(e.name)) in ELECTRONS
+        ]
     axes, variables, no_unit = _complete(axes, variables, units or {}, plasma=plasma)
     no_time = "" if dt_s is not None or "time" in axes else _no_time(source, usable)
     times = _in_units(replaced) if replaced else []

@@ -81,7 +81,7 @@ def layout_of(lines: Sequence[str]) -> Layout:
         columns = _rate(filled[separator], decimal)[2]
     first = _first_row(table, lines, columns, decimal)
     below = [row for row in table[first:] if row]
-    columns = _numeric(below, decimal)
+    columns = _numeric(below, decimal) or columns
     shown_above = [line.strip("\r\n ") for line in lines[:first]]
     shown_above = [line for line in shown_above if line and not RULE.fullmatch(line)]
     above = _split([line.lstrip("#%!/ ") for line in shown_above], separator)
@@ -314,8 +314,9 @@ def split_names(names: Sequence[str], units: Sequence[str] = ()) -> Header:
 def _step_s(above: Sequence[Sequence[str]]) -> float | None:
     """Time step in s from a preamble, or None."""
     for cells in above:
-        if len(cells) > 1 and STEP.fullmatch(cells[0]) and NUMBER.fullmatch(cells[1]):
-            return float(cells[1].replace(",", "."))
+        if len(cells) > 1 and STEP.fullmatch(cells[0]):
+            said = cells[1].replace(",", ".")
+            return float(said) if re.fullmatch(PLAIN["."], said) else None
     return None
 
 
@@ -373,10 +374,12 @@ def _rigol_header(above: Sequence[Sequence[str]], n_columns: int) -> Header | No
     """
     for k, cells in enumerate(above):
         words = [cell.lower() for cell in cells]
-        if "increment" in words and k + 1 < len(above) and len(words) > n_columns:
-            step_s = float(above[k + 1][words.index("increment")])
+        below = dict(zip(words, above[k + 1] if k + 1 < len(above) else [], strict=False))
+        said = below.get("increment", "")
+        if len(words) > n_columns and re.fullmatch(PLAIN["."], said):
             units = [unit if unit_like(unit) else "" for unit in map(_plain, above[k + 1])]
-            return Header(_unique(cells[:n_columns]), tuple(units[:n_columns]), step_s)
+            units += [""] * n_columns
+            return Header(_unique(cells[:n_columns]), tuple(units[:n_columns]), float(said))
     return None
 
 
