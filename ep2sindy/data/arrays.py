@@ -31,7 +31,6 @@ class ArrayInfo:
 
     name: str
     shape: tuple[int, ...] = ()
-    kind: str = ""
     unit: str = ""
     dims: tuple[str, ...] = ()
     low: float = np.nan
@@ -73,7 +72,7 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     falls = _fall(points, steps)
     steps = steps if steps.size > 1 and not falls else np.empty(0)
     return ArrayInfo(
-        name, values.shape, str(array.dtype), stated, dims,
+        name, values.shape, stated, dims,
         float(finite.min()) if finite.size else np.nan,
         float(finite.max()) if finite.size else np.nan,
         int(values.size - finite.size),

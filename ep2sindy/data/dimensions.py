@@ -102,13 +102,9 @@ def time_length(
 
 def _may_be_time(shape: Sequence[int], space: Sequence[int]) -> set[int]:
     """Lengths of the axes that could be time: all other axes of the array are axes of space."""
-    longer = [n for n in shape if n > 1]
-    found = set()
-    for k, n in enumerate(longer):
-        fellows = Counter(longer[:k] + longer[k + 1 :])
-        if not fellows - Counter(space):
-            found.add(n)
-    return found
+    longer = Counter(n for n in shape if n > 1)
+    left = longer - Counter(space)
+    return {*(left or longer)} if left.total() < 2 else set()
 
 
 def assign_dims(
