@@ -27,7 +27,7 @@ records of one kind; if their names differ in numbers, they may be operating poi
 
 # Variables that experiments on files need besides time; generic experiments need none.
 NEEDS: Mapping[str, tuple[str, ...]] = {
-    "breathing": ("n_i", "n_n", "R_ion", "u_iz"),
+    "breathing": ("n_i", "n_n"),  # of three libraries one; the others are left out
     "weak": ("n_i", "n_n"),
     "constrained": ("n_i", "n_n", "R_ion", "u_iz"),
     "ils": ("n_i", "n_n"),
