@@ -61,7 +61,7 @@ HEAVY = {
     "h5py": (),
     "tensorboard": (),
     "pandas": (*TABLES, "report"),
-    "xarray": (*TABLES, "trust.checksum"),
+    "xarray": TABLES,
 }
 
 # An experiment whose settings, tables and views make one file.

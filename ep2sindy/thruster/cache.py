@@ -17,7 +17,8 @@ from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import in_line, on_screen
 from ep2sindy.signals import oscillation, spectrum
 from ep2sindy.thruster.axial.settings import to_json
-from ep2sindy.trust.checksum import verified, with_checksum
+
+MADE_OF = "kept_for"  # attribute: the parameters of a kept result
 
 # Source text on which a kept result depends: this room, and what sets the status of a record.
 SOURCES = [Path(__file__).parent, *(Path(str(each.__file__)) for each in (oscillation, spectrum))]
@@ -31,9 +32,10 @@ def read_or_run(
 
     Without a folder, nothing is kept. The hash in the file's name covers all parameters and the
     source text of SOURCES, so that a changed formula never returns an old result. Both ways return
-    the same values. The file states its parameters and holds a checksum. A file that does not
-    match, or cannot be read, is reported, recomputed and replaced. Results appear under their final
-    name only once complete. Raises OSError if the folder cannot be written, before anything runs.
+    the same values. The file states its parameters, and HDF5 checks its values by checksums. A file
+    that does not match, or cannot be read, is reported, recomputed and replaced. Results appear
+    under their final name only once complete. Raises OSError if the folder cannot be written,
+    before anything runs.
     """
     if cache is None:
         return run()
@@ -41,7 +43,7 @@ def read_or_run(
     path = Path(cache, f"{name}_{fingerprint(text, sources=SOURCES)}.nc")
     if path.exists():
         try:
-            return verified(read(path), text)
+            return _of(read(path), text)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             with on_screen(sys.stdout):
                 tqdm.write(in_line(f"{path} cannot be read ({error}); simulating it again"))
@@ -52,8 +54,15 @@ def read_or_run(
             pass
     field = run()
     with as_progress(progress).stage(None, "", "keeping the simulation"):
-        write(with_checksum(field, text), path)
+        write(field.assign_attrs({MADE_OF: text}), path)
     return field
+
+
+def _of(stored: xr.Dataset, parameters: str) -> xr.Dataset:
+    """A kept result; raises ValueError if it was computed from other parameters."""
+    if stored.attrs.pop(MADE_OF, "") != parameters:
+        raise ValueError("it is of other parameters")
+    return stored.drop_attrs(deep=False).assign_attrs(stored.attrs)
 
 
 def read(path: Path) -> xr.Dataset:
@@ -65,9 +74,9 @@ def read(path: Path) -> xr.Dataset:
 
 
 def write(field: xr.Dataset, path: Path) -> None:
-    """Write a compressed file, completely or not at all."""
+    """Write a compressed file with checksums, completely or not at all."""
     compressed = {
-        str(variable): {"zlib": True, "complevel": 1, "shuffle": True}
+        str(variable): {"zlib": True, "complevel": 1, "shuffle": True, "fletcher32": True}
         for variable in field.data_vars
     }
     write_netcdf(field, path, encoding=compressed)
