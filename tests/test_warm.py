@@ -14,12 +14,16 @@ from ep2sindy.app import warm
 from ep2sindy.runtime import compilation
 
 
+def full() -> None:
+    raise OSError(28, "No space left on device")
+
+
 @pytest.fixture
 def compilations(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[bool]:
     """What comes of each compilation, the next one first; the cache lies in `tmp_path`."""
     outcomes = [True, True, True]
     monkeypatch.setenv("EP2SINDY_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(warm, "_compiled_side_by_side", lambda: outcomes.pop(0))
+    monkeypatch.setattr(warm, "_compile_all", lambda: None if outcomes.pop(0) else full())
     return outcomes
 
 
@@ -123,31 +127,12 @@ def test_a_folder_that_cannot_be_written_costs_no_run(
         warm.main([])
 
 
-def test_kernels_of_the_package_alone_are_told_and_in_place_of_the_announcement(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    names: list[str] = []
-    monkeypatch.setattr(compilation, "_TOLD", [])
-    compilation.tell_each_kernel(names.append)
-    listener = compilation._Listener()
-    for module in ("ep2sindy.model.kernels", "numba.np.arrayobj"):
-        event = SimpleNamespace(
-            data={"dispatcher": SimpleNamespace(__module__=module, __name__="f")}
-        )
-        listener.on_start(event)
-        listener.on_end(event)
-    assert names == ["ep2sindy.model.kernels.f"]
-    assert capsys.readouterr().err == ""
-
-
 def test_a_call_that_compiles_says_so_once(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(compilation, "_TOLD", [])
-    listener, event = compilation._Listener(), SimpleNamespace(data={})
+    monkeypatch.setattr(compilation, "_ANNOUNCED", [])
     for _ in range(3):
-        listener.on_start(event)
-        listener.on_end(event)
+        compilation._Listener().on_start(SimpleNamespace(data={}))
     assert capsys.readouterr().err == f"{compilation.ANNOUNCEMENT}\n"
 
 

@@ -6,8 +6,6 @@ Runs of the command line begin with it; once it is done, it takes no time.
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -19,11 +17,11 @@ import numpy as np
 
 import ep2sindy as ep
 from ep2sindy.model.many import DrivenWindows, Ensemble
-from ep2sindy.runtime.compilation import ANNOUNCEMENT, digest, sources, tell_each_kernel
+from ep2sindy.runtime.compilation import ANNOUNCEMENT, announce_once, digest, sources
+from ep2sindy.runtime.parallel import Loky
 from ep2sindy.runtime.progress import Bars
 from ep2sindy.runtime.screen import say
 from ep2sindy.runtime.user_cache import cache_folder
-from ep2sindy.trust.user_code import isolate
 
 ABOUT = """Compiles all kernels of the package, once after installation: a minute on two cores.
 Runs of the command line do so by themselves; in Python, a call compiles what it uses."""
@@ -49,9 +47,8 @@ def warm() -> None:
     if stamp.exists():
         return
     say(ANNOUNCEMENT, error=True)
-    if not _compiled_side_by_side():
-        return
     with suppress(OSError):  # on a full disk, the next run repeats this half minute
+        _compile_all()
         stamp.mkdir()
 
 
@@ -67,22 +64,16 @@ def _stamp() -> Path:
     return cache_folder("kernels", f"warm_{sha256(versions.encode()).hexdigest()[:16]}")
 
 
-def _compiled_side_by_side() -> bool:
-    """Run all parts in separate processes; returns whether all succeeded, and reports failures."""
-    inlined = '\n@compiled(inline="always")'  # compiled as part of their callers
-    texts = [path.read_text("utf-8") for path in sources()]
-    n_kernels = sum(text.count("\n@compiled") - text.count(inlined) for text in texts)
-    reader, writer = os.pipe()
-    command, environment = isolate("ep2sindy.app.warm")
-    parts = [subprocess.Popen([*command, each], stdout=writer, env=environment) for each in PARTS]
-    os.close(writer)
-    with open(reader, encoding="utf-8") as lines, Bars().stage(n_kernels, "kernel") as advance:
-        names: set[str] = set()  # parts share some names
-        for name in lines:
-            advance(int(name not in names))
-            names.add(name)
-    statuses = [part.wait() for part in parts]
-    return not any(statuses)
+def _compile_all() -> None:
+    """Run all parts, side by side where there are cores for them."""
+    with Bars().stage(len(PARTS), "part") as advance:
+        for _ in Loky().run(_compile, [*PARTS]):
+            advance(1)
+
+
+def _compile(part: str) -> None:
+    announce_once()  # for all processes
+    PARTS[part]()
 
 
 def _search() -> None:
@@ -132,8 +123,3 @@ PARTS: Mapping[str, Callable[[], None]] = {
     "refinement": _refinement,
     "plane": _plane,
 }
-
-
-if __name__ == "__main__":
-    tell_each_kernel(lambda name: print(name, flush=True))
-    PARTS[sys.argv[1]]()

@@ -123,32 +123,24 @@ def _imported(files: Iterable[Path]) -> set[Path]:
     return {place for place in places if place.is_file()}
 
 
-def tell_each_kernel(tell: Callable[[str], None]) -> None:
-    """Call `tell` with the name of each kernel of the package once it is compiled.
-
-    This replaces the announcement.
-    """
-    _listen()
-    _TOLD.append(tell)
-
-
 class _Listener(event.Listener):
     """Announces once per process that kernels are being compiled; cached ones cause no message."""
 
     def on_start(self, event: event.Event) -> None:
-        if not _TOLD:
-            _TOLD.append(lambda name: None)  # numba reports every function; one message is enough
+        if announce_once():  # numba reports every function
             say(ANNOUNCEMENT + "".join(_UNKEPT[:1]), error=True)
 
     def on_end(self, event: event.Event) -> None:
-        kernel: Any = event.data.get("dispatcher")
-        module = str(getattr(kernel, "__module__", ""))
-        if module.startswith("ep2sindy."):
-            for tell in _TOLD:
-                tell(f"{module}.{kernel.__name__}")
+        pass
 
 
-_TOLD: list[Callable[[str], None]] = []  # receivers of kernel names; empty until one is needed
+def announce_once() -> bool:
+    """True at the first call of a process: the announcement is due then, or has been made."""
+    _ANNOUNCED.append(True)
+    return len(_ANNOUNCED) == 1
+
+
+_ANNOUNCED: list[bool] = []
 _UNKEPT: list[str] = []  # why kernels cannot be kept
 _LISTENERS: list[_Listener] = []
 

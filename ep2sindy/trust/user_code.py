@@ -43,19 +43,6 @@ def leave_folder() -> None:
         sys.path[:] = [path for path in sys.path if Path(path).resolve() != here]
 
 
-def isolate(module: str) -> tuple[list[str], dict[str, str]]:
-    """Command and environment of a process that runs a module of the package.
-
-    The process imports nothing from the current folder, unless it is a checkout of the package.
-    """
-    here = Path.cwd()
-    places = [path for path in sys.path if path]
-    if here != PACKAGE.parent:  # in a checkout the path stays, or an installed one would be found
-        places = [path for path in places if Path(path).resolve() != here]
-    known = os.pathsep.join([*places, str(PACKAGE.parent)])
-    return [sys.executable, "-P", "-m", module], {**os.environ, SAFE: "1", "PYTHONPATH": known}
-
-
 def away_from(settings: str) -> AbstractContextManager[None]:
     """Change the folder during an import that would read this settings file, if there is one."""
     return chdir(PACKAGE) if os.path.exists(settings) else nullcontext()
