@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,10 +22,6 @@ from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import Relation, complete, relations_of
 from ep2sindy.library.roles import Roles
 from ep2sindy.runtime.values import check_kind, check_list
-
-if TYPE_CHECKING:
-    pass
-
 
 # Check that the functions of a library are defined along the trajectories.
 

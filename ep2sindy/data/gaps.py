@@ -25,26 +25,6 @@ class MissingSamples(UserWarning):
     """Warns that samples are NaN and were left out."""
 
 
-# What instruments and programs write for an overload, or for no sample.
-MARKS = (9.9e37, -9.9e37, 9.91e37, 1e30, -1e30, -999.0, -9999.0, 32767.0, -32768.0)
-
-
-def without_marks(values: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    """Samples with NaN in place of marks of overload or absence; the same array if there are none.
-
-    A number is a mark if it comes twice or more, and lies farther from all other samples than
-    these range.
-    """
-    for mark in MARKS:
-        hits = values == mark
-        if np.count_nonzero(hits) < 2:
-            continue
-        others = values[~hits & np.isfinite(values)]
-        if others.size < 2 or np.abs(others - mark).min() > np.ptp(others) > 0.0:
-            values = np.where(hits, np.nan, values)
-    return values
-
-
 def present_rows(columns: Mapping[str, Float[np.ndarray, " _"]]) -> Bool[np.ndarray, " _"]:
     """Mask of the samples that are present in every column; NaN marks a missing sample.
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.gaps import without_marks
+from ep2sindy.data.numbers import without_marks
 from ep2sindy.data.readers.source import FileSource, damage_named
 from ep2sindy.library.names import check_variable
 from ep2sindy.runtime.screen import near_words

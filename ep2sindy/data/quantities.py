@@ -16,7 +16,7 @@ from ep2sindy.data.conversion import (
     conversion,
     converts,
 )
-from ep2sindy.data.gaps import without_marks
+from ep2sindy.data.numbers import without_marks
 from ep2sindy.data.readers.table_layout import split_name
 from ep2sindy.library.units import is_count, time_unit_in
 
@@ -191,7 +191,7 @@ def axis_unit(axis: str, name: str, stated: str) -> str:
     in_name = (time_unit_in(last_of(name)) or "") if axis == "time" else ""
     options = (stated, in_name, split_unit(last_of(name))[1])
     unit = COORDINATE_UNITS[axis]
-    return next((each for each in options if each == unit or converts(axis, each)), "")
+    return next((u for u in options if u and (u == unit or converts(axis, u))), "")
 
 
 def quantity_of(name: str, stated: str, *, plasma: bool) -> tuple[str, str] | None:
@@ -223,7 +223,7 @@ def own_unit(ours: str, stated: str) -> str:
         return stated
     suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
     options = (stated, *suffixes)
-    return next((unit for unit in options if converts(ours, unit, is_variable=True)), "1")
+    return next((u for u in options if u and converts(ours, u, is_variable=True)), "1")
 
 
 def columns_in_si(
@@ -233,11 +233,11 @@ def columns_in_si(
     values = np.empty(table.shape)
     units: dict[str, str] = {}
     for k, label in enumerate(table.columns):
-        name, stated = split_name(label)
+        name, stated = (label, "") if label.isidentifier() else split_name(label)
         name, unit = quantity_of(name, stated, plasma=False) or (name, own_unit(name, stated))
         units[name] = unit or "1"
         values[:, k] = without_marks(table[label].to_numpy(dtype=np.float64))
-        if not is_count(units[name]):
+        if units[name] != "1" and not is_count(units[name]):
             factor, zero, units[name] = conversion(name, units[name], is_variable=True)
             values[:, k] = factor * values[:, k] + zero
     return values, units
@@ -247,4 +247,4 @@ def time_unit(name: object) -> str | None:
     """Unit of a column of times that is called so, seconds by default; None for another column."""
     if not isinstance(name, str) or axis_of(name) != "time":
         return None
-    return axis_unit("time", name, split_name(name)[1]) or "s"
+    return axis_unit("time", name, "" if name.isidentifier() else split_name(name)[1]) or "s"

@@ -263,7 +263,7 @@ def _elapsed(column: pd.Series) -> tuple[Float[np.ndarray, " rows"], Clock]:
     if column.dtype.kind in "mM":
         t, unit = count_dates(column)
         return t, Clock.of(unit)
-    unit = time_unit(str(column.name)) or "s"
+    unit = "s" if column.name in TIMES else time_unit(column.name) or "s"
     t = seconds(column.to_numpy())
     return (t, SECONDS) if unit == "s" else (t * seconds_in(unit), Clock.of(unit))
 

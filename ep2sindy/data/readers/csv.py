@@ -31,6 +31,8 @@ CLOCK = r"\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?\s?(?:[AaPp][Mm])?"
 DATE = rf"\d{{4}}-\d\d-\d\d(?:[ T]{CLOCK}(?:Z|[+-]\d\d:?\d\d)?)?"
 SLASHED = r"\d{1,2}[/.-]\d{1,2}[/.-]\d{2,4}\b"
 
+AT_TIMES = "@ t="  # in headers of COMSOL's exports of several times
+
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
@@ -49,7 +51,13 @@ def read_csv(path: Path) -> FileSource:
 
 def text_source(path: Path, file: TextIO) -> FileSource:
     """Source of the table in a text, from its beginning; path: the file that the text is from."""
-    layout = layout_of(list(islice(file, N_LOOKED_AT)))
+    lines = list(islice(file, N_LOOKED_AT))
+    layout = layout_of(lines)
+    if any(AT_TIMES in line for line in lines[: layout.first]):
+        raise ValueError(
+            f"its columns are quantities at different times ({AT_TIMES!r}), its rows places: make "
+            "times the rows, as COMSOL does of a point, or a field of it in Python"
+        )
     file.seek(0)
     frame = _frame(file, layout)
     header = layout.header

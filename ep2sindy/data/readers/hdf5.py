@@ -33,7 +33,8 @@ def read_hdf5(path: Path) -> FileSource:
 
     Numbers packed by `scale_factor` and `add_offset` are unpacked. Numbers equal to `_FillValue`,
     and numbers that were never written, are NaN. A group's attributes `time` and `dt` are arrays of
-    one number, "group/time". Of openPMD, units and the grids of meshes are read too.
+    one number, "group/time". Of openPMD, units and the grids of meshes are read too; of a mesh in
+    azimuthal modes (thetaMode) the first, which is the average over the azimuth.
     """
     import h5py
 
@@ -45,6 +46,7 @@ def read_hdf5(path: Path) -> FileSource:
         with h5py.File(path) as file:
             found = file[name]
             values, attrs = read_written(found), _attributes(found, name)
+            values = values[0] if _has_modes(found) else values
             units = {"units": attrs.pop("units")}
             if not attrs:  # not packed, as most
                 return xr.DataArray(values, attrs=units)
@@ -94,11 +96,18 @@ def _mesh(name: str, item: h5py.Group | h5py.Dataset) -> dict[str, xr.DataArray]
     unit_m = float(_plain(item.attrs.get("gridUnitSI", 1.0)))
     within = np.ravel(one.attrs.get("position", np.zeros(len(labels))))
     where, found = name.rpartition("/")[0], {}
-    numbers = (item.attrs["gridGlobalOffset"], item.attrs["gridSpacing"], within, one.shape)
+    shape = one.shape[1:] if _has_modes(one) else one.shape
+    numbers = (item.attrs["gridGlobalOffset"], item.attrs["gridSpacing"], within, shape)
     for label, offset, spacing, start, n in zip(labels, *numbers, strict=True):
         points = unit_m * (float(offset) + float(spacing) * (np.arange(n) + float(start)))
         found[f"{where}/{label}".lstrip("/")] = xr.DataArray(points, attrs={"units": "m"})
     return found
+
+
+def _has_modes(found: h5py.Dataset) -> bool:
+    """True for a record of openPMD whose first axis holds azimuthal modes."""
+    said = (each.attrs.get("geometry") for each in (found, found.parent))
+    return "thetaMode" in (_plain(geometry) for geometry in said)
 
 
 def _openpmd_unit(attributes: h5py.AttributeManager) -> str:

@@ -26,7 +26,14 @@ def read_matlab73(path: Path) -> FileSource:
 
     def read(name: str) -> xr.DataArray:
         with h5py.File(path) as file:
-            return xr.DataArray(read_written(file[name.replace(".", "/")]).T)
+            found = file[name.replace(".", "/")]
+            kind = found.attrs.get("MATLAB_class", b"object").decode()
+            if "MATLAB_object_decode" in found.attrs or found.dtype.hasobject:
+                raise ValueError(
+                    f"{name!r} is a MATLAB {kind}, of which the file holds references: save its "
+                    f"columns as arrays, or writetable({name}, 'run.csv')"
+                )
+            return xr.DataArray(read_written(found).T)
 
     names = [
         name.replace("/", ".") for name in names_in_hdf5(path) if not name.startswith("#refs#")

@@ -60,15 +60,39 @@ class Layout:
 def layout_of(lines: Sequence[str]) -> Layout:
     """Find the layout of the table in the first lines of a file.
 
-    Separator and decimal sign are those by which most cells are numbers, in most columns. The rows
-    begin where a line holds numbers in all of these columns.
+    The rows begin where a line holds numbers in all columns that mostly do.
     Raises ValueError if there is no row of numbers, if numbers can be read in two ways, or if the
     header does not name the columns.
     """
-    shown = ["" if line.lstrip().startswith(COMMENTS) or RULE.fullmatch(line) else line
-             for line in (line.strip("\r\n ") for line in lines)]  # fmt: skip
-    tables = {s: _split(shown, s) for s in SEPARATORS if s is None or any(s in t for t in shown)}
-    filled = {s: [cells for cells, line in zip(table, shown, strict=True) if DIGIT.search(line)]
+    lines = [line.strip("\r\n ") for line in lines]
+    shown = ["" if line.startswith(COMMENTS) or RULE.fullmatch(line) else line for line in lines]
+    separator, decimal, columns, table = _form(shown)
+    first = _first_row(table, lines, columns, decimal)
+    below = [row for row in table[first:] if row]
+    columns = _numeric(below, decimal) or columns
+    before = [line for line in lines[:first] if line and not RULE.fullmatch(line)]
+    above = _split([line.lstrip("#%!/ ") for line in before], separator)
+    n_columns = max(map(len, below))
+    if above and separator and len(above[-1]) == shown[first].count(separator) + 1:
+        n_columns = max(n_columns, len(above[-1]))  # the last ones are empty in these lines
+    is_comment = bool(before) and before[-1].startswith(COMMENTS)
+    header = header_of(above, n_columns, strict=separator is not None, is_comment=is_comment)
+    if columns[0] > 1 and not any(header.units):
+        header = _labels_beside(header, below, columns)
+    cells = (row[j] for row in below for j in columns if j < len(row))
+    has_marks = any(re.fullmatch(GROUPED[decimal], cell) for cell in cells)
+    return Layout(separator, decimal, first, columns, header, has_marks)
+
+
+def _form(
+    lines: Sequence[str],
+) -> tuple[str | None, str, tuple[int, ...], list[list[str]]]:
+    """Separator, decimal sign, numeric columns, and the cells of all lines.
+
+    Separator and decimal sign are those by which most cells are numbers, in most columns.
+    """
+    tables = {s: _split(lines, s) for s in SEPARATORS if s is None or any(s in t for t in lines)}
+    filled = {s: [cells for cells, line in zip(table, lines, strict=True) if DIGIT.search(line)]
               for s, table in tables.items()}  # fmt: skip
     options = [(*_rate(table, d), s, d) for d in PLAIN for s, table in filled.items()]
     share, _, columns, separator, decimal = max(options, key=lambda option: option[:2])
@@ -79,21 +103,7 @@ def layout_of(lines: Sequence[str]) -> Layout:
     if any("," in cell for cell in numbers):
         decimal = _decimal(numbers, separator, decimal)
         columns = _rate(filled[separator], decimal)[2]
-    first = _first_row(table, lines, columns, decimal)
-    below = [row for row in table[first:] if row]
-    columns = _numeric(below, decimal) or columns
-    shown_above = [line.strip("\r\n ") for line in lines[:first]]
-    shown_above = [line for line in shown_above if line and not RULE.fullmatch(line)]
-    above = _split([line.lstrip("#%!/ ") for line in shown_above], separator)
-    n_columns = max(map(len, below))
-    if above and separator and len(above[-1]) == shown[first].count(separator) + 1:
-        n_columns = max(n_columns, len(above[-1]))  # the last ones are empty in these lines
-    is_comment = bool(above) and shown_above[-1].startswith(COMMENTS)
-    header = header_of(above, n_columns, strict=separator is not None, is_comment=is_comment)
-    if columns[0] > 1 and not any(header.units):
-        header = _labels_beside(header, below, columns)
-    has_marks = any(re.fullmatch(GROUPED[decimal], cell) for cell in numbers)
-    return Layout(separator, decimal, first, columns, header, has_marks)
+    return separator, decimal, columns, table
 
 
 def _split(lines: Sequence[str], separator: str | None) -> list[list[str]]:
