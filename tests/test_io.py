@@ -1,5 +1,6 @@
 import json
 import os
+import re
 from pathlib import Path
 
 import h5py
@@ -12,6 +13,7 @@ from nptdms import ChannelObject, TdmsWriter
 from scipy.io import savemat
 
 from ep2sindy.data.conversion import conversion, same_unit
+from ep2sindy.data.inspection import inspect_file
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import open_field, read_field, write_field
 from ep2sindy.data.prepare import keep_where
@@ -75,6 +77,21 @@ def write_matlab73(path: Path) -> None:
         file["#refs#/a"] = 1.0
     with path.open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+def test_matlab_objects_are_named_and_take_nothing_with_them(tmp_path: Path) -> None:
+    """Timetables, tables and strings of v7.3 are numbers that refer to others in the file."""
+    path = tmp_path / "run.mat"
+    write_matlab73(path)
+    with h5py.File(path, "r+") as file:
+        file["TT"] = np.array([[0xDD000000, 2, 1, 1, 1, 1]], dtype="u4")
+        file["TT"].attrs["MATLAB_class"] = np.bytes_("timetable")
+        file["TT"].attrs["MATLAB_object_decode"] = np.int32(3)
+    shown = str(inspect_file(path))
+    assert re.search(r"TT +left out", shown)
+    said = "'TT' is left out: 'TT' is a MATLAB timetable, of which the file holds references: save"
+    assert said in " ".join(shown.split())
+    assert open_field(path, **SETTINGS)["n_i"].dims == ("time", "z", "r")
 
 
 def write_npz(path: Path) -> None:

@@ -57,7 +57,18 @@ def openpmd(file: h5py.File, k: int) -> None:
     group["particles/e/position/x"] = np.arange(20.0 + k)
 
 
-LAYOUTS = [by_attribute, by_dataset, by_step, by_quantity, openpmd]
+def in_modes(file: h5py.File, k: int) -> None:
+    """The same in azimuthal modes, of which the first is the average over the azimuth."""
+    openpmd(file, k)
+    group = file[f"data/{NUMBERS[k]}/fields"]
+    attributes = dict(group["n_i"].attrs)
+    mode = group["n_i"][()]
+    del group["n_i"]
+    mesh = group.create_dataset("n_i", data=np.stack([mode, 9.0 * mode, -mode]))
+    mesh.attrs.update(attributes | {"geometry": np.bytes_("thetaMode")})
+
+
+LAYOUTS = [by_attribute, by_dataset, by_step, by_quantity, openpmd, in_modes]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -336,3 +336,10 @@ def test_no_table_ends_in_words_of_python(tmp_path: Path, sep: str) -> None:
         except ValueError as error:
             said = str(error)
         assert not OF_PYTHON.search(said), said
+
+
+def test_an_export_of_comsol_with_times_as_columns_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "hall.txt"
+    path.write_text("% Nodes: 2\n% x  n_i @ t=0  n_i @ t=1E-6\n0 1 2\n0.1 2 3\n")
+    with pytest.raises(ValueError, match="hall.txt .*at different times .'@ t='.*make times the"):
+        inspect_file(path)

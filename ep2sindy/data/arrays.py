@@ -60,7 +60,7 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     try:
         array = read_array(source, name, name)
     except ValueError as error:
-        return ArrayInfo(name, problem=_short(str(error)))
+        return ArrayInfo(name, problem=_short(str(error), source))
     values = np.asarray(array.values, dtype=np.float64)
     finite = values[np.isfinite(values)]
     attribute = str(array.attrs.get("units", "") or source.units.get(name, ""))
@@ -85,8 +85,9 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     )  # fmt: skip
 
 
-def _short(text: str) -> str:
-    return TEXT if "real numbers" in text else text
+def _short(text: str, source: FileSource) -> str:
+    """Why an array cannot be used, without the file's name."""
+    return TEXT if "real numbers" in text else text.removeprefix(f"{source.path} cannot be read: ")
 
 
 def _fall(points: np.ndarray, steps: np.ndarray) -> str:

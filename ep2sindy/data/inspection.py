@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from ep2sindy.data.arrays import ArrayInfo
+from ep2sindy.data.arrays import TEXT, ArrayInfo
 from ep2sindy.data.conversion import KNOWN_UNITS
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.quantities import MADE_FROM, is_counter_name
@@ -193,8 +193,9 @@ class Inspection:
             step = f", {about}{one.step:.4g} apart" if one.step else ""
             role = ", ".join(self._roles.get(one.name, ["-"])) + step
             shape = f"({', '.join(map(str, one.shape))})"
+            unused = TEXT if one.problem == TEXT else "left out"
             rows.append(
-                [one.name, *[""] * 5, one.problem] if one.problem else
+                [one.name, *[""] * 5, unused] if one.problem else
                 [one.name, shape, one.unit, f"{one.low:.4g}", f"{one.high:.4g}",
                  str(one.n_missing or ""), role]
             )  # fmt: skip
