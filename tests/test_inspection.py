@@ -1,6 +1,7 @@
 """Files without a mapping: what they are taken for, what is asked, and what is made of it."""
 
 import json
+import shlex
 from pathlib import Path
 
 import h5py
@@ -11,12 +12,14 @@ import xarray as xr
 from scipy.io import savemat
 
 import ep2sindy as ep
+from ep2sindy.app import inspection
 from ep2sindy.app.inspection import experiments
 from ep2sindy.data.conversion import conversion
 from ep2sindy.data.quantities import axis_of, axis_unit, quantity_of, split_unit
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.recognition import recognise
 from ep2sindy.data.runs import trajectories_of
+from tests.programs import composed, computed
 
 NT, NZ, NR = 40, 7, 5
 T = np.arange(NT) * 1.5e-6
@@ -438,3 +441,23 @@ def test_the_density_of_electrons_is_offered_as_that_of_ions(tmp_path: Path) -> 
     assert "in a quasi-neutral plasma 'n_e' is n_i: say so in" in " ".join(
         ep.inspect_file(path).notes()
     )
+
+
+def test_a_field_over_x_and_y_names_the_command_that_takes_a_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    t = 1e-6 * np.arange(300)
+    waves = {"a": np.sin(1e5 * t), "b": np.cos(1e5 * t)}
+    data = {
+        name: (("time", "x", "y"), wave[:, None, None] * np.ones((4, 5)), {"units": "V"})
+        for name, wave in waves.items()
+    }
+    axes = {"time": ("time", t, {"units": "s"}), "x": np.arange(4.0), "y": np.arange(5.0)}
+    xr.Dataset(data, coords=axes).to_netcdf("xy.nc")
+    inspection.main(["xy.nc"], tmp_path)
+    shown = capsys.readouterr().out.splitlines()
+    (line,) = (each for each in shown if each.startswith("  ep2sindy +exp=discover"))
+    found = computed(composed(*shlex.split(line)[1:], "output=out"))
+    terms = found.summary["models"]["model"]["equations"]["a"]["terms"]
+    assert terms == pytest.approx({"b": 1e5}, rel=1e-3)

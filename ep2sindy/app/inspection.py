@@ -135,6 +135,8 @@ def commands(
     if not lines:
         data = [f"data={group}", *([f"data.path={path}"] if path else []), *step]
         lines = record_commands(first, data, are_several=len(found) > 1)
+    if not lines and path:
+        lines = [line] if (line := point_command(first, path)) else []
     return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]
 
 
@@ -172,6 +174,28 @@ def record_commands(found: Inspection, data: list[str], *, are_several: bool) ->
     if len(states) > 1:
         lines.append(["+exp=discover", *data, f"trajectory.states=[{','.join(states)}]"])
     return lines
+
+
+def point_command(found: Inspection, path: str) -> list[str]:
+    """The command that studies a point in the middle of arrays over axes that are not z and r."""
+    time = found.found.axes.get("time")
+    over = [
+        each
+        for each in found.found.held
+        if len(each.shape) > 1 and each.shape[0] == found.found.n_samples and not each.problem
+    ]
+    if time is None or len(over) < 2:
+        return []
+    named = []
+    for each in over:
+        place = ", ".join([":", *(str(n // 2) for n in each.shape[1:])])
+        named.append(f'{each.name}:{{name:"{each.name}[{place}]",unit:"{each.unit or 1}"}}')
+    return [
+        "+exp=discover", "data=file", f"data.path={path}", f"data.time.name={time.name}",
+        f"data.time.unit={time.unit}", "data.z.name=null", "~data.variables",
+        f"+data.variables={{{','.join(named)}}}",
+        f"trajectory.states=[{','.join(each.name for each in over)}]",
+    ]  # fmt: skip
 
 
 def channel(found: Inspection) -> list[str]:
