@@ -131,6 +131,7 @@ def test_a_signal_of_either_sign_can_be_taken(embedding: str, tmp_path: Path) ->
         assert "I_before" in found.log
 
 
+@pytest.mark.slow
 def test_fine_samples_are_averaged_by_default(tmp_path: Path) -> None:
     t, x = signal(12.0)
     fine = np.linspace(t[0], t[-1], 4 * len(t))
@@ -152,6 +153,7 @@ def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path:
     assert set(set_to_two.summary["states"]) == {"2"}
 
 
+@pytest.mark.slow
 def test_the_law_of_chaos_is_found_in_one_of_its_states(tmp_path: Path) -> None:
     run = ep.lorenz().trajectory(noise=0.02, rng=2)
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
@@ -199,6 +201,7 @@ def recognised(path: Path, header: str, *more: str) -> DictConfig:
     return composed(*few, "data=recognised", *more)
 
 
+@pytest.mark.slow
 def test_a_recognised_signal_without_a_unit_takes_the_one_given(tmp_path: Path) -> None:
     config = recognised(tmp_path / "scope.csv", "time [s],I", "signal=I", "unit=mA")
     found = computed(config)
@@ -213,6 +216,7 @@ def test_a_unit_that_the_data_contradict_is_refused(tmp_path: Path) -> None:
         computed(config)
 
 
+@pytest.mark.slow
 def test_a_mean_that_was_lost_is_asked_for_and_given_back(tmp_path: Path) -> None:
     t, x = signal(12.0)
     path = scope(tmp_path / "scope.csv", t, x - x.mean())

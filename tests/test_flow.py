@@ -92,6 +92,7 @@ def test_a_model_that_could_follow_any_samples_is_a_misfit() -> None:
 
 # The first is a long curved way off, where ten straight steps end far from the minimum. The second
 # is a wrong optimum of seventeen terms, which only states that are let go again show to be one.
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [("AtmosphericRegime", 0.2, 1), ("HyperRossler", 0.01, 1)])
 def test_supports_that_exchanges_between_exact_flows_do_not_reach(
     draw: tuple[str, float, int],

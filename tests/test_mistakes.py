@@ -26,7 +26,10 @@ ROOT = Path(__file__).resolve().parents[1]
         (["breathing"], "must be KEY=VALUE, such as +exp=discover or seed=1: 'breathing' came; +e"),
         (["inspct", "run.csv"], "'inspct' came; near it is the command inspect, which stands fi"),
         (["+exp=discover", "search=joined"], "no choice of search 'joined'; near it is search=jo"),
-        (["+exp=discover", "data=recogn"], "near it is data=recognised; there are file, hallthr"),
+        (
+            ["+exp=discover", "data=recogn"],
+            "near it is data=recognised; there are file, recognised",
+        ),
         (["+exp=discover", "serch=joint"], "unknown key 'serch'; near it is search; there are"),
         (["+exp=discover", "~serch"], "unknown key 'serch'; near it is search; there are"),
         (["+exp=discover", "+serch=joint"], "unknown keys ['serch']; near it is search; there"),

@@ -208,6 +208,7 @@ def test_scores_tell_what_a_term_would_bring() -> None:
     assert np.abs(np.log(ratio)).max() < 1.0  # forty draws scatter by 22 %
 
 
+@pytest.mark.slow
 def test_a_true_term_outside_the_set_enters(monkeypatch: pytest.MonkeyPatch) -> None:
     system = waves(6)
     problem = problem_of(system, 0.02, 2)
