@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
         (["+exp=discover", "search=joined"], "no choice of search 'joined'; near it is search=jo"),
         (
             ["+exp=discover", "data=recogn"],
-            "near it is data=recognised; there are file, recognised",
+            "near it is data=recognised; there are file, recog",
         ),
         (["+exp=discover", "serch=joint"], "unknown key 'serch'; near it is search; there are"),
         (["+exp=discover", "~serch"], "unknown key 'serch'; near it is search; there are"),
