@@ -57,15 +57,22 @@ def test_what_kernels_import_compiles_them_again_too() -> None:
     assert watched | {"compilation.py"} <= {path.name for path in compilation.sources()}
 
 
-def called(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+CALL = """
+import sys
+from pathlib import Path
+from ep2sindy.runtime import compilation
+sys.path.insert(0, sys.argv[1])
+compilation.SHARED = Path(sys.argv[2])
+import my_kernels
+"""
+
+
+def called(
+    folder: Path, *, shared: Path = Path("/none"), **environment: str
+) -> subprocess.CompletedProcess[str]:
     """Run a kernel that calls another, by a process of its own."""
-    command = [
-        sys.executable,
-        "-c",
-        "import sys; sys.path.insert(0, sys.argv[1]); import my_kernels",
-    ]
     return subprocess.run(
-        [*command, str(folder)],
+        [sys.executable, "-c", CALL, str(folder), str(shared)],
         env=os.environ | environment, capture_output=True, text=True, check=True,
     )  # fmt: skip
 
@@ -96,6 +103,17 @@ def test_a_kernel_is_kept_in_the_users_cache_and_follows_what_it_calls(
     inner.write_text(inner.read_text().replace("x + 1.0", "x + 1.25"))
     assert called(kernels, EP2SINDY_CACHE=cache).stdout == "5.5\n"
     assert not list(kernels.rglob("*.nbi"))
+
+
+def test_kernels_beside_the_package_serve_those_who_may_write_nowhere(
+    kernels: Path, tmp_path: Path
+) -> None:
+    """As in a container, whose image an administrator has warmed."""
+    called(kernels, EP2SINDY_CACHE=str(tmp_path / "cache"))
+    (tmp_path / "cache" / "kernels").rename(tmp_path / "shared")
+    for place in ("/dev/null", str(tmp_path / "other")):
+        run = called(kernels, shared=tmp_path / "shared", EP2SINDY_CACHE=place)
+        assert (run.stdout, run.stderr) == ("5.0\n", "")
 
 
 def test_without_a_folder_kernels_are_compiled_every_time_and_it_is_said(kernels: Path) -> None:

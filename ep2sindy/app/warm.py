@@ -17,7 +17,15 @@ import numpy as np
 
 import ep2sindy as ep
 from ep2sindy.model.many import DrivenWindows, Ensemble
-from ep2sindy.runtime.compilation import ANNOUNCEMENT, announce_once, digest, sources
+from ep2sindy.runtime.compilation import (
+    ANNOUNCEMENT,
+    SHARED,
+    announce_once,
+    copied,
+    digest,
+    folders,
+    sources,
+)
 from ep2sindy.runtime.parallel import Loky
 from ep2sindy.runtime.progress import Bars
 from ep2sindy.runtime.screen import say
@@ -29,12 +37,21 @@ Runs of the command line do so by themselves; in Python, a call compiles what it
 
 def main(arguments: Sequence[str]) -> None:
     """Compile, and report where the kernels are kept."""
-    argparse.ArgumentParser("ep2sindy warm", description=ABOUT).parse_args(arguments)
+    parser = argparse.ArgumentParser("ep2sindy warm", description=ABOUT)
+    parser.add_argument(
+        "--shared", action="store_true", help="keep them beside the package, for all users"
+    )
+    given = parser.parse_args(arguments)
     try:
-        place = _stamp().parent
+        stamp = _stamp()
+        warm()
+        if given.shared:
+            for folder in (*folders(), stamp):
+                SHARED.mkdir(parents=True, exist_ok=True)
+                copied(folder, SHARED / folder.name)
     except OSError as error:
         sys.exit(f"error: {error}")
-    warm()
+    place = SHARED if given.shared else stamp.parent
     say(f"all kernels are compiled; they are kept in {place}")
 
 
@@ -44,7 +61,7 @@ def warm() -> None:
         stamp = _stamp()
     except OSError:  # every process compiles what it uses, and says so
         return
-    if stamp.exists():
+    if stamp.exists() or (SHARED / stamp.name).exists():
         return
     say(ANNOUNCEMENT, error=True)
     with suppress(OSError):  # on a full disk, the next run repeats this half minute

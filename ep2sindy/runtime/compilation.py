@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import atexit
 import re
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from shutil import copytree, rmtree
+from tempfile import mkdtemp
 from typing import Any
+from uuid import uuid4
 
 from ep2sindy.runtime.screen import say
 from ep2sindy.runtime.user_cache import cache_folder
@@ -21,6 +26,7 @@ with away_from(SETTINGS):
 config._config_fname = ""  # numba looks for the file again at every compilation
 
 THIS = Path(__file__)
+SHARED = PACKAGE / "__pycache__" / "kernels"  # of `ep2sindy warm --shared`
 IMPORT = re.compile(r"^from (ep2sindy(?:\.\w+)+) import", re.MULTILINE)
 
 ANNOUNCEMENT = "ep2sindy: compiling its kernels, once after installation (half a minute) ..."
@@ -85,13 +91,47 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
 
 @cache
 def _folder_of(sources: Path) -> str:
-    """Where the kernels of a folder of sources are kept; empty if they cannot be."""
+    """Where the kernels of a folder of sources are kept; empty if they cannot be.
+
+    Kernels beside the package serve all users: they are copied, since numba reads only where it
+    may write.
+    """
     files = {*sources.glob("*.py"), *_imported(_kernels_in(sources)), THIS}
+    name = f"{sources.name}_{digest(files)}"
+    beside = SHARED / name
     try:
-        return str(cache_folder("kernels", f"{sources.name}_{digest(files)}"))
+        folder = cache_folder("kernels", name)
     except OSError as error:
-        _UNKEPT.append(f"; they are not kept, for {error}")
-        return ""
+        if not beside.is_dir():
+            _UNKEPT.append(f"; they are not kept, for {error}")
+            return ""
+        folder = _private_folder() / name
+    if beside.is_dir() and not folder.exists():
+        copied(beside, folder)
+    return str(folder)
+
+
+@cache
+def _private_folder() -> Path:
+    """A folder of this process alone, for kernels of users without a cache."""
+    folder = mkdtemp(prefix="ep2sindy-")
+    atexit.register(rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def copied(source: Path, target: Path) -> None:
+    """Copy a folder, completely or not at all; one that is there stays."""
+    temporary = target.with_name(f".{target.name}-{uuid4().hex}")
+    copytree(source, temporary)
+    with suppress(OSError):  # another process was faster
+        temporary.rename(target)
+    rmtree(temporary, ignore_errors=True)
+
+
+def folders() -> list[Path]:
+    """Where all kernels of the package are kept."""
+    rooms = sorted({path.parent for path in _kernels_in(PACKAGE)})
+    return [Path(folder) for room in rooms if (folder := _folder_of(room))]
 
 
 def digest(files: Iterable[Path]) -> str:
