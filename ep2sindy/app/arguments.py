@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 
 import hydra._internal.hydra as program
@@ -28,6 +29,17 @@ COMMANDS = ("compare", "inspect", "warm")  # that stand first, without +exp=NAME
 QUOTED_KEY = re.compile(r"""(?<=[{,])\s*(?P<quote>["'])(?P<name>\w+)(?P=quote)\s*(?=:)""")
 # `points.files=PATTERN`, whose braces would be a mapping to Hydra; or the same as `points=PATTERN`.
 FILES = re.compile(r"points(?:\.files=|=(?=[^\[{]*\{\w+\}))(?P<value>.+)", re.DOTALL)
+QUOTES = "'\""
+BEFORE_QUOTE = re.compile(r'(\\*)("|$)')
+# Names of files, folders, signals and groups, which Hydra takes unquoted if they are plain.
+NAMES = re.compile(
+    r"""(?P<key>\+{0,2}(?:data|data\.path|output|signal))="""
+    r"""(?P<value>(?!["']|\[.*\]$|.*\$\{)(?=.*[^A-Za-z0-9_/.*?-]).+)"""
+)
+# What is quoted, or a word with letters beyond ASCII; but not a name of a mapping.
+LETTERS = re.compile(
+    r"""("(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*')|([^\s,[\]{}:=()"']*[^\x00-\x7f][^\s,[\]{}:=()"']*)(?!\s*:)"""
+)
 
 SILENT = {"version": 1, "root": {"level": "ERROR"}, "disable_existing_loggers": True}
 FIXED: Mapping[str, Any] = {"callbacks": {}, "job_logging": SILENT, "hydra_logging": SILENT}
@@ -59,19 +71,41 @@ def options_first(arguments: Sequence[str]) -> list[str]:
 def mend(text: str) -> str:
     """A setting as Hydra's grammar takes it.
 
-    Names of a mapping may come in quotes, and the files of points in any form.
+    Names of a mapping may come in quotes, names of files, folders and columns as they are, and the
+    files of points in any form.
 
     Raises ValueError for an argument that is no setting.
     """
     if pattern := FILES.fullmatch(text):
-        quoted = pattern["value"].strip("'\"").replace("\\", "\\\\").replace('"', '\\"')
-        text = f'points="{quoted}"'
+        text = f"points={_quoted(pattern['value'].strip(QUOTES))}"
+    elif (name := NAMES.fullmatch(text)) and not _is_sweep(name["value"]):
+        text = f"{name['key']}={_quoted(name['value'])}"
     without = QUOTED_KEY.sub(lambda found: found["name"], text)
+    key, _, value = without.partition("=")
+    without = (
+        f"{key}={LETTERS.sub(lambda found: found[1] or _quoted(found[2]), value)}"
+        if value
+        else without
+    )
     try:
         OverridesParser.create().parse_overrides([without])
     except OverrideParseException as error:
         raise ValueError(_unreadable(text, error.message.strip().partition("\n")[0])) from error
     return without
+
+
+def _quoted(text: str) -> str:
+    """Text in double quotes. To Hydra a backslash is itself, but for those before a quote."""
+    return f'"{re.sub(BEFORE_QUOTE, _escaped, text)}"'
+
+
+def _escaped(found: re.Match[str]) -> str:
+    return 2 * found[1] + ("\\" + found[2] if found[2] else "")
+
+
+def _is_sweep(value: str) -> bool:
+    """True for several values between commas, unless that is the name of a file."""
+    return "," in value and not Path(value).exists()
 
 
 class Loader(ConfigLoaderImpl):

@@ -222,7 +222,8 @@ def _hydra(paths: Sequence[str]) -> str:
     if len(paths) > 1:
         return f"[{','.join(_hydra([path]) for path in paths)}]"
     (text,) = paths
-    return text if re.fullmatch(r"[\w/.*?-]+", text) else "'" + text.replace("'", "\\'") + "'"
+    plain = re.fullmatch(r"[\w/.*?-]+", text, re.ASCII)
+    return text if plain else "'" + text.replace("'", "\\'") + "'"
 
 
 def experiments(found: Inspection) -> list[str]:

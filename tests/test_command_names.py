@@ -1,0 +1,71 @@
+"""Names of files, folders and columns with any signs, as they are typed and as they are printed."""
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from ep2sindy.app.arguments import mend
+from tests.programs import ROOT
+
+NAMES = [
+    "dä.csv", "run(1).csv", "a b.csv", "日本.csv", "it's.csv", 'q"q.csv', "x=1.csv", "a&b.csv",
+    "$HOME.csv", "a;b.csv", "[1].csv", "{z}.csv", "~t.csv", "#1.csv", "100%.csv", "-dash.csv",
+    "é.dat", "run+1.csv", "a:b.csv", "back\\slash.csv", "plain.csv", "up/../plain.csv",
+]  # fmt: skip
+
+
+def value_of(text: str) -> object:
+    (found,) = OverridesParser.create().parse_overrides([mend(text)])
+    return found.value()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("key", ["data.path", "output", "signal"])
+def test_names_need_no_quotes_when_typed(key: str, name: str) -> None:
+    assert value_of(f"{key}={name}") == name
+
+
+def test_names_in_lists_and_mappings_may_have_any_letters() -> None:
+    states = value_of("trajectory.states=[Düse_ä,b,'c_ü']")
+    assert list(map(str, states)) == ["Düse_ä", "b", "c_ü"]
+    assert value_of("data.variables={a:{name:größe,unit:V}}") == {
+        "a": {"name": "größe", "unit": "V"}
+    }
+    assert value_of("data.path=[a.csv,ü.csv]") == ["a.csv", "ü.csv"]
+    assert value_of("data.path=${oc.env:HOME}") == "${oc.env:HOME}"
+
+
+def test_a_comma_parts_jobs_of_a_sweep_unless_it_stands_in_a_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (found,) = OverridesParser.create().parse_overrides([mend("data.path=a.csv,b.csv")])
+    assert found.is_sweep_override()
+    Path("a,b.csv").touch()
+    assert value_of("data.path=a,b.csv") == "a,b.csv"
+
+
+@pytest.mark.parametrize("name", ["it's (1) ä.csv", "$a&b;日本.csv"])
+def test_what_inspect_prints_is_pasted_into_a_shell_and_runs(name: str, tmp_path: Path) -> None:
+    t = 1e-6 * np.arange(300)
+    rows = np.column_stack([t, 2.0 + np.sin(1e5 * t), 2.0 + np.cos(1e5 * t)])
+    np.savetxt(tmp_path / name, rows, delimiter=",", header="t_s,Düse_ä,b", comments="")
+    program = shlex.join([sys.executable, "-m", "ep2sindy.app.main"])
+
+    def shell(command: str) -> str:
+        found = os.environ | {"PYTHONPATH": str(ROOT)}
+        run = subprocess.run(
+            command, shell=True, cwd=tmp_path, env=found, capture_output=True, text=True, check=True
+        )
+        return run.stdout
+
+    shown = shell(f"{program} inspect {shlex.quote(name)}").splitlines()
+    (line,) = (each.strip() for each in shown if "+exp=discover data" in each)
+    found = shell(f"{line.replace('ep2sindy', program, 1)} output=Ergebnisse_für")
+    assert "Düse_ä' = " in found
