@@ -139,7 +139,7 @@ def read_written(found: h5py.Dataset) -> np.ndarray:
     """
     if found.shape is None:
         raise ValueError(f"{found.name!r} is empty: its dataspace is null, and holds no values")
-    n_bytes = found.size * found.dtype.itemsize
+    n_bytes = float(found.size * found.dtype.itemsize)
     check_memory(n_bytes, repr(found.name), way_out="copy the part that you need into a file")
     values = np.asarray(found[()])
     holes = holes_of(found)
