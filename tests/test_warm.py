@@ -116,6 +116,22 @@ def test_kernels_beside_the_package_serve_those_who_may_write_nowhere(
         assert (run.stdout, run.stderr) == ("5.0\n", "")
 
 
+@pytest.mark.usefixtures("compilations")
+def test_an_administrator_puts_kernels_beside_the_package(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    made, lacking = tmp_path / "cache" / "kernels" / "model_1", tmp_path / "none"
+    made.mkdir(parents=True)
+    (made / "a.nbi").write_text("index")
+    monkeypatch.setattr(warm, "folders", lambda: [made, lacking])
+    monkeypatch.setattr(warm, "SHARED", tmp_path / "shared")
+    for _ in range(2):
+        warm.main(["--shared"])
+        stamp, kernel = sorted((tmp_path / "shared").iterdir(), reverse=True)
+        assert stamp.name.startswith("warm_")
+        assert (kernel / "a.nbi").read_text() == "index"
+
+
 def test_without_a_folder_kernels_are_compiled_every_time_and_it_is_said(kernels: Path) -> None:
     for place, reason in (
         ("~/.cache", "a cache needs an absolute folder"),

@@ -81,12 +81,8 @@ def mend(text: str) -> str:
     elif (name := NAMES.fullmatch(text)) and not _is_sweep(name["value"]):
         text = f"{name['key']}={_quoted(name['value'])}"
     without = QUOTED_KEY.sub(lambda found: found["name"], text)
-    key, _, value = without.partition("=")
-    without = (
-        f"{key}={LETTERS.sub(lambda found: found[1] or _quoted(found[2]), value)}"
-        if value
-        else without
-    )
+    key, sign, value = without.partition("=")
+    without = key + sign + LETTERS.sub(lambda found: found[1] or _quoted(found[2]), value)
     try:
         OverridesParser.create().parse_overrides([without])
     except OverrideParseException as error:

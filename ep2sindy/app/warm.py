@@ -46,8 +46,8 @@ def main(arguments: Sequence[str]) -> None:
         stamp = _stamp()
         warm()
         if given.shared:
-            for folder in (*folders(), stamp):
-                SHARED.mkdir(parents=True, exist_ok=True)
+            SHARED.mkdir(parents=True, exist_ok=True)
+            for folder in filter(Path.exists, (*folders(), stamp)):
                 copied(folder, SHARED / folder.name)
     except OSError as error:
         sys.exit(f"error: {error}")

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -31,9 +31,6 @@ from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
 from ep2sindy.selection.rule import OtherSystem
-
-if TYPE_CHECKING:
-    pass
 
 FORMAT = "ep2sindy.Discovery/1"
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -29,9 +28,6 @@ from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.attractor import phase_along
 from ep2sindy.signals.oscillation import DIED_OUT
 from ep2sindy.signals.spectrum import dominant_frequency
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -16,9 +15,6 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import start_scale
 from ep2sindy.model.scaled import ScaledModel
 from ep2sindy.runtime.values import check_positive, read_only
-
-if TYPE_CHECKING:
-    pass
 
 # A multiplier whose modulus is this close to one counts as neutral: a departure then takes at least
 # a thousand periods to change e-fold, longer than any record. The multipliers themselves are exact

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -32,9 +32,6 @@ from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import words_of
 from ep2sindy.runtime.values import read_only
 from ep2sindy.selection.criteria import FLOOR
-
-if TYPE_CHECKING:
-    pass
 
 FORMAT = "ep2sindy.OperatingLaw/1"
 

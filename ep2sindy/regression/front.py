@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,9 +18,6 @@ from ep2sindy.regression.row_kernels import TILE, add_residuals, spread
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
-
-if TYPE_CHECKING:
-    pass
 
 # Correction of coefficients, as a share of them, after which another one would be rounding.
 REFINED = 1e-9

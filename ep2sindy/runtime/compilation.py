@@ -106,7 +106,7 @@ def _folder_of(sources: Path) -> str:
             _UNKEPT.append(f"; they are not kept, for {error}")
             return ""
         folder = _private_folder() / name
-    if beside.is_dir() and not folder.exists():
+    if beside.is_dir():
         copied(beside, folder)
     return str(folder)
 
@@ -121,6 +121,8 @@ def _private_folder() -> Path:
 
 def copied(source: Path, target: Path) -> None:
     """Copy a folder, completely or not at all; one that is there stays."""
+    if target.exists():
+        return
     temporary = target.with_name(f".{target.name}-{uuid4().hex}")
     copytree(source, temporary)
     with suppress(OSError):  # another process was faster
