@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 from shutil import rmtree
 
@@ -37,10 +38,11 @@ def cache_folder(kind: str, key: str) -> Path:
             f"{place} cannot be a cache: {reason}; {PLACE} names another folder"
         ) from error
     folder = place / key
-    if folder.exists():
-        os.utime(folder)
-        return folder
-    for other in place.iterdir():
-        if time.time() - other.stat().st_mtime > 86400.0 * STALE_DAYS:
-            rmtree(other, ignore_errors=True)
+    with suppress(OSError):  # another process may use or remove the same at the same time
+        if folder.exists():
+            os.utime(folder)
+            return folder
+        for other in place.iterdir():
+            if time.time() - other.stat().st_mtime > 86400.0 * STALE_DAYS:
+                rmtree(other, ignore_errors=True)
     return folder
