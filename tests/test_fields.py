@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy.data import zones
+from ep2sindy.data import blocks
 from ep2sindy.data.fields import check_field, mask_outside
 from ep2sindy.data.open import read_field, write_field
 from ep2sindy.data.sampling import GridPoint, point_samples
@@ -156,12 +156,12 @@ def test_mask_outside_leaves_variables_without_its_dimensions() -> None:
 def test_slabs_do_not_change_the_average(monkeypatch: pytest.MonkeyPatch) -> None:
     names = {"states": ["n_i"], "inputs": ["T_e_eV"], "products": ["n_i*T_e_eV"]}
     whole = zone_average(masked_field(), Zone(), **names)
-    monkeypatch.setattr(zones, "SLAB_VALUES", 12)  # three samples of four cells
+    monkeypatch.setattr(blocks, "BLOCK_VALUES", 12)  # three samples of four cells
     assert np.array_equal(zone_average(masked_field(), Zone(), **names).values, whole.values)
 
 
 def test_a_gap_in_a_later_slab_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(zones, "SLAB_VALUES", 12)
+    monkeypatch.setattr(blocks, "BLOCK_VALUES", 12)
     field = masked_field()
     field["n_i"].values[9, 1, 1] = np.nan
     with pytest.raises(ValueError, match=r"n_i = nan at time = 9e-05 s, z = 1 m, r = 2 m"):

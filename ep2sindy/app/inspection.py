@@ -273,7 +273,7 @@ def config_text(found: Sequence[Inspection], paths: Sequence[str | list[str]]) -
         f"dt_s: {steps}  # time step in s where the file has no time; taken instead of it",
         'mask: {name: null, unit: "1", dims: null}  # nonzero in the plasma',
         "channel_m: null  # length of the channel from z = 0; null: as the file says",
-        "chunks: null  # such as {time: 1000}, for what exceeds memory (NetCDF, Zarr; needs dask)",
+        "chunks: null  # such as {time: 1000}, for steps on what exceeds memory (needs dask)",
     ]
     return "\n".join(lines) + "\n"
 

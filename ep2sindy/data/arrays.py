@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import xarray as xr
 
+from ep2sindy.data.blocks import blocks_of
 from ep2sindy.data.conversion import counted_in
 from ep2sindy.data.mapping import N_MARKS, read_array
 from ep2sindy.data.numbers import digits_of_rounded, even_grid
-from ep2sindy.data.readers.source import FileSource
+from ep2sindy.data.readers.source import FileSource, damage_named
 from ep2sindy.data.readers.table_layout import unit_in_brackets
 
 MIN_GAP = 3.0  # steps; a shorter one may be a sample that came late
@@ -56,26 +58,24 @@ class ArrayInfo:
 
 
 def describe_array(source: FileSource, name: str) -> ArrayInfo:
-    """Read one array and summarise it."""
+    """Read one array, block by block, and summarise it."""
     try:
         array = read_array(source, name, name)
+        with damage_named(source.path):
+            low, high, n_missing = _range(array)
     except ValueError as error:
         return ArrayInfo(name, problem=_short(str(error), source))
-    values = np.asarray(array.values, dtype=np.float64)
-    finite = values[np.isfinite(values)]
     attribute = str(array.attrs.get("units", "") or source.units.get(name, ""))
     stated = counted_in(attribute) if attribute else unit_in_brackets(name)
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
-    points = values.ravel() if values.size in values.shape else np.empty(0)
+    is_vector = array.size in array.shape
+    points = np.asarray(array.values, dtype=np.float64).ravel() if is_vector else np.empty(0)
     digits = digits_of_rounded(points)
     steps = np.diff(points if digits is None else even_grid(points))
     falls = _fall(points, steps)
     steps = steps if steps.size > 1 and not falls else np.empty(0)
     return ArrayInfo(
-        name, values.shape, stated, dims,
-        float(finite.min()) if finite.size else np.nan,
-        float(finite.max()) if finite.size else np.nan,
-        int(values.size - finite.size),
+        name, array.shape, stated, dims, low, high, n_missing,
         int(array.attrs.get(N_MARKS, 0)),
         float(np.median(steps)) if steps.size else None,
         bool(steps.size and np.ptp(steps) <= 1e-3 * steps.mean()),
@@ -83,6 +83,22 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
         _gap(steps),
         falls,
     )  # fmt: skip
+
+
+def _range(array: xr.DataArray) -> tuple[float, float, int]:
+    """Least and largest finite value, NaN without any, and the number of the other values."""
+    lows, highs, n_missing = [np.inf], [-np.inf], 0
+    for where in blocks_of(array):
+        values = array.isel(where).values
+        ends = values.min(initial=np.inf), values.max(initial=-np.inf)
+        if not np.isfinite(ends).all():  # seldom: a NaN makes both ends NaN
+            finite = values[np.isfinite(values)]
+            n_missing += values.size - finite.size
+            ends = finite.min(initial=np.inf), finite.max(initial=-np.inf)
+        lows.append(float(ends[0]))
+        highs.append(float(ends[1]))
+    low, high = min(lows), max(highs)
+    return (low, high, n_missing) if low <= high else (np.nan, np.nan, n_missing)
 
 
 def _short(text: str, source: FileSource) -> str:

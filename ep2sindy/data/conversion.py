@@ -53,7 +53,9 @@ def to_si(array: xr.DataArray, ours: str, unit: str, *, is_variable: bool = Fals
             f"{stated!r}; set it to what the numbers count"
         )
     if (factor, offset) != (1.0, 0.0):
-        array = array * factor + offset
+        from ep2sindy.data.blocks import scale  # here, for it loads xarray
+
+        array = scale(array, factor=factor, offset=offset)
     return array.drop_attrs().assign_attrs(units=target)
 
 

@@ -132,6 +132,8 @@ def assign_dims(
             f"dims given: {list(dims) or None}; give data.variables.{ours}.dims in the order of "
             "the file, such as [z,time]"
         )
+    if array.shape != sizes and array.squeeze().shape == sizes:
+        array = array.squeeze()
     if array.shape == sizes:
         named = array.drop_vars(list(array.coords)).rename(dict(zip(array.dims, dims, strict=True)))
     else:

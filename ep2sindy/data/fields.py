@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.blocks import read_whole
 from ep2sindy.data.conversion import COORDINATE_UNITS
 from ep2sindy.data.export import CLOCK
 from ep2sindy.data.trajectory import check_time
@@ -98,9 +99,11 @@ def grid_values(array: xr.DataArray) -> Float[np.ndarray, "time z r"]:
     """Load a variable as (time, z, r) in float64; a dimension it lacks has length 1.
 
     The array may be the variable's own: copy it before writing into it.
+    Raises ValueError if it would take more memory than is free.
     """
-    missing = [axis for axis in DIMS if axis not in array.dims]
-    return array.expand_dims(missing).transpose(*DIMS).values.astype(np.float64, copy=False)
+    shape = tuple(array.sizes.get(axis, 1) for axis in DIMS)
+    ordered = array.transpose(*(axis for axis in DIMS if axis in array.dims))
+    return read_whole(ordered).reshape(shape).astype(np.float64, copy=False)
 
 
 def mask_cells(array: xr.DataArray) -> Bool[np.ndarray, "1 z r"]:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from math import isclose
 from pathlib import Path
 
 import xarray as xr
 
 from ep2sindy.data.arrays import describe_array
+from ep2sindy.data.blocks import UNDECODED
 from ep2sindy.data.conversion import conversion, to_si
 from ep2sindy.data.dimensions import assign_dims, read_axes
 from ep2sindy.data.export import CLOCK
@@ -23,7 +25,7 @@ from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
 from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import reader_of
-from ep2sindy.data.readers.source import UNDECODED, FileSource, damage_named, file_named
+from ep2sindy.data.readers.source import FileSource, damage_named, file_named
 from ep2sindy.data.recognition import recognise
 from ep2sindy.data.steps import open_record
 
@@ -54,9 +56,9 @@ def open_field(
     channel_m: length of the channel from z = 0, stored as an attribute; None: as in the file.
     units: our name -> unit, where the file states none. plasma: names such as Te are a plasma's
         quantities without a unit, too, and what has no unit is in SI. Both without `variables`.
-    chunks: our dimension -> length, to stream data that exceed memory (needs dask; NetCDF, Zarr).
-    Values from NetCDF and Zarr are read when they are used; without dask, this holds for variables
-    in SI without a mask. Other kinds of file are read at once.
+    chunks: our dimension -> length, to stream data that exceed memory (needs dask).
+    Large variables of NetCDF, Zarr, HDF5 and MATLAB 7.3 are read when they are used, and a zone is
+    averaged over parts of them; without dask, a mask reads them. Other kinds are read at once.
     Warns with `DoubtfulUnit` if dt_s contradicts the file's times.
     Raises one ValueError for all names not in the file, shapes that do not fit their dimensions,
     and units that cannot be converted; also for a missing or damaged file, or one of another kind.
@@ -112,6 +114,8 @@ def _field(
     chunks: Mapping[str, int] | None,
 ) -> xr.Dataset:
     """Build the field that a mapping describes; one error reports all faults of the mapping."""
+    if chunks is not None and find_spec("dask") is None:
+        raise ValueError("data.chunks needs dask: pip install 'ep2sindy[cluster]'")
     problems, arrays = Problems(), {}
     wanted = in_file(variables, problems)
     if not wanted and not problems.found:

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.blocks import blocks_of
 from ep2sindy.data.fields import (
     SPACE,
     cell_sizes,
@@ -27,8 +28,6 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.names import split_factors
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.screen import near_words
-
-SLAB_VALUES = 2**22  # 32 MB of float64: memory limit for one variable while averaging a zone
 
 
 def zone_average(
@@ -49,8 +48,8 @@ def zone_average(
     products: each, such as "n_i*n_n*R_ion", adds an input named `<n_i*n_n*R_ion>` with the average
     of the product, which is not the product of averages. If a variable's attribute `average_of`
     names the product, that variable is used: like a simulation's samples, it is averaged in time.
-    Sums run in float64, slab by slab in time, whatever the storage type. Samples at which a
-    variable of time alone is missing (NaN) are left out for all variables.
+    Sums run in float64, over parts of the field that fit into memory. Samples at which a variable
+    of time alone is missing (NaN) are left out for all variables.
     Raises ValueError for an unknown variable, a zone off the grid or without plasma, or a
     value that is not finite in an unmasked cell.
 
@@ -151,30 +150,29 @@ def _means(
     weights: Float[np.ndarray, "z r"],
     columns: Sequence[Sequence[tuple[str, int]]],
 ) -> Float[np.ndarray, "samples columns"]:
-    """Weighted means over the cells at all times, computed slab by slab."""
-    n_slab = max(1, SLAB_VALUES // weights.size)
-    slabs = (part.isel(time=slice(k, k + n_slab)) for k in range(0, part.sizes["time"], n_slab))
-    return np.concatenate([_slab_means(slab, masks, weights, columns) for slab in slabs])
-
-
-def _slab_means(
-    slab: xr.Dataset,
-    masks: Mapping[str, Bool[np.ndarray, "1 _ _"]],
-    weights: Float[np.ndarray, "z r"],
-    columns: Sequence[Sequence[tuple[str, int]]],
-) -> Float[np.ndarray, "samples columns"]:
-    """Weighted means of products of variables over the cells, for one slab of samples."""
-    values = {}
-    for name, masked in masks.items():
-        raw = grid_values(slab[name])
-        check_samples(slab[name], raw, masked)
-        values[name] = np.where(masked, 0.0, raw)
-    means = np.empty((slab.sizes["time"], len(columns)))
-    for j, factors in enumerate(columns):
-        product = math.prod(values[name] ** power for name, power in factors)
-        cells = np.broadcast_to(product, (len(means), *weights.shape))
-        means[:, j] = np.einsum("tzr,zr->t", cells, weights)
+    """Weighted means of products of variables over the cells at all times, block by block."""
+    means = np.zeros((part.sizes["time"], len(columns)))
+    for where in blocks_of(part):
+        block, values = part.isel(where), {}
+        cells = tuple(where.get(axis, slice(None)) for axis in SPACE)
+        for name, masked in masks.items():
+            raw, here = grid_values(block[name]), _of_cells(masked, cells)
+            check_samples(block[name], raw, here)
+            values[name] = np.where(here, 0.0, raw)
+        share = _of_cells(weights, cells)
+        for j, factors in enumerate(columns):
+            product = math.prod(values[name] ** power for name, power in factors)
+            spread = np.broadcast_to(product, (block.sizes["time"], *share.shape))
+            means[where["time"], j] += np.einsum("tzr,zr->t", spread, share)
     return means
+
+
+def _of_cells(grid: np.ndarray, cells: Sequence[slice]) -> np.ndarray:
+    """Part of an array over z and r, its last axes; an axis of one point stands for all cells."""
+    along_z, along_r = (
+        part if n > 1 else slice(None) for part, n in zip(cells, grid.shape[-2:], strict=True)
+    )
+    return grid[..., along_z, along_r]
 
 
 # Zones: part of a grid in z and r, given by its ends or as a part of a thruster's channel.

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import product
-from math import ceil
+from math import ceil, prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from xarray.backends import BackendArray
+from xarray.core import indexing
 
-from ep2sindy.data.readers.source import PACKED_BY, UNDECODED, FileSource, Reader, check_packing
+from ep2sindy.data.blocks import AT_ONCE, UNDECODED
+from ep2sindy.data.readers.source import PACKED_BY, FileSource, Reader, check_packing
 from ep2sindy.trust.memory import check_memory
 
 if TYPE_CHECKING:
@@ -45,14 +47,12 @@ def read_hdf5(path: Path) -> FileSource:
             return beside[name]
         with h5py.File(path) as file:
             found = file[name]
-            values, attrs = read_written(found), _attributes(found, name)
-            values = values[0] if _has_modes(found) else values
-            units = {"units": attrs.pop("units")}
-            if not attrs:  # not packed, as most
-                return xr.DataArray(values, attrs=units)
-            packed = xr.Variable([f"dim_{k}" for k in range(values.ndim)], values, attrs)
-        plain = xr.decode_cf(xr.Dataset({"it": packed}), decode_coords=False, **UNDECODED)["it"]
-        return xr.DataArray(plain.values, attrs=units)
+            array, attrs = stored_array(path, found), _attributes(found, name)
+            array = array[0] if _has_modes(found) else array
+        unit = attrs.pop("units")
+        packed = xr.Dataset({"it": array.assign_attrs(attrs)})
+        plain = xr.decode_cf(packed, decode_coords=False, **UNDECODED)["it"]
+        return plain.drop_attrs().assign_attrs(units=unit)
 
     names = names_in_hdf5(path)
     beside = {name: array for name, array in beside.items() if name not in names}
@@ -131,45 +131,77 @@ def names_in_hdf5(path: Path) -> list[str]:
     return names
 
 
-def read_written(found: h5py.Dataset) -> np.ndarray:
-    """Read the values of a data set, with NaN in blocks that were never written (HDF5 gives zeros).
+class _Stored(BackendArray):
+    """Values of a data set, read when they are used; those that were never written are NaN."""
 
+    def __init__(self, path: Path, found: h5py.Dataset) -> None:
+        self.path, self.name, self.shape = path, found.name, found.shape
+        self.written, self.chunks = _written(found)
+        self.dtype = found.dtype if self.written.all() else np.dtype(np.float64)
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> np.ndarray:
+        support = indexing.IndexingSupport.OUTER_1VECTOR
+        return indexing.explicit_indexing_adapter(key, self.shape, support, self._read)
+
+    def _read(self, key: tuple[Any, ...]) -> np.ndarray:
+        import h5py
+
+        with h5py.File(self.path) as file:
+            values = np.asarray(file[self.name][key])
+        if self.written.all():
+            return values
+        chunk_of = (np.arange(n) // c for n, c in zip(self.shape, self.chunks, strict=True))
+        places = [np.ravel(of[k]) for of, k in zip(chunk_of, key, strict=True)]
+        return np.where(self.written[np.ix_(*places)].reshape(values.shape), values, np.nan)
+
+
+def stored_array(path: Path, found: h5py.Dataset) -> xr.DataArray:
+    """Values of a data set, read when they are used if they are many.
+
+    Where nothing was written, HDF5 gives zeros, and this NaN.
     Raises ValueError if nothing was ever written, and for a null dataspace, which cannot hold any
     values.
     """
     if found.shape is None:
         raise ValueError(f"{found.name!r} is empty: its dataspace is null, and holds no values")
-    n_bytes = float(found.size * found.dtype.itemsize)
-    check_memory(n_bytes, repr(found.name), way_out="copy the part that you need into a file")
-    values = np.asarray(found[()])
-    holes = holes_of(found)
-    if not holes:
-        return values
-    if len(holes) == 1 and holes[0] == (slice(None),) * found.ndim:
+    if found.dtype.kind not in "iufb":
+        return xr.DataArray(found[()])
+    # Read whole: a vector, as times are, and one mark for each chunk that says if it was written.
+    n_bytes = found.size * found.dtype.itemsize if found.ndim < 2 else prod(_counts(found))
+    check_memory(
+        float(n_bytes), repr(found.name), way_out="copy the part that you need into a file"
+    )
+    stored = _Stored(path, found)
+    if not stored.written.any():
         raise ValueError(f"{found.name!r} was never written: the file holds its shape alone")
-    values = values.astype(np.float64)
-    for hole in holes:
-        values[hole] = np.nan
-    return values
+    dims = [f"dim_{k}" for k in range(found.ndim)]
+    chunks = {} if found.chunks is None else dict(zip(dims, found.chunks, strict=True))
+    lazy = indexing.LazilyIndexedArray(stored)
+    array = xr.DataArray(xr.Variable(dims, lazy, encoding={"preferred_chunks": chunks}))
+    return array if array.nbytes > AT_ONCE else array.load()
 
 
-def holes_of(found: h5py.Dataset) -> list[tuple[slice, ...]]:
-    """Blocks of a numeric data set without storage in the file, because they were never written."""
-    if not found.size or found.shape == () or found.dtype.kind not in "iuf" or found.is_virtual:
-        return []
-    if found.chunks is None or not found.id.get_num_chunks():
-        return [] if found.id.get_storage_size() else [(slice(None),) * found.ndim]
-    counts = [ceil(n / step) for n, step in zip(found.shape, found.chunks, strict=True)]
-    if found.id.get_num_chunks() == np.prod(counts, dtype=object):
-        return []
-    there: set[tuple[int, ...]] = set()
-    found.id.chunk_iter(lambda chunk: there.add(chunk.chunk_offset))
-    starts = product(*(range(0, n, s) for n, s in zip(found.shape, found.chunks, strict=True)))
-    return [
-        tuple(slice(a, a + step) for a, step in zip(start, found.chunks, strict=True))
-        for start in starts
-        if start not in there
-    ]
+def _written(found: h5py.Dataset) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Which chunks of a data set were written, over the grid of its chunks, and their shape."""
+    chunks = found.chunks or tuple(max(n, 1) for n in found.shape)
+    written = np.ones(_counts(found), dtype=bool)
+    if not found.size or not found.shape or found.dtype.kind not in "iuf" or found.is_virtual:
+        return written, chunks
+    if found.chunks is None:
+        written[...] = found.id.get_storage_size() > 0
+    elif found.id.get_num_chunks() < written.size:
+        written[...] = False
+        starts: list[tuple[int, ...]] = []
+        found.id.chunk_iter(lambda chunk: starts.append(chunk.chunk_offset))
+        for start in starts:
+            written[tuple(k // step for k, step in zip(start, chunks, strict=True))] = True
+    return written, chunks
+
+
+def _counts(found: h5py.Dataset) -> list[int]:
+    """Number of chunks along each axis; one where the values are not divided into chunks."""
+    chunks = found.chunks or tuple(max(n, 1) for n in found.shape)
+    return [ceil(n / step) for n, step in zip(found.shape, chunks, strict=True)]
 
 
 def _attributes(found: h5py.Dataset, name: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from zipfile import ZipFile
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.hdf5 import names_in_hdf5, read_written
+from ep2sindy.data.readers.hdf5 import names_in_hdf5, stored_array
 from ep2sindy.data.readers.source import FileSource, Reader, leaves
 
 V73 = b"MATLAB 7.3"
@@ -33,7 +33,7 @@ def read_matlab73(path: Path) -> FileSource:
                     f"{name!r} is a MATLAB {kind}, of which the file holds references: save its "
                     f"columns as arrays, or writetable({name}, 'run.csv')"
                 )
-            return xr.DataArray(read_written(found).T)
+            return stored_array(path, found).T
 
     names = [
         name.replace("/", ".") for name in names_in_hdf5(path) if not name.startswith("#refs#")

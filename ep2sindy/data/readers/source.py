@@ -15,17 +15,13 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from ep2sindy.data.blocks import AT_ONCE, UNDECODED
 from ep2sindy.data.fields import channel_length_m
 from ep2sindy.data.numbers import count_dates
 from ep2sindy.library.units import seconds_in
 from ep2sindy.runtime.screen import words_of
 
-# xarray must keep times as numbers, whatever their attribute `units` says.
-UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
-
 PACKED_BY = ("scale_factor", "add_offset")
-
-AT_ONCE = 2**28  # bytes of an array up to which it is read once when its file is opened
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
