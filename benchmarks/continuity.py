@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-CACHE = Path(".cache/simulations").absolute()
 # Voltage (V), mass flow (mg/s) and the speed of the neutrals that is set (m/s).
 POINTS = [(300, 5, 338), (200, 5, 320), (300, 2, 195), (300, 4, 338), (300, 6, 338), (400, 5, 338)]
 NEUTRALS = "{_target_: ep2sindy.prepare.gradient, of: n_n, name: grad_n}"
@@ -43,7 +42,6 @@ def line(name: str, overrides: Sequence[str], speed: float) -> str:
         given = [
             "pointwise=continuity",
             *overrides,
-            f"data.cache={CACHE}",
             f"output={folder}",
             "keep=false",
         ]

@@ -20,16 +20,13 @@ BREATHING_HZ = 19.15e3
 SHARE = 0.05
 N_PARTS = 4
 STATES = ("n_i", "n_n")
-CACHE = ".cache/simulations"
 
 
 def driven(frequency_Hz: float, *, duration_s: float = 6e-3) -> ep.Trajectory:
     """Channel averages of a discharge whose voltage is modulated, the voltage as an input."""
     supply = ep.thruster.ModulatedVoltage(SHARE, frequency_Hz)
     thruster, point = ep.thruster.Thruster(), replace(POINT, supply=supply)
-    field = ep.thruster.simulate(
-        thruster, point, duration_s=duration_s, cache=CACHE, progress=False
-    )
+    field = ep.thruster.simulate(thruster, point, duration_s=duration_s, cache=True, progress=False)
     inside = field.sel(z=slice(0.0, thruster.channel_length))
     weight = inside["dz"] / inside["dz"].sum()
     states = [(inside[name] * weight).sum("z").values.astype(float) for name in STATES]

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from dataclasses import field as field_of
 from functools import cache
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,7 +45,6 @@ NOISES = ((0.2, 6.0), (0.4, 50.0))  # share of each state's RMS, periods
 N_NOISE_DRAWS = 3
 LONGER = 10.0  # times the held-out part, for the other solver
 STATES = ("n_i", "n_n")
-CACHE = Path(".cache/simulations")
 
 # The source until version 0.2, conf/thruster/pulses.yaml: sharp pulses.
 FORMER = ep.thruster.Thruster(
@@ -135,7 +133,7 @@ def field(label: str, name: str = "default") -> xr.Dataset:
     point = POINTS[label]
     if name == "former":
         point = replace(point, neutral_speed=FORMER_SPEED.get(label, 280.0))
-    return ep.thruster.simulate(SETS[name], point, cache=CACHE, progress=False)
+    return ep.thruster.simulate(SETS[name], point, cache=True, progress=False)
 
 
 @cache
@@ -459,7 +457,7 @@ def print_noise() -> None:
 def print_plane() -> None:
     """The (z, r) simulator: averages over the channel's volume, and their balance."""
     print("\n(z, r) simulator, whole channel, by what is held out; ends of free runs if not alive")
-    run = ep.thruster.simulate_2d(duration_s=12e-3, cache=CACHE, progress=False)
+    run = ep.thruster.simulate_2d(duration_s=12e-3, cache=True, progress=False)
     zone = ep.Zone(z=CHANNEL)
     whole = Record(
         ep.zone_average(run, zone, states=STATES, label="plane"),

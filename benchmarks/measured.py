@@ -162,7 +162,7 @@ def populations() -> None:
 def current() -> None:
     """The simulator's current as a scope has it, spoilt in three ways, over draws of its noise."""
     field = ep.thruster.simulate(
-        ep.thruster.Thruster(), ep.thruster.OperatingPoint(300, 5), cache=".cache/simulations"
+        ep.thruster.Thruster(), ep.thruster.OperatingPoint(300, 5), cache=True
     )
     t, x = field["time"].values, field["I_d"].values
     spoilt: dict[str, Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]] = {
@@ -354,7 +354,7 @@ def offset() -> None:
 def neutrals(voltage: float, flow: float) -> None:
     """The simulator's ions measured, its neutrals hidden; the last quarter held out."""
     point = ep.thruster.OperatingPoint(voltage, flow)
-    field = ep.thruster.simulate(ep.thruster.Thruster(), point, cache=".cache/simulations")
+    field = ep.thruster.simulate(ep.thruster.Thruster(), point, cache=True)
     both = ep.zone_average(field, ep.Zone(z="channel"), states=["n_i", "n_n"])
     run = ep.Trajectory(both.t, both.columns(["n_i"]), ["n_i"], units={"n_i": "m^-3"})
     n = round(0.75 * run.n_samples)

@@ -80,7 +80,7 @@ def averaged(
         ep.thruster.OperatingPoint(
             voltage, flow, neutral_speed=280.0 if thruster else DEFAULT_SPEED
         ),
-        cache=".cache/simulations",
+        cache=True,
         duration_s=6e-3,
         progress=False,
     )

@@ -41,7 +41,7 @@ def current(point: str) -> Trajectory:
     field = ep.thruster.simulate(
         ep.thruster.Thruster(),
         ep.thruster.OperatingPoint(voltage, mass_flow),
-        cache=".cache/simulations",
+        cache=True,
     )
     return Trajectory(field["time"].values, field[NAME].values[:, None], (NAME,), units={NAME: "A"})
 

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from ep2sindy.app.warm import warm
 from ep2sindy.report import folder
+from ep2sindy.thruster import cache
 
 # Workers share the cores: threads of their own would only get in each other's way.
 threadpool_limits(1)
@@ -38,6 +39,15 @@ def coarse_figures() -> Iterator[None]:
     """Files of figures have few pixels, for nobody looks at them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(folder, "DPI", 40)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def own_simulations(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Simulations are kept for this session alone, and none of the user's is read."""
+    folder = tmp_path_factory.mktemp("simulations")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "cache_folder", lambda kind, key: folder)
         yield
 
 

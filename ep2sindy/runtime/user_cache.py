@@ -1,7 +1,7 @@
-"""The user's own folder for what can be made again: compiled kernels, and pieces of broken runs.
+"""The user's own folder for what can be made again: kernels, simulations, pieces of broken runs.
 
-Both are read by unpickling, which can run code. So they are never looked for in the folder in which
-a program is started, which may be a stranger's.
+Kernels and pieces are read by unpickling, which can run code, and a simulation is believed. So they
+are never looked for in the folder in which a program is started, which may be a stranger's.
 """
 
 from __future__ import annotations

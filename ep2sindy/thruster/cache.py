@@ -15,6 +15,7 @@ from ep2sindy.data.fields import write_netcdf
 from ep2sindy.runtime.files import fingerprint, sweep, writing
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import in_line, on_screen
+from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.signals import oscillation, spectrum
 from ep2sindy.thruster.axial.settings import to_json
 
@@ -25,28 +26,29 @@ SOURCES = [Path(__file__).parent, *(Path(str(each.__file__)) for each in (oscill
 
 
 def read_or_run(
-    cache: str | Path | None, name: str, parameters: dict[str, Any],
+    cache: str | Path | bool | None, name: str, parameters: dict[str, Any],
     run: Callable[[], xr.Dataset], progress: Progress | bool,
 ) -> xr.Dataset:  # fmt: skip
     """The result of `run`, read from a file in the folder `cache`, or run and kept there.
 
-    Without a folder, nothing is kept. The hash in the file's name covers all parameters and the
+    True: the user's own folder; where there is none, this is said, and nothing is kept. None or
+    False: nothing is kept. The hash in the file's name covers all parameters and the
     source text of SOURCES, so that a changed formula never returns an old result. Both ways return
     the same values. The file states its parameters, and HDF5 checks its values by checksums. A file
     that does not match, or cannot be read, is reported, recomputed and replaced. Results appear
     under their final name only once complete. Raises OSError if the folder cannot be written,
     before anything runs.
     """
-    if cache is None:
+    folder = _folder(cache)
+    if folder is None:
         return run()
     text = to_json(parameters)
-    path = Path(cache, f"{name}_{fingerprint(text, sources=SOURCES)}.nc")
+    path = folder / f"{name}_{fingerprint(text, sources=SOURCES)}.nc"
     if path.exists():
         try:
             return _of(read(path), text)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
-            with on_screen(sys.stdout):
-                tqdm.write(in_line(f"{path} cannot be read ({error}); simulating it again"))
+            _say(f"{path} cannot be read ({error}); simulating it again")
     with writing(path.parent):  # checked now, not after the simulation
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path.parent)
@@ -56,6 +58,22 @@ def read_or_run(
     with as_progress(progress).stage(None, "", "keeping the simulation"):
         write(field.assign_attrs({MADE_OF: text}), path)
     return field
+
+
+def _folder(cache: str | Path | bool | None) -> Path | None:
+    """The folder that `cache` means, or None where nothing is kept."""
+    if cache is not True:
+        return Path(cache) if cache else None
+    try:
+        return cache_folder("simulations", fingerprint("", sources=SOURCES))
+    except OSError as error:
+        _say(f"the simulation is not kept: {error}")
+        return None
+
+
+def _say(text: str) -> None:
+    with on_screen(sys.stdout):
+        tqdm.write(in_line(text))
 
 
 def _of(stored: xr.Dataset, parameters: str) -> xr.Dataset:

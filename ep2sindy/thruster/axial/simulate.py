@@ -73,7 +73,7 @@ def simulate(
     cfl: float = CFL,
     coldest_T_e_eV: float = 0.0,
     initial: Start | xr.Dataset | str | Path | None = None,
-    cache: str | Path | None = None,
+    cache: str | Path | bool | None = None,
     progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Simulate one operating point and record it at equal steps after a warm-up.
@@ -85,8 +85,8 @@ def simulate(
     coldest_T_e_eV: lower bound of T_e, like the 1.5 eV of HallThruster.jl; the energy balance then
     lacks the added heat. initial: `GuessedStart` (None), `ColdStart`, `SoftStart`, or the end of
     another run, given as its Dataset or NetCDF file. cache: folder in which this simulation is
-    kept, or from which it is read, with the same values. Its file name holds a hash of all
-    parameters and of this package's source text: a changed formula never returns an old result.
+    kept, or from which it is read, with the same values; True: your cache folder. The file's name
+    holds a hash of all parameters and of the sources: a changed formula gives no old result.
 
     Returns a Dataset on ("time", "z"), time in s from the end of the warm-up, with fields
     (float32) and series (float64); docs/thruster.md lists them. Its attributes hold the

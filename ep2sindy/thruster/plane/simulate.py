@@ -78,7 +78,7 @@ def simulate_2d(
     n_z: int = 41,
     n_r: int = 49,
     averaged: bool = True,
-    cache: str | Path | None = None,
+    cache: str | Path | bool | None = None,
     progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Simulate one operating point in (z, r) and sample it at equal steps after a warm-up.
