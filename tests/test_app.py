@@ -279,6 +279,25 @@ def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
     assert "Traceback" not in said.err
 
 
+def test_a_sweep_that_needs_slurm_says_so_where_there_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("ep2sindy.app.arguments.which", lambda command: None)
+    error = ended("-m", "+exp=simulate", "seed=0,1", "hydra/launcher=slurm")
+    assert error.startswith("error: hydra/launcher=slurm needs the command srun of SLURM")
+
+
+def test_a_launcher_of_an_extra_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `slurm.yaml` is read where the extra is not installed."""
+    (tmp_path / "conf" / "hydra" / "launcher").mkdir(parents=True)
+    own = "defaults: [submitit_that_is_not_installed, _self_]"
+    (tmp_path / "conf" / "hydra" / "launcher" / "mine.yaml").write_text(own)
+    monkeypatch.chdir(tmp_path)
+    error = ended("-m", "+exp=simulate", "seed=0,1", "hydra/launcher=mine")
+    assert error.endswith("comes with an extra: pip install 'ep2sindy[cluster]'")
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

@@ -513,6 +513,15 @@ def test_a_written_field_is_netcdf(tmp_path: Path) -> None:
         read_field(tmp_path / "a.npz")
 
 
+def test_chunks_without_dask_name_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ep2sindy.data.open.find_spec", lambda name: None)
+    write_netcdf4(tmp_path / "a.nc")
+    with pytest.raises(ValueError, match=r"data.chunks needs dask: pip install .*cluster"):
+        open_field(tmp_path / "a.nc", **SETTINGS, chunks={"time": 2})
+
+
 def test_chunks_stream_a_file(tmp_path: Path) -> None:
     pytest.importorskip("dask")
     write_netcdf4(tmp_path / "a.nc")

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 import hydra._internal.hydra as program
@@ -43,6 +44,8 @@ LETTERS = re.compile(
 
 SILENT = {"version": 1, "root": {"level": "ERROR"}, "disable_existing_loggers": True}
 FIXED: Mapping[str, Any] = {"callbacks": {}, "job_logging": SILENT, "hydra_logging": SILENT}
+
+PLUGINS = ("hydra._internal.core_plugins.", "hydra_plugins.")  # where parts may come from
 
 Compose = Callable[[list[str]], DictConfig]
 
@@ -121,7 +124,23 @@ class Loader(ConfigLoaderImpl):
                     f"hydra.{name} must stay as it is, for it names what is called: {came!r} came; "
                     "leave it out"
                 )
+        check_plugins(found.hydra)
         return found
+
+
+def check_plugins(hydra: DictConfig) -> None:
+    """Raise ValueError for a launcher or sweeper that cannot start jobs, before Hydra fails."""
+    for part in ("launcher", "sweeper"):
+        target = str(hydra[part].get("_target_"))
+        if not target.startswith(PLUGINS):
+            raise ValueError(
+                f"hydra.{part} must be one of Hydra's plugins: {target!r} came; leave it out"
+            )
+        if target.endswith("SlurmLauncher") and which("srun") is None:
+            raise ValueError(
+                "hydra/launcher=slurm needs the command srun of SLURM, and there is none here: "
+                "start the sweep on a node of the cluster, or take hydra/launcher=submitit_local"
+            )
 
 
 @contextmanager
@@ -151,6 +170,8 @@ def explained(overrides: Sequence[str], compose: Compose) -> Iterator[None]:
 def _no_choice(error: MissingConfigException) -> str:
     """Words for a choice of a group, or an experiment, that there is not."""
     group, _, name = str(error.missing_cfg_file or "").rpartition("/")
+    if group == "hydra/launcher" and name.startswith("submitit"):
+        return f"the launcher {name} comes with an extra: pip install 'ep2sindy[cluster]'"
     options = sorted(error.options or ())
     if not group or not options:
         return str(error).partition("\nConfig search path")[0]
