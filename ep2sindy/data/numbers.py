@@ -126,7 +126,8 @@ def without_marks(values: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"
     these range.
     """
     for mark in MARKS:
-        hits = values == mark
+        # Not exactly: older releases of pandas may read the last digit of a number wrongly.
+        hits = np.abs(values - mark) <= 1e-14 * abs(mark)
         if np.count_nonzero(hits) < 2:
             continue
         others = values[~hits & np.isfinite(values)]

@@ -240,6 +240,8 @@ def _least_squares(
     from scipy.optimize import lsq_linear  # import takes 0.5 s; most searches do not need it
 
     n = theta.shape[1]
+    if not n:  # nothing is free
+        return np.zeros(0), np.zeros((0, 0)), float(np.mean(np.square(target)))
     norms, size = column_norms(theta), np.linalg.norm(target) or 1.0
     columns = np.column_stack([theta / norms, target / size])
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))
