@@ -36,7 +36,7 @@ def run_config(config: DictConfig) -> Path:
     check_common(config)
     formats = formats_of(config)
     with Bars().stage(3, "step", "loading") as advance:
-        check_targets(config)
+        check_targets(OmegaConf.to_container(config))
         advance(1)
         kind = study_class(config.get("study"))
         advance(1)
