@@ -395,7 +395,7 @@ def test_marks_of_overload_that_repeat_are_missing_samples_and_said(
     x[[3, 9]] = mark
     path = write_csv(tmp_path / "a.csv", t_s=T, x=x)
     found = ep.inspect_file(path)
-    assert found.found.held[1].n_missing == 2
+    assert found.held[1].n_missing == 2
     assert "'x': 2 samples are marks of an overload or of absence, and left out" in found.notes()
     assert np.isnan(ep.open_field(path)["x"].values[[3, 9]]).all()
     (run,) = trajectories_of(pd.read_csv(path))

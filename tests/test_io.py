@@ -13,9 +13,8 @@ from nptdms import ChannelObject, TdmsWriter
 from scipy.io import savemat
 
 from ep2sindy.data.conversion import conversion, same_unit
-from ep2sindy.data.inspection import inspect_file
 from ep2sindy.data.mapping import Variable
-from ep2sindy.data.open import open_field, read_field, write_field
+from ep2sindy.data.open import inspect_file, open_field, read_field, write_field
 from ep2sindy.data.prepare import keep_where
 from ep2sindy.data.readers.registry import READERS, reader_of
 from ep2sindy.data.readers.source import look_at
@@ -418,7 +417,7 @@ KINDS = {
 @pytest.mark.parametrize("name", KINDS)
 def test_the_order_of_readers_decides_nothing(tmp_path: Path, name: str) -> None:
     KINDS[name](tmp_path / name)
-    claims = sorted(reader.claim(look_at(tmp_path / name)) for reader in READERS)
+    claims = sorted(reader.claim(*look_at(tmp_path / name)) for reader in READERS)
     assert claims[-1] > claims[-2]
     assert reader_of(tmp_path / name) is reader_of(tmp_path / name, READERS[::-1])
 
@@ -427,7 +426,7 @@ def test_the_order_of_readers_decides_nothing(tmp_path: Path, name: str) -> None
 def test_hdf5_is_recognised_as_its_own_library_does(tmp_path: Path, name: str) -> None:
     KINDS[name](tmp_path / name)
     is_hdf5 = not name.endswith("zarr") and h5py.is_hdf5(tmp_path / name)
-    assert (look_at(tmp_path / name).form == "hdf5") is is_hdf5
+    assert (look_at(tmp_path / name)[0] == "hdf5") is is_hdf5
 
 
 KNOWN = (

@@ -12,9 +12,9 @@ from typing import Any
 import yaml
 
 from ep2sindy.data.conversion import KNOWN_UNITS
-from ep2sindy.data.inspection import Inspection, compare_files, inspect_file, unlike
+from ep2sindy.data.inspection import STEP, Inspection, compare_files, unlike
 from ep2sindy.data.mapping import Variable
-from ep2sindy.data.recognition import STEP
+from ep2sindy.data.open import inspect_file
 from ep2sindy.data.steps import records_of
 from ep2sindy.operating.file_names import FilePattern, propose_pattern
 from ep2sindy.operating.records import point_label
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         pattern = propose_pattern([path for path in paths if isinstance(path, str)])
     if pattern:
         say("\n".join(point_lines(pattern)))
-    name = given.write or _word_for(found[0].path)
+    name = given.write or _word_for(found[0].source.path)
     differing = unlike(found) if len(found) > 1 else ""
     if given.write is None and differing:
         say(differing)
@@ -124,8 +124,8 @@ def commands(
     names no file, and in which `more` and units are given too.
     """
     first = found[0]
-    units = ",".join(f"{name}:UNIT" for name in first.found.no_unit)
-    step = [STEP] * bool(first.found.no_time)
+    units = ",".join(f"{name}:UNIT" for name in first.no_unit)
+    step = [STEP] * bool(first.no_time)
     if group == "recognised":
         step += [*more, *[f"data.units={{{units}}}"] * bool(units)]
     lines = []
@@ -178,11 +178,11 @@ def record_commands(found: Inspection, data: list[str], *, are_several: bool) ->
 
 def point_command(found: Inspection, path: str) -> list[str]:
     """The command that studies a point in the middle of arrays over axes that are not z and r."""
-    time = found.found.axes.get("time")
+    time = found.axes.get("time")
     over = [
         each
-        for each in found.found.held
-        if len(each.shape) > 1 and each.shape[0] == found.found.n_samples and not each.problem
+        for each in found.held
+        if len(each.shape) > 1 and each.shape[0] == found.n_samples and not each.problem
     ]
     if time is None or len(over) < 2:
         return []
@@ -232,7 +232,7 @@ def experiments(found: Inspection) -> list[str]:
     for name, needed in NEEDS.items():
         lacking = found.lacking(needed) or (() if found.signals else ("a signal",))
         groups.setdefault(lacking, []).append(f"+exp={name}")
-    ready = "all but what is asked is there" if found.found.asked else "all there"
+    ready = "all but what is asked is there" if found.asked else "all there"
     return [
         f"{'missing ' + ', '.join(lacking) if lacking else ready} for {', '.join(names)}"
         for lacking, names in groups.items()
@@ -254,8 +254,9 @@ def config_text(found: Sequence[Inspection], paths: Sequence[str | list[str]]) -
     first = found[0]
     variables = {n: Variable(None, u) for n, u in {**KNOWN_UNITS, "T_e_eV": "eV"}.items()}
     variables |= first.variables
+    more = " ..." * (len(paths) > 1)
     lines = [
-        f"# {in_line(str(first.path))}{' ...' * (len(paths) > 1)}, as `ep2sindy inspect` found it.",
+        f"# {in_line(str(first.source.path))}{more}, as `ep2sindy inspect` found it.",
         "# A name is the one in the file; null: the file has it not. Correct what is wrong.",
         "_target_: ep2sindy.open_field",
         f"path: {_flow(paths[0] if len(paths) == 1 else list(paths))}",
@@ -299,4 +300,4 @@ def _flow(value: Any) -> str:
 
 
 def _word(found: Inspection, name: str) -> str:
-    return "  # the file names no unit: put it right" if name in found.found.no_unit else ""
+    return "  # the file names no unit: put it right" if name in found.no_unit else ""

@@ -8,15 +8,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import permutations
+from math import prod
+from types import MappingProxyType
+from typing import TypeAlias
 
 import numpy as np
 import xarray as xr
 
+from ep2sindy.data.arrays import ArrayInfo
 from ep2sindy.data.conversion import to_si
 from ep2sindy.data.fields import DIMS
 from ep2sindy.data.mapping import Problems, Variable, read_array
 from ep2sindy.data.numbers import even_grid
 from ep2sindy.data.readers.source import FileSource
+
+Shaped: TypeAlias = xr.DataArray | ArrayInfo
 
 
 def read_axis(source: FileSource, axis: str, variable: Variable) -> xr.DataArray:
@@ -51,40 +57,44 @@ def read_axes(
             f"a field needs time: name the file's time or give its step dt_s; {source.path} holds "
             f"{list(source.names)}"
         )
-    if dt_s is None or problems.found:
-        return points
-    with problems.noted():
-        n_samples, dim = time_length(source, arrays, variables, points)
-        numbers = source.steps if len(source.steps) == n_samples else range(n_samples)
-        steps = xr.DataArray(dt_s * np.array(numbers), dims=dim, attrs={"units": "s"})
-        return {"time": steps, **points}
+    if dt_s is not None and not problems.found:
+        dims = {ours: variable.dims for ours, variable in variables.items()}
+        with problems.noted():
+            n_samples, dim = time_length(arrays, points, dims, named=source.dims_named)
+            numbers = source.steps if len(source.steps) == n_samples else range(n_samples)
+            steps = xr.DataArray(dt_s * np.array(numbers), dims=dim, attrs={"units": "s"})
+            return {"time": steps, **points}
     return points
 
 
 def time_length(
-    source: FileSource,
-    arrays: Mapping[str, xr.DataArray],
-    variables: Mapping[str, Variable],
-    points: Mapping[str, xr.DataArray],
+    arrays: Mapping[str, Shaped],
+    points: Mapping[str, Shaped],
+    dims: Mapping[str, Sequence[str] | None] = MappingProxyType({}),
+    *,
+    named: bool,
 ) -> tuple[int, str]:
     """Number of samples and the file's name of the time dimension, for a file without times.
 
-    The user's dims decide first. Otherwise it is the file's named dimension that belongs to no
-    coordinate, or the length that remains in most arrays once those of z and r are removed.
+    points: coordinates. dims: the user's, which decide first. named: the arrays have the file's
+    names of dimensions; time is then that which belongs to no coordinate. Otherwise it is the
+    length that remains in most arrays once those of z and r are removed.
     """
     votes: Counter[tuple[int, str]] = Counter()
-    known = {str(p.dims[0]) for p in points.values()} if source.dims_named else set()
-    space = [p.size for axis, p in points.items() if axis != "time"]
+    known = {dim for each in points.values() for dim in each.dims}
+    space = [prod(each.shape) for axis, each in points.items() if axis != "time"]
     for ours, array in arrays.items():
-        dims = variables[ours].dims
-        if dims is not None:
-            if "time" in dims and array.size > 1:
-                shape = array.shape if array.ndim == len(dims) else array.squeeze().shape
-                return shape[list(dims).index("time")], "time"
-        elif source.dims_named:
-            votes.update((array.sizes[d], str(d)) for d in array.dims if str(d) not in known)
+        longer = tuple(n for n in array.shape if n > 1)
+        given = dims.get(ours)
+        if given is not None:
+            if "time" in given and longer:
+                shape = array.shape if len(array.shape) == len(given) else longer
+                return shape[list(given).index("time")], "time"
+        elif named:
+            sizes = zip(array.shape, array.dims, strict=True)
+            votes.update((n, str(dim)) for n, dim in sizes if dim not in known)
         else:
-            votes.update((n, "time") for n in _may_be_time(array.shape, space))
+            votes.update((n, "time") for n in _may_be_time(longer, space))
     if not votes:
         shapes = {ours: array.shape for ours, array in arrays.items()}
         raise ValueError(
@@ -101,10 +111,9 @@ def time_length(
 
 
 def _may_be_time(shape: Sequence[int], space: Sequence[int]) -> set[int]:
-    """Lengths of the axes that could be time: all other axes of the array are axes of space."""
-    longer = Counter(n for n in shape if n > 1)
-    left = longer - Counter(space)
-    return {*(left or longer)} if left.total() < 2 else set()
+    """Lengths over one that could be time: all other axes of the array are axes of space."""
+    left = Counter(shape) - Counter(space)
+    return {*(left or shape)} if left.total() < 2 else set()
 
 
 def assign_dims(

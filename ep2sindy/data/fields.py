@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.conversion import COORDINATE_UNITS
 from ep2sindy.data.export import CLOCK
 from ep2sindy.data.trajectory import check_time
+from ep2sindy.library.names import check_variable
 from ep2sindy.library.units import Clock
 from ep2sindy.runtime.files import read_json, write_bytes
 
@@ -53,6 +54,13 @@ def check_field(field: xr.Dataset) -> None:
             raise ValueError(f"{name} must hold real numbers: its type is {variable.dtype}")
         if "units" not in variable.attrs:
             raise ValueError(f"{name} must name its unit in the attribute 'units' ('1' for none)")
+
+
+def check_new(field: xr.Dataset, name: str) -> None:
+    """Raise ValueError unless a variable of this name can be added to a field."""
+    check_variable(name)
+    if name in field:
+        raise ValueError(f"a new variable needs a new name: the field already has {name!r}")
 
 
 def clock_of(field: xr.Dataset) -> Clock:

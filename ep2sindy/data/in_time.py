@@ -10,17 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
 from scipy import signal
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, make_interp_spline
 
-from ep2sindy.data.fields import (
-    DIMS,
-    check_samples,
-    grid_points,
-    grid_values,
-    mask_cells,
-)
+from ep2sindy.data.fields import check_new, check_samples, grid_points, grid_values, mask_cells
 from ep2sindy.library.units import unit_product
 
 
@@ -77,11 +70,12 @@ def low_pass(field: xr.Dataset, *, cutoff_Hz: float, order: int = 4) -> xr.Datas
             f"{field.sizes['time']} came; lower the order or leave it out"
         )
     sos = signal.butter(order, cutoff_Hz, fs=1 / dt_s, output="sos")
-    smooth = {
-        name: signal.sosfiltfilt(sos, _samples(field, name), axis=0, padlen=n_edge)
-        for name in _of_time(field)
-    }
-    return field.assign({name: _like(field[name], values) for name, values in smooth.items()})
+    smooth = {}
+    for name in _of_time(field):
+        array = _samples(field, name)
+        values = signal.sosfiltfilt(sos, array.values, axis=0, padlen=n_edge)
+        smooth[name] = array.copy(data=values)
+    return field.assign(smooth)
 
 
 def _uniform_step(field: xr.Dataset) -> float:
@@ -114,36 +108,20 @@ def resample(field: xr.Dataset, *, dt_s: float) -> xr.Dataset:
     finer = dt_s <= np.median(np.diff(t)) * (1 + 1e-6)
     n_steps = int((t[-1] - t[0]) / dt_s * (1 + 1e-12))
     new = t[0] + dt_s * (np.arange(n_steps + 1) if finer else 0.5 + np.arange(n_steps))
-    arrays = {}
+    found = {}
     for name in _of_time(field):
-        values = _samples(field, name)
-        masked = np.isnan(values).any(axis=0)
-        filled = np.where(masked, 0.0, values)
-        found = CubicSpline(t, filled, axis=0)(new) if finer else _means(t, filled, new, dt_s)
-        arrays[name] = np.where(masked, np.nan, found)
+        array = _samples(field, name)
+        masked = np.isnan(array.values).any(axis=0)
+        filled = np.where(masked, 0.0, array.values)
+        if finer:
+            values = CubicSpline(t, filled, axis=0)(new)
+        else:
+            area = make_interp_spline(t, filled, k=1, axis=0).antiderivative()
+            values = (area(new + 0.5 * dt_s) - area(new - 0.5 * dt_s)) / dt_s
+        found[name] = (array.dims, np.where(masked, np.nan, values), array.attrs)
     times = xr.DataArray(new, dims="time", attrs=field["time"].attrs)
-    kept = field.drop_vars([*arrays, "time"]).assign_coords(time=times)
-    found = {name: _like(field[name], values, times=times) for name, values in arrays.items()}
+    kept = field.drop_vars([*found, "time"]).assign_coords(time=times)
     return kept.assign(found)[list(field.data_vars)].assign_attrs(field.attrs)
-
-
-def _means(t: np.ndarray, values: np.ndarray, at: np.ndarray, width: float) -> np.ndarray:
-    """Means of the piecewise linear interpolant over `width` around each time in `at`."""
-    steps = np.diff(t)[:, None, None]
-    areas = np.concatenate(
-        [
-            np.zeros((1, *values.shape[1:])),
-            np.cumsum(steps * (values[1:] + values[:-1]) / 2, axis=0),
-        ]
-    )
-    slopes = np.diff(values, axis=0) / steps
-
-    def area(x: np.ndarray) -> np.ndarray:
-        k = np.clip(np.searchsorted(t, x, side="right") - 1, 0, len(t) - 2)
-        past = (x - t[k])[:, None, None]
-        return areas[k] + past * (values[k] + 0.5 * past * slopes[k])
-
-    return (area(at + width / 2) - area(at - width / 2)) / width
 
 
 def interpolate(field: xr.Dataset, *, max_gap_s: float | None = None) -> xr.Dataset:
@@ -156,7 +134,8 @@ def interpolate(field: xr.Dataset, *, max_gap_s: float | None = None) -> xr.Data
     t = grid_points(field, "time")
     filled = {}
     for name in _of_time(field):
-        values = grid_values(field[name]).copy()
+        array = _time_first(field[name])
+        values = array.values.copy()
         absent = np.isnan(values)
         some = absent.any(axis=0) & ~absent.all(axis=0)
         for cell in np.argwhere(some):
@@ -165,7 +144,7 @@ def interpolate(field: xr.Dataset, *, max_gap_s: float | None = None) -> xr.Data
             _check_gaps(str(name), t, present, max_gap_s)
             values[place] = np.interp(t, t[present], values[place][present])
         if some.any():
-            filled[name] = _like(field[name], values)
+            filled[name] = array.copy(data=values)
     return field.assign(filled)
 
 
@@ -194,22 +173,20 @@ def delay(
     known, are left out.
     Raises ValueError for a delay that is not positive or as long as the record.
     """
-    array = _variable(field, variable)
+    array = _samples(field, variable)
     t = grid_points(field, "time")
-    name = _new_name(field, name or f"{variable}_delayed")
+    name = name or f"{variable}_delayed"
+    check_new(field, name)
     kept = t >= t[0] + delay_s * (1 - 1e-12)
     if delay_s <= 0 or kept.sum() < 2:
         raise ValueError(
             f"delay_s must be positive and leave two samples or more: {delay_s:g} s came for a "
             f"record of {t[-1] - t[0]:g} s"
         )
-    values = _samples(field, variable)
-    at = np.maximum(t[kept] - delay_s, t[0])
-    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    share = ((at - t[k]) / (t[k + 1] - t[k]))[:, None, None]
-    past = values[k] * (1 - share) + values[k + 1] * share
+    straight = make_interp_spline(t, array.values, k=1, axis=0, check_finite=False)
+    past = straight(np.maximum(t[kept] - delay_s, t[0]))
     later = field.isel(time=np.flatnonzero(kept))
-    return later.assign({name: _like(array, past, times=later["time"])})
+    return later.assign({name: (array.dims, past, array.attrs)})
 
 
 def derivative(field: xr.Dataset, *, variable: str, name: str | None = None) -> xr.Dataset:
@@ -218,14 +195,15 @@ def derivative(field: xr.Dataset, *, variable: str, name: str | None = None) -> 
     name: by default `d<variable>_dt`. Steps may be unequal. Differentiation amplifies noise, so
     apply `low_pass` first.
     """
-    array = _variable(field, variable)
+    array = _samples(field, variable)
     t = grid_points(field, "time")
-    name = _new_name(field, name or f"d{variable}_dt")
+    name = name or f"d{variable}_dt"
+    check_new(field, name)
     if len(t) < 3:
         raise ValueError(f"a derivative needs three samples or more: {len(t)} came")
-    rate = np.gradient(_samples(field, variable), t, axis=0, edge_order=2)
+    rate = np.gradient(array.values, t, axis=0, edge_order=2)
     units = unit_product([(array.attrs["units"], 1), ("s", -1)])
-    return field.assign({name: _like(array, rate).assign_attrs(units=units)})
+    return field.assign({name: array.copy(data=rate).assign_attrs(units=units)})
 
 
 def detrend(
@@ -242,12 +220,10 @@ def detrend(
     basis = np.linalg.qr(np.vander((t - t.mean()) / np.ptp(t), degree + 1, increasing=True))[0]
     found = {}
     for name in names:
-        array = _variable(field, name)
-        values = _samples(field, name)
-        cells = values.reshape(len(t), -1)
-        mean = cells.mean(axis=0)
-        flat = cells - basis @ (basis.T @ cells) + mean
-        found[name] = _like(array, flat.reshape(values.shape))
+        array = _samples(field, name)
+        cells = array.values.reshape(len(t), -1)
+        flat = cells - basis @ (basis.T @ cells) + cells.mean(axis=0)
+        found[name] = array.copy(data=flat.reshape(array.shape))
     return field.assign(found)
 
 
@@ -255,36 +231,18 @@ def _of_time(field: xr.Dataset) -> list[str]:
     return [str(name) for name, array in field.data_vars.items() if "time" in array.dims]
 
 
-def _variable(field: xr.Dataset, name: str) -> xr.DataArray:
+def _samples(field: xr.Dataset, name: str) -> xr.DataArray:
+    """A variable in float64, time first.
+
+    Raises ValueError for one that is unknown or does not depend on time, and for a cell that is
+    missing only at some times.
+    """
     if name not in _of_time(field):
         raise ValueError(f"unknown variable of time {name!r}; this field has {_of_time(field)}")
-    return field[name]
+    array = field[name]
+    check_samples(array, grid_values(array), mask_cells(array))
+    return _time_first(array)
 
 
-def _new_name(field: xr.Dataset, name: str) -> str:
-    if name in field.variables or not name.isidentifier():
-        raise ValueError(
-            f"a new variable needs a new name of letters, digits and _: {name!r} came, this field "
-            f"has {list(field.variables)}"
-        )
-    return name
-
-
-def _samples(field: xr.Dataset, name: str) -> Float[np.ndarray, "time z r"]:
-    """Values of a variable; raises ValueError for a cell that is missing only at some times."""
-    values = grid_values(field[name])
-    check_samples(field[name], values, mask_cells(field[name]))
-    return values
-
-
-def _like(
-    array: xr.DataArray, values: np.ndarray, *, times: xr.DataArray | None = None
-) -> xr.DataArray:
-    """Array of new values (time, z, r) with the dimensions and the unit of `array`."""
-    dims = [axis for axis in DIMS if axis in array.dims]
-    sizes = [array.sizes[axis] for axis in dims[1:]]
-    coords = {axis: array[axis] for axis in dims if axis in array.coords}
-    coords |= {} if times is None else {"time": times}
-    return xr.DataArray(
-        values.reshape(len(values), *sizes), dims=dims, coords=coords, attrs=array.attrs
-    )
+def _time_first(array: xr.DataArray) -> xr.DataArray:
+    return array.transpose("time", ...).astype(np.float64)

@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.fields import SPACE, check_field, grid_points, mask_outside
+from ep2sindy.data.fields import SPACE, check_field, check_new, grid_points, mask_outside
 from ep2sindy.data.zones import FACES, Factors, average_of
-from ep2sindy.library.names import check_variable, split_factors
+from ep2sindy.library.names import split_factors
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.screen import cut
 
@@ -48,9 +48,7 @@ def derive(field: xr.Dataset, *, name: str, expression: str, units: str) -> xr.D
     Raises ValueError for an unknown name in the expression, a new name that is already taken, or
     any other syntax.
     """
-    check_variable(name)
-    if name in field:
-        raise ValueError(f"a derived variable needs a new name: the field already has {name!r}")
+    check_new(field, name)
     array = evaluate(field, expression)
     if not array.dims:
         raise ValueError(f"a derived variable must use at least one variable: {expression!r} came")
@@ -74,9 +72,7 @@ def gradient(field: xr.Dataset, *, of: str, name: str, axis: str = "z") -> xr.Da
     Raises ValueError for an axis that the field or the variables lack, a single cell, an unknown
     variable, or a name that is taken.
     """
-    check_variable(name)
-    if name in field:
-        raise ValueError(f"a gradient needs a new name: the field already has {name!r}")
+    check_new(field, name)
     _check_axis(field, axis, f"a gradient along {axis!r}")
     factors = average_of(field, split_factors(of), faces=axis == "z" and "dz" in field)
     array = evaluate(field, "*".join(f"{variable}^{power}" for variable, power in factors))

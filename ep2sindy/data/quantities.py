@@ -194,7 +194,7 @@ def axis_unit(axis: str, name: str, stated: str) -> str:
     return next((u for u in options if u and (u == unit or converts(axis, u))), "")
 
 
-def quantity_of(name: str, stated: str, *, plasma: bool) -> tuple[str, str] | None:
+def quantity_of(name: str, stated: str, *, plasma: bool = False) -> tuple[str, str] | None:
     """Our name for an array, and the unit it has, "" for none; None if it keeps its own name.
 
     A short name needs a unit that fits, stated or at its end; a full one stands for itself, unless
@@ -234,7 +234,7 @@ def columns_in_si(
     units: dict[str, str] = {}
     for k, label in enumerate(table.columns):
         name, stated = (label, "") if label.isidentifier() else split_name(label)
-        name, unit = quantity_of(name, stated, plasma=False) or (name, own_unit(name, stated))
+        name, unit = quantity_of(name, stated) or (name, own_unit(name, stated))
         units[name] = unit or "1"
         values[:, k] = without_marks(table[label].to_numpy(dtype=np.float64))
         if units[name] != "1" and not is_count(units[name]):

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -39,23 +40,19 @@ def zone_averages(
     >>> ep.zone_averages(field, zones, states=["n_i", "n_n"]).state_names
     ('n_i@anode', 'n_n@anode', 'n_i@exit', 'n_n@exit')
     """
-    runs = {
-        name: zone_average(
-            field, zone, states=states, inputs=inputs, products=products,
-            axisymmetric=axisymmetric, label=label,
-        )
-        for name, zone in side_by_side(zones, field).items()
-    }  # fmt: skip
+    average = partial(
+        zone_average, field, states=states, inputs=inputs, products=products,
+        axisymmetric=axisymmetric, label=label,
+    )  # fmt: skip
+    runs = {name: average(zone) for name, zone in side_by_side(zones, field).items()}
     first = next(iter(runs.values()))
-    return Trajectory(
-        t=first.t,
+    return replace(
+        first,
         states=np.column_stack([run.states for run in runs.values()]),
         state_names=in_zones(runs, first.state_names),
         inputs=np.column_stack([run.inputs for run in runs.values()]),
         input_names=in_zones(runs, first.input_names),
         units={f"{n}@{name}": unit for name, run in runs.items() for n, unit in run.units.items()},
-        label=label,
-        clock=first.clock,
     )
 
 
@@ -142,16 +139,16 @@ class ZoneAverage:
         return list(self.zones or {})
 
     def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
-        settings: Any = {
-            "states": self.states,
-            "inputs": inputs,
-            "products": self.products,
-            "axisymmetric": self.axisymmetric,
-            "label": label,
-        }
-        if self.zones is None:
-            return zone_average(field, self.zone, **settings)
-        return zone_averages(field, self.parts(field), **settings)
+        average: Any = zone_average if self.zones is None else zone_averages
+        return average(
+            field,
+            self.zone if self.zones is None else self.parts(field),
+            states=self.states,
+            inputs=inputs,
+            products=self.products,
+            axisymmetric=self.axisymmetric,
+            label=label,
+        )
 
     def columns(self, names: Sequence[str]) -> list[str]:
         """What the averages of variables are called in the trajectory."""

@@ -189,16 +189,13 @@ class Trajectory:
                 f"a window must lie inside the trajectory: [{start}, {stop}) was asked of "
                 f"{self.n_samples} samples"
             )
-        return Trajectory(
-            t=self.t[start:stop],
-            states=self.states[start:stop],
-            state_names=self.state_names,
-            inputs=self.inputs[start:stop],
-            input_names=self.input_names,
-            units=self.units,
-            label=self.label,
-            clock=self.clock,
-            missing=None if self.missing is None else self.missing[start:stop],
+        part = slice(start, stop)
+        return replace(
+            self,
+            t=self.t[part],
+            states=self.states[part],
+            inputs=self.inputs[part],
+            missing=None if self.missing is None else self.missing[part],
         )
 
     def stretches(self, min_samples: int = MIN_STRETCH) -> list[Trajectory]:

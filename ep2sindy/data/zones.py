@@ -103,13 +103,11 @@ def average_of(field: xr.Dataset, factors: Factors, *, faces: bool = False) -> F
 
 
 def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str]) -> None:
-    unknown = [name for name in used if name not in field.data_vars]
-    if unknown:
-        made = [(n, *MADE_FROM[n]) for n in unknown if n in MADE_FROM]
+    if unknown := [name for name in used if name not in field.data_vars]:
         hints = [
             f"; {name} is made from {source}: 'prepare=[{{_target_:{step}}}]'"
-            for name, source, step in made
-            if source in field
+            for name, (source, step) in MADE_FROM.items()
+            if name in unknown and source in field
         ]
         hints = hints or [near_words(unknown[0], map(str, field.data_vars))]
         raise ValueError(
@@ -149,31 +147,23 @@ def _means(
     part: xr.Dataset,
     masks: Mapping[str, Bool[np.ndarray, "1 _ _"]],
     weights: Float[np.ndarray, "z r"],
-    columns: Sequence[Sequence[tuple[str, int]]],
+    columns: Sequence[Factors],
 ) -> Float[np.ndarray, "samples columns"]:
-    """Weighted means over the cells at all times, computed slab by slab."""
+    """Weighted means of products of variables over the cells at all times, slab by slab."""
     n_slab = max(1, SLAB_VALUES // weights.size)
-    slabs = (part.isel(time=slice(k, k + n_slab)) for k in range(0, part.sizes["time"], n_slab))
-    return np.concatenate([_slab_means(slab, masks, weights, columns) for slab in slabs])
-
-
-def _slab_means(
-    slab: xr.Dataset,
-    masks: Mapping[str, Bool[np.ndarray, "1 _ _"]],
-    weights: Float[np.ndarray, "z r"],
-    columns: Sequence[Sequence[tuple[str, int]]],
-) -> Float[np.ndarray, "samples columns"]:
-    """Weighted means of products of variables over the cells, for one slab of samples."""
-    values = {}
-    for name, masked in masks.items():
-        raw = grid_values(slab[name])
-        check_samples(slab[name], raw, masked)
-        values[name] = np.where(masked, 0.0, raw)
-    means = np.empty((slab.sizes["time"], len(columns)))
-    for j, factors in enumerate(columns):
-        product = math.prod(values[name] ** power for name, power in factors)
-        cells = np.broadcast_to(product, (len(means), *weights.shape))
-        means[:, j] = np.einsum("tzr,zr->t", cells, weights)
+    means = np.empty((part.sizes["time"], len(columns)))
+    for begin in range(0, len(means), n_slab):
+        inside = slice(begin, min(begin + n_slab, len(means)))
+        values = {}
+        for name, masked in masks.items():
+            array = part[name].isel(time=inside, missing_dims="ignore")
+            raw = grid_values(array)
+            check_samples(array, raw, masked)
+            values[name] = np.where(masked, 0.0, raw)
+        for j, factors in enumerate(columns):
+            product = math.prod(values[name] ** power for name, power in factors)
+            cells = np.broadcast_to(product, (inside.stop - begin, *weights.shape))
+            means[inside, j] = np.einsum("tzr,zr->t", cells, weights)
     return means
 
 
@@ -235,10 +225,8 @@ def _at_peak(field: xr.Dataset) -> str:
     """Where a field's magnetic field, in T, is strongest: near the exit; empty if there is none."""
     for name, variable in field.data_vars.items():
         if variable.attrs.get("units") == "T" and "z" in variable.dims:
-            others = [axis for axis in variable.dims if axis != "z"]
-            strength = np.abs(variable.values.astype(float)).mean(
-                axis=tuple(variable.dims.index(axis) for axis in others)
-            )
+            others = {*variable.dims} - {"z"}
+            strength = np.abs(variable.astype(float)).mean(others).values
             peak_m = grid_points(field, "z")[int(np.nanargmax(strength))]
             return f" ({name} is strongest at {peak_m:.4g} m, where most thrusters have their exit)"
     return ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def open_source(path: Path) -> FileSource:
             "'ep2sindy[files]', or save it as CSV"
         )
     with damage_named(path):
-        return reader.open(path)
+        return replace(reader.open(path), kind=reader.name)
 
 
 def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
@@ -45,24 +46,24 @@ def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
         raise ValueError(f"a file or a folder must come: {path} is a pipe, a socket or a device")
     if path.is_file() and path.stat().st_size == 0:
         raise ValueError(f"{path} is empty: it holds no bytes; was it written to the end?")
-    look = look_at(path)
-    claims = [reader.claim(look) for reader in readers]
+    form, head, ending = look_at(path)
+    claims = [reader.claim(form, head, ending) for reader in readers]
     if any(claims):
         return readers[claims.index(max(claims))]
-    if look.form == "folder":
+    if form == "folder":
         folders = joined([e for r in readers if r.form == "folder" for e in r.endings], "or")
         counts = Counter(each.suffix for each in path.iterdir() if each.is_file() and each.suffix)
         way_out = ", with no files in it"
         if counts:
-            (ending, n), *_ = counts.most_common(1)
-            way_out = f"; take its {n} files that end in {ending}, '{path}/*{ending}'"
+            (most, n), *_ = counts.most_common(1)
+            way_out = f"; take its {n} files that end in {most}, '{path}/*{most}'"
         raise ValueError(
             f"a file must come, or a folder that ends in {folders}: {path} is a folder{way_out}"
         )
     by_ending = [r for r in readers if r.form in ("other", "folder")]
     kinds = joined([r.name for r in readers if r not in by_ending], "or")
-    endings = joined([ending for r in by_ending for ending in r.endings], "or")
+    endings = joined([each for r in by_ending for each in r.endings], "or")
     raise ValueError(
         f"a file must be {kinds}, or end in {endings}: "
-        f"{path} begins with {look.head!r}; its ending may be wrong, or its content damaged"
+        f"{path} begins with {head!r}; its ending may be wrong, or its content damaged"
     )

@@ -27,9 +27,6 @@ PACKED_BY = ("scale_factor", "add_offset")
 
 AT_ONCE = 2**28  # bytes of an array up to which it is read once when its file is opened
 
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-
-
 Form: TypeAlias = Literal["folder", "hdf5", "workbook", "zip", "other"]
 
 
@@ -43,7 +40,7 @@ class FileSource:
     file gives it outside its arrays. channel_m: length of the thruster's channel in m, if the file
     gives it. words: notes on how the file was read, shown on inspection. is_table: True if the
     arrays are columns of a table. attributes: texts and numbers that describe the whole file.
-    steps: numbers of the steps of a run that was written step by step.
+    steps: numbers of the steps of a run that was written step by step. kind: kind of file.
     """
 
     path: Path
@@ -58,6 +55,7 @@ class FileSource:
     is_table: bool = False
     attributes: Mapping[str, str | float] = field(default_factory=dict)
     steps: Sequence[int] = ()
+    kind: str = ""
 
     def __post_init__(self) -> None:
         if len(set(self.names)) < len(self.names):
@@ -71,15 +69,6 @@ class FileSource:
     def known(self) -> frozenset[str]:
         """All names that can be read, aliases included."""
         return frozenset([*self.names, *self.aliases])
-
-
-@dataclass(frozen=True)
-class Look:
-    """Features that identify a file's kind. head: its first 16 bytes; empty for a folder."""
-
-    form: Form
-    head: bytes
-    ending: str
 
 
 @dataclass(frozen=True)
@@ -99,25 +88,30 @@ class Reader:
     endings: tuple[str, ...] = ()
     package: str = ""
 
-    def claim(self, look: Look) -> int:
+    def claim(self, form: Form, head: bytes, ending: str) -> int:
         """Strength of the claim: 3 by first bytes, 2 by ending, 1 by form alone, 0 for none."""
-        if look.head.startswith(self.first_bytes):
+        if head.startswith(self.first_bytes):
             return 3
-        if look.form != self.form:
+        if form != self.form:
             return 0
-        return 2 * (look.ending in self.endings) if self.endings else 1
+        return 2 * (ending in self.endings) if self.endings else 1
 
 
-def look_at(path: Path) -> Look:
-    """Read the features that identify a file's kind; raises OSError if it cannot be read."""
+def look_at(path: Path) -> tuple[Form, bytes, str]:
+    """What identifies a file's kind: its form, its first bytes (none of a folder), its ending.
+
+    Raises OSError if it cannot be read.
+    """
+    import h5py
+
     ending = path.suffix.lower()
     if path.is_dir():
-        return Look("folder", b"", ending)
+        return "folder", b"", ending
     with path.open("rb") as file:
         head = file.read(16)
     if head.startswith(b"PK"):
-        return Look("workbook" if _is_workbook(path) else "zip", head, ending)
-    return Look("hdf5" if _is_hdf5(path) else "other", head, ending)
+        return "workbook" if _is_workbook(path) else "zip", head, ending
+    return "hdf5" if h5py.is_hdf5(path) else "other", head, ending
 
 
 def _is_workbook(path: Path) -> bool:
@@ -127,21 +121,6 @@ def _is_workbook(path: Path) -> bool:
             return any(name.startswith("xl/") for name in archive.namelist())
     except BadZipFile:  # damaged: the list of its members stands at its end
         return path.suffix.lower() in (".xlsx", ".xlsm")
-
-
-def _is_hdf5(path: Path) -> bool:
-    """True if the HDF5 signature stands at byte 0, 512, 1024, 2048 and so on.
-
-    A user block may precede it. Source: HDF5 file format specification 3.0, II.A.
-    """
-    size, place = path.stat().st_size, 0
-    with path.open("rb") as file:
-        while place + len(HDF5_SIGNATURE) <= size:
-            file.seek(place)
-            if file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE:
-                return True
-            place = max(512, 2 * place)
-    return False
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -46,7 +46,15 @@ def read_excel(path: Path) -> FileSource:
         for name, source in found.items()
     ]
     words += [f"left out: sheet {name!r}, {text}" for name, text in faults.items()]
-    return _joined(path, found, "; ".join(words))
+    if len(found) == 1:  # the columns keep their names
+        return replace(*found.values(), words="; ".join(words))
+    places = {f"{sheet}/{name}": (s, name) for sheet, s in found.items() for name in s.names}
+
+    def read(name: str) -> xr.DataArray:
+        source, column = places[name]
+        return source.read(column)
+
+    return FileSource(path, [*places], read, words="; ".join(words), is_table=True)
 
 
 def _as_text(frame: pd.DataFrame) -> StringIO:
@@ -57,23 +65,6 @@ def _as_text(frame: pd.DataFrame) -> StringIO:
         writer.writerow("" if str(cell) in FAULTS else " ".join(str(cell).split()) for cell in row)
     text.seek(0)
     return text
-
-
-def _joined(path: Path, sheets: Mapping[str, FileSource], words: str) -> FileSource:
-    """One source of all sheets; of a single one, the columns keep their names."""
-    if len(sheets) == 1:
-        (only,) = sheets.values()
-        return FileSource(
-            path, only.names, only.read, aliases=only.aliases, words=words, step_s=only.step_s,
-            is_table=True,
-        )  # fmt: skip
-    places = {f"{sheet}/{name}": (s, name) for sheet, s in sheets.items() for name in s.names}
-
-    def read(name: str) -> xr.DataArray:
-        source, column = places[name]
-        return source.read(column)
-
-    return FileSource(path, [*places], read, words=words, is_table=True)
 
 
 def read_parquet(path: Path) -> FileSource:
