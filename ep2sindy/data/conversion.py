@@ -25,7 +25,7 @@ COORDINATE_UNITS = {"time": "s", "z": "m", "r": "m"}
 # Units of our usual names. A unit of another dimension is a mistake in the mapping.
 KNOWN_UNITS = {
     "n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s",
-    "I_d": "A", "V_d": "V",
+    "I_d": "A", "V_d": "V", "T_e_eV": "eV",
 }  # fmt: skip
 
 NAMED_UNITS = ("V", "A", "W", "N", "Pa", "J", "T")

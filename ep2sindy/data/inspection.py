@@ -138,19 +138,15 @@ class Inspection:
     def lines(self, more_notes: Sequence[str] = ()) -> list[str]:
         """Summary of the file, its arrays and the notes on them, in lines of a screen's width."""
         words = f"; {self.source.words}" if self.source.words else ""
-        own, rows = self.notes(), self._rows
-        hidden = [f"... {len(own) - N_NOTES} more notes"] * (len(own) > N_NOTES)
-        texts = map(in_line, (*own[:N_NOTES], *hidden, *more_notes))
-        notes = [
-            line
-            for text in texts
-            for line in textwrap.wrap(text, WIDTH, initial_indent="- ", subsequent_indent="  ",
-                                      break_long_words=False, break_on_hyphens=False)
-        ]  # fmt: skip
+        own = _first(self.notes(), N_NOTES, "notes")
+        wrapped = textwrap.TextWrapper(
+            WIDTH, initial_indent="- ", subsequent_indent="  ", break_long_words=False,
+            break_on_hyphens=False,
+        )  # fmt: skip
         head = f"{self.source.path}: {self.source.kind}{words}"
-        table = text_table(HEADER, rows[:N_ROWS])
-        more = [f"... {len(rows) - N_ROWS} more arrays"] * (len(rows) > N_ROWS)
-        return [in_line(head), *table, *more, *notes]
+        table = text_table(HEADER, self._rows)
+        notes = [line for text in (*own, *more_notes) for line in wrapped.wrap(in_line(text))]
+        return [in_line(head), table[0], *_first(table[1:], N_ROWS, "arrays"), *notes]
 
     def differences(self, first: Inspection) -> list[str]:
         """In what this file differs from another of its kind: all but ranges and samples."""
@@ -198,13 +194,10 @@ class Inspection:
             about = "" if one.even else "about "
             step = f", {about}{one.step:.4g} apart" if one.step else ""
             role = ", ".join(self._roles.get(one.name, ["-"])) + step
-            shape = f"({', '.join(map(str, one.shape))})"
-            unused = TEXT if one.problem == TEXT else "left out"
-            rows.append(
-                [one.name, *[""] * 5, unused] if one.problem else
-                [one.name, shape, one.unit, f"{one.low:.4g}", f"{one.high:.4g}",
-                 str(one.n_missing or ""), role]
-            )  # fmt: skip
+            span = [f"{one.low:.4g}", f"{one.high:.4g}", str(one.n_missing or "")]
+            said = [f"({', '.join(map(str, one.shape))})", one.unit, *span, role]
+            unused = [*[""] * 5, TEXT if one.problem == TEXT else "left out"]
+            rows.append([one.name, *(unused if one.problem else said)])
         return rows
 
     @cached_property
@@ -220,17 +213,23 @@ class Inspection:
         return roles
 
 
+def _first(lines: Sequence[str], n: int, what: str) -> list[str]:
+    """The first lines of many, and how many more there are."""
+    more = [f"... {len(lines) - n} more {what}"] if len(lines) > n else []
+    return [*lines[:n], *more]
+
+
 def compare_files(first: Inspection, others: Sequence[Inspection]) -> list[str]:
     """Lines on the files after the first: one for each that differs, and one for all the rest."""
     differing = {each.source.path: texts for each in others if (texts := each.differences(first))}
     same = [each for each in others if each.source.path not in differing]
-    lines = [in_line(f"{path}: {'; '.join(texts)}") for path, texts in differing.items()]
+    lines = [f"{path}: {'; '.join(texts)}" for path, texts in differing.items()]
     if same:
         counts = sorted({each.n_samples or 0 for each in same})
         span = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
         which = f"the other {len(same)} files" if len(same) > 1 else str(same[0].source.path)
-        lines.append(in_line(f"{which}: the same arrays{f'; {span} samples' * bool(counts[0])}"))
-    return lines
+        lines.append(f"{which}: the same arrays{f'; {span} samples' * bool(counts[0])}")
+    return [in_line(line) for line in lines]
 
 
 def unlike(found: Sequence[Inspection]) -> str:

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.conversion import (
-    COORDINATE_UNITS,
-    KNOWN_UNITS,
-    SUFFIX_UNITS,
-    conversion,
-    converts,
-)
+from ep2sindy.data.conversion import COORDINATE_UNITS, SUFFIX_UNITS, conversion, converts
 from ep2sindy.data.numbers import without_marks
 from ep2sindy.data.readers.table_layout import split_name
 from ep2sindy.library.units import is_count, time_unit_in
@@ -30,65 +23,41 @@ class DoubtfulUnit(UserWarning):
     """Warns that a step contradicts the file's own times."""
 
 
-@dataclass(frozen=True)
-class KnownQuantity:
-    """One quantity of a thruster.
-
-    full: names that say by themselves what they are. short: names that other things bear too, which
-    count only beside a unit that fits. Each is a sorted tuple of words as `words_of` returns it.
-    """
-
-    unit: str
-    full: frozenset[tuple[str, ...]]
-    short: frozenset[tuple[str, ...]]
+def _names(text: str) -> frozenset[tuple[str, ...]]:
+    """Names between commas, each a sorted tuple of words as `words_of` returns it."""
+    return frozenset(tuple(sorted(name.split())) for name in text.split(","))
 
 
-def _names(*texts: str) -> frozenset[tuple[str, ...]]:
-    return frozenset(tuple(sorted(text.split())) for text in texts)
+# Names that say by themselves what they are.
+FULL = {
+    "n_i": _names("ion density, plasma density"),
+    "n_n": _names("neutral density"),
+    "u_iz": _names("ion velocity z, ion axial velocity, ion velocity"),
+    "u_ir": _names("ion velocity r, ion radial velocity"),
+    "T_e_eV": _names("electron temperature"),
+    "R_ion": _names("ionization rate"),
+    "I_d": _names("discharge current"),
+    "V_d": _names("discharge voltage"),
+}
 
+# Names that other things bear too, which count only beside a unit that fits.
+SHORT = {
+    "n_i": _names("n i, ni, n ion, nion, n plasma, i density"),
+    "n_n": _names("n n, nn, n neutral, nneutral, na, n a, ng, n g"),
+    "u_iz": _names("u i z, uiz, u i, ui, v i z, viz, v i, vi, u z, uz, v z, vz"),
+    "u_ir": _names("u i r, uir, v i r, vir, u r, ur, v r, vr"),
+    "T_e_eV": _names("t e, te, tev, t e ev, t electron, e temperature"),
+    "R_ion": _names("r i, r ion, rion, k ion, kion, k i, rate, i rate, k iz, kiz, iz rate"),
+    "I_d": _names("i d, id, d current, current, idis, i discharge"),
+    "V_d": _names("v d, vd, u d, ud, d voltage, voltage, vdis, udis"),
+}
 
-QUANTITIES: dict[str, KnownQuantity] = {
-    "n_i": KnownQuantity(
-        KNOWN_UNITS["n_i"], _names("ion density", "plasma density"),
-        _names("n i", "ni", "n ion", "nion", "n plasma", "i density"),
-    ),
-    "n_n": KnownQuantity(
-        KNOWN_UNITS["n_n"], _names("neutral density"),
-        _names("n n", "nn", "n neutral", "nneutral", "na", "n a", "ng", "n g"),
-    ),
-    "u_iz": KnownQuantity(
-        KNOWN_UNITS["u_iz"], _names("ion velocity z", "ion axial velocity", "ion velocity"),
-        _names("u i z", "uiz", "u i", "ui", "v i z", "viz", "v i", "vi", "u z", "uz", "v z", "vz"),
-    ),
-    "u_ir": KnownQuantity(
-        KNOWN_UNITS["u_ir"], _names("ion velocity r", "ion radial velocity"),
-        _names("u i r", "uir", "v i r", "vir", "u r", "ur", "v r", "vr"),
-    ),
-    "T_e_eV": KnownQuantity(
-        "eV", _names("electron temperature"),
-        _names("t e", "te", "tev", "t e ev", "t electron", "e temperature"),
-    ),
-    "R_ion": KnownQuantity(
-        KNOWN_UNITS["R_ion"], _names("ionization rate"),
-        _names("r i", "r ion", "rion", "k ion", "kion", "k i", "rate", "i rate", "k iz", "kiz",
-               "iz rate"),
-    ),
-    "I_d": KnownQuantity(
-        KNOWN_UNITS["I_d"], _names("discharge current"),
-        _names("i d", "id", "d current", "current", "idis", "i discharge"),
-    ),
-    "V_d": KnownQuantity(
-        KNOWN_UNITS["V_d"], _names("discharge voltage"),
-        _names("v d", "vd", "u d", "ud", "d voltage", "voltage", "vdis", "udis"),
-    ),
-}  # fmt: skip
-
-ELECTRONS = _names("n e", "ne", "electron density")  # their density is n_i where no charge is left
+ELECTRONS = _names("n e, ne, electron density")  # their density is n_i where no charge is left
 
 AXIS_NAMES = {
-    "time": _names("t", "time", "times", "timestamp", "tvec", "seconds", "sec"),
-    "z": _names("z", "axial", "zz"),
-    "r": _names("r", "radial", "rr"),
+    "time": _names("t, time, times, timestamp, tvec, seconds, sec"),
+    "z": _names("z, axial, zz"),
+    "r": _names("r, radial, rr"),
 }
 
 # Names of what numbers or labels samples: no time without a step, and no signal.
@@ -100,23 +69,22 @@ COUNTERS = frozenset({
 # Variables that can be computed if a file lacks them: name -> (source variable, step of `prepare`).
 MADE_FROM = {"R_ion": ("T_e_eV", "ep2sindy.thruster.ionization_rate")}
 
-# Words found in names -> their meaning; "" marks a word without meaning.
-WORDS = {
-    **dict.fromkeys(("densities", "dens", "number"), "density"),
-    **dict.fromkeys(("ions",), "ion"),
-    **dict.fromkeys(("neutrals", "neut", "atom", "atoms"), "neutral"),
-    **dict.fromkeys(("vel", "speed"), "velocity"),
-    **dict.fromkeys(("radius", "rad"), "radial"),
-    **dict.fromkeys(("temp",), "temperature"),
-    **dict.fromkeys(("electrons", "elec"), "electron"),
-    **dict.fromkeys(("anode",), "discharge"),
-    **dict.fromkeys(("curr",), "current"),
-    **dict.fromkeys(("ionisation",), "ionization"),
-    **dict.fromkeys(("coefficient", "coeff", "coef"), ""),
-    **dict.fromkeys(("grid", "pos", "position", "coord", "coordinate", "coords", "points"), ""),
-    **dict.fromkeys(("cells", "centers", "centres", "axis", "vec", "vector", "cell"), ""),
-    **dict.fromkeys(("avg", "mean", "average", "averaged", "data", "field", "si"), ""),
-}  # fmt: skip
+# Meaning -> words that stand for it in names; "" for words without meaning.
+MEANINGS = {
+    "density": "densities dens number",
+    "ion": "ions",
+    "neutral": "neutrals neut atom atoms",
+    "velocity": "vel speed",
+    "radial": "radius rad",
+    "temperature": "temp",
+    "electron": "electrons elec",
+    "discharge": "anode",
+    "current": "curr",
+    "ionization": "ionisation",
+    "": "coefficient coeff coef grid pos position coord coordinate coords points cells centers "
+    "centres axis vec vector cell avg mean average averaged data field si",
+}
+WORDS = {word: meaning for meaning, words in MEANINGS.items() for word in words.split()}
 
 # HallThruster.jl's names, for the lowest charge state.
 HALLTHRUSTER = {
@@ -174,12 +142,16 @@ def is_counter_name(name: str) -> bool:
     return bool(words) and {*words} <= COUNTERS
 
 
+def _in_hallthruster(name: str) -> str | None:
+    """Our name for one of HallThruster.jl."""
+    return next((ours for text, ours in HALLTHRUSTER.items() if re.fullmatch(text, name)), None)
+
+
 def axis_of(name: str) -> str | None:
     """The axis that a name in a file says, with or without a unit at its end; None for none."""
     last = last_of(name)
-    for pattern, ours in HALLTHRUSTER.items():
-        if ours in AXIS_NAMES and re.fullmatch(pattern, name):
-            return ours
+    if (ours := _in_hallthruster(name)) in AXIS_NAMES:
+        return ours
     for axis, names in AXIS_NAMES.items():
         if {words_of(last), words_of(split_unit(last)[0])} & names:
             return axis
@@ -204,13 +176,12 @@ def quantity_of(name: str, stated: str, *, plasma: bool = False) -> tuple[str, s
     base, ending = split_unit(last)
     unit = stated or ending
     spelled = {words_of(text) for text in (name, last, base)} if not last.isdigit() else set()
-    exact = next((ours for text, ours in HALLTHRUSTER.items() if re.fullmatch(text, name)), None)
-    for ours, quantity in QUANTITIES.items():
-        is_full = bool(spelled & quantity.full)
-        if not (is_full or ours in (exact, last, base) or spelled & quantity.short):
-            continue
-        fits = converts(ours, unit, is_variable=True) if unit else is_full or plasma
-        return (ours, unit) if fits else None
+    exact = (_in_hallthruster(name), last, base)
+    for ours, full in FULL.items():
+        if ours in exact or spelled & (full | SHORT[ours]):
+            is_said = plasma or bool(spelled & full)
+            fits = converts(ours, unit, is_variable=True) if unit else is_said
+            return (ours, unit) if fits else None
     return None
 
 

@@ -16,14 +16,13 @@ from math import isclose, prod
 import numpy as np
 
 from ep2sindy.data.arrays import TEXT, ArrayInfo, describe_array
-from ep2sindy.data.conversion import COORDINATE_UNITS, conversion, converts
+from ep2sindy.data.conversion import COORDINATE_UNITS, KNOWN_UNITS, conversion, converts
 from ep2sindy.data.dimensions import fitting, time_length
 from ep2sindy.data.fields import DIMS
 from ep2sindy.data.inspection import STEP, Inspection
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file
 from ep2sindy.data.quantities import (
     ELECTRONS,
-    QUANTITIES,
     axis_of,
     axis_unit,
     is_counter_name,
@@ -95,7 +94,7 @@ def _with_units(
             raise ValueError(f"the file states the unit of {ours}, {variable.unit}: give none")
         unit = units.get(ours, variable.unit)
         if not unit:
-            unit = COORDINATE_UNITS.get(ours) or QUANTITIES[ours].unit
+            unit = COORDINATE_UNITS.get(ours) or KNOWN_UNITS[ours]
             if not plasma:
                 no_unit[ours] = (
                     f"{ours} ({variable.name!r}) names no unit: give it, such as "
@@ -353,7 +352,7 @@ class _Arrays:
         bare = [e.name for e in rest if e.unit in ("", "1") and not quantity_of(e.name, "")]
         meant = {name: quantity_of(name, "", plasma=True) for name in bare}
         texts = ", ".join(f"{name!r} for {q[0]}" for name, q in meant.items() if q)
-        if texts and not self.plasma and {*found} & {*QUANTITIES}:
+        if texts and not self.plasma and {*found} & {*KNOWN_UNITS}:
             self.questions.append(f"data.plasma=true takes {texts}, and what has no unit for SI")
         if "n_i" not in found:
             self.questions.extend(

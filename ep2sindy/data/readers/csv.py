@@ -61,9 +61,9 @@ def text_source(path: Path, file: TextIO) -> FileSource:
     file.seek(0)
     frame = _frame(file, layout)
     header = layout.header
-    columns = [j for j in range(frame.shape[1]) if j in layout.columns or _holds_numbers(frame[j])]
-    others = [j for j in range(frame.shape[1]) if j not in columns]
-    dates = _dates(frame, others) if others else {}
+    columns = [j for j in frame if j in layout.columns or _holds_numbers(frame[j])]
+    others = [j for j in frame if j not in columns]
+    dates = _dates(frame, others)
     kept = sorted({*columns, *dates})
     names = {header.names[j]: j for j in kept}
     places = {str(j): j for j in kept} | names
