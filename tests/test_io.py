@@ -16,7 +16,6 @@ from ep2sindy.data.conversion import conversion, same_unit
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import inspect_file, open_field, read_field, write_field
 from ep2sindy.data.prepare import keep_where
-from ep2sindy.data.readers.registry import READERS, reader_of
 from ep2sindy.data.readers.source import look_at
 from ep2sindy.data.zones import Zone, zone_average
 from tests.programs import composed
@@ -412,14 +411,6 @@ KINDS = {
     "probe.csv": write_text,
     "thruster.json": write_text,
 }
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_the_order_of_readers_decides_nothing(tmp_path: Path, name: str) -> None:
-    KINDS[name](tmp_path / name)
-    claims = sorted(reader.claim(*look_at(tmp_path / name)) for reader in READERS)
-    assert claims[-1] > claims[-2]
-    assert reader_of(tmp_path / name) is reader_of(tmp_path / name, READERS[::-1])
 
 
 @pytest.mark.parametrize("name", KINDS)

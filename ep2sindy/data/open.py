@@ -66,15 +66,16 @@ def open_field(
     >>> field["n_i"].attrs["units"]
     'm^-3'
     """
-    source = open_record(path)
-    axes: Mapping[str, Variable | Keys | None] = {"time": time, "z": z, "r": r}
-    times: Sequence[Variable] = [*in_file({"time": time}, Problems()).values()]
+    source, problems = open_record(path), Problems()
+    axes = in_file({"time": time, "z": z, "r": r}, problems)
+    times: Sequence[Variable] = [axes["time"]] if "time" in axes else []
     if variables is None:
+        problems.check(source)
         found = recognise(source, dt_s=dt_s, given=axes, units=units, plasma=plasma)
         found.check()
         variables, axes, dt_s, times = found.variables, found.axes, found.dt_s, found.replaced
     with file_named(source.path):
-        field = _field(source, variables, axes, dt_s, mask, chunks)
+        field = _field(source, variables, axes, dt_s, mask, chunks, problems)
     if doubt := _step_doubt(source, times, field, dt_s):
         warnings.warn(doubt, DoubtfulUnit, stacklevel=2)
     said = {"channel_m": channel_m or source.channel_m, "file": str(source.path), STEP_DOUBT: doubt}
@@ -124,13 +125,14 @@ def _step_doubt(
 def _field(
     source: FileSource,
     variables: Mapping[str, Variable | Keys],
-    coordinates: Mapping[str, Variable | Keys | None],
+    axes: Mapping[str, Variable],
     dt_s: float | None,
     mask: Variable | Keys | None,
     chunks: Mapping[str, int] | None,
+    problems: Problems,
 ) -> xr.Dataset:
     """Build the field that a mapping describes; one error reports all faults of the mapping."""
-    problems, arrays = Problems(), {}
+    arrays: dict[str, xr.DataArray] = {}
     wanted = in_file(variables, problems)
     if not wanted and not problems.found:
         raise ValueError(f"a field needs a variable: none of {list(variables)} has a name")
@@ -140,7 +142,6 @@ def _field(
         with problems.noted():
             stated = arrays[ours].attrs if ours in arrays else {}
             to_si(xr.DataArray(0.0, attrs=stated), ours, variable.unit, is_variable=True)
-    axes = in_file(coordinates, problems)
     points = read_axes(source, axes, dt_s, arrays, wanted, problems)
     if dt_s is None and "time" in points:
         points["time"].attrs[CLOCK] = axes["time"].unit

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count, permutations
 from math import isclose, prod
+from types import MappingProxyType
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from ep2sindy.data.conversion import COORDINATE_UNITS, KNOWN_UNITS, conversion, 
 from ep2sindy.data.dimensions import fitting, time_length
 from ep2sindy.data.fields import DIMS
 from ep2sindy.data.inspection import STEP, Inspection
-from ep2sindy.data.mapping import Keys, Problems, Variable, in_file
+from ep2sindy.data.mapping import Variable
 from ep2sindy.data.quantities import (
     ELECTRONS,
     axis_of,
@@ -43,7 +44,7 @@ def recognise(
     source: FileSource,
     *,
     dt_s: float | None = None,
-    given: Mapping[str, Variable | Keys | None] | None = None,
+    given: Mapping[str, Variable] = MappingProxyType({}),
     units: Mapping[str, str] | None = None,
     plasma: bool = False,
 ) -> Inspection:
@@ -53,11 +54,8 @@ def recognise(
     states none. plasma: names such as Te mean quantities without a unit, and what has no unit is
     in SI.
     """
-    problems = Problems()
-    named = in_file(given or {}, problems)
-    problems.check(source)
     arrays = _Arrays(source, [describe_array(source, name) for name in source.names], plasma)
-    axes = arrays.axes(named)
+    axes = arrays.axes(given)
     dt_s = arrays.step_s(axes.get("time")) if dt_s is None else dt_s
     times = [axes.pop("time")] if dt_s is not None and "time" in axes else []
     if "time" in axes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -76,9 +76,8 @@ class Reader:
     """One kind of file: how it is recognised, and how it is opened.
 
     first_bytes: beginnings that no other kind of file has. form, endings: files without such a
-    beginning are recognised by their form together with one of the endings. A reader without
-    endings takes all files of its form that no other reader claims by their ending. form None:
-    recognised by first bytes alone. package: the module of the extra `files` that it needs.
+    beginning are recognised by their form, together with one of the endings if there are any.
+    package: the module of the extra `files` that it needs.
     """
 
     name: str
@@ -88,13 +87,10 @@ class Reader:
     endings: tuple[str, ...] = ()
     package: str = ""
 
-    def claim(self, form: Form, head: bytes, ending: str) -> int:
-        """Strength of the claim: 3 by first bytes, 2 by ending, 1 by form alone, 0 for none."""
-        if head.startswith(self.first_bytes):
-            return 3
-        if form != self.form:
-            return 0
-        return 2 * (ending in self.endings) if self.endings else 1
+    def takes(self, form: Form, head: bytes, ending: str) -> bool:
+        """True for a file with such a beginning, or of the form and with one of the endings."""
+        fits = form == self.form and (not self.endings or ending in self.endings)
+        return head.startswith(self.first_bytes) or fits
 
 
 def look_at(path: Path) -> tuple[Form, bytes, str]:
@@ -184,12 +180,12 @@ def counted_dates(dates: pd.Series) -> xr.DataArray:
     return xr.DataArray(elapsed_s / seconds_in(unit), attrs={"units": unit})
 
 
-def leaves(node: Any, path: str = "") -> dict[str, Any]:
+def leaves(node: Any) -> dict[str, Any]:
     """Flatten nested dicts and lists to {"a.b.0": value}; a list of numbers is one value.
 
     Raises ValueError if two values get the same name, as in {"a.b": 1, "a": {"b": 2}}.
     """
-    pairs = list(_leaves(node, path))
+    pairs = list(_leaves(node))
     found = dict(pairs)
     if len(found) < len(pairs):
         ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
@@ -197,14 +193,11 @@ def leaves(node: Any, path: str = "") -> dict[str, Any]:
     return found
 
 
-def _leaves(node: Any, path: str) -> Iterator[tuple[str, Any]]:
-    items: Iterable[tuple[Any, Any]]
-    if isinstance(node, dict):
-        items = node.items()
-    elif isinstance(node, list) and any(isinstance(item, dict | list) for item in node):
-        items = enumerate(node)
-    else:
+def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    is_nested = isinstance(node, list) and any(isinstance(item, dict | list) for item in node)
+    inner = node if isinstance(node, dict) else dict(enumerate(node)) if is_nested else None
+    if inner is None:
         yield path, node
-        return
-    for key, item in items:
-        yield from _leaves(item, f"{path}.{key}" if path else str(key))
+    else:
+        for key, item in inner.items():
+            yield from _leaves(item, f"{path}.{key}" if path else str(key))
