@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import partial
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
@@ -181,9 +181,9 @@ def check_names(names: Iterable[str], place: str) -> None:
 
 def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:
     """A value of the first type that fits; if none fits, the error is that of the last."""
-    if node is None and type(None) in kinds:
+    if node is None and NoneType in kinds:
         return None
-    kinds = [kind for kind in kinds if kind is not type(None)]
+    kinds = [kind for kind in kinds if kind is not NoneType]
     for kind in kinds[:-1]:
         try:
             return value_of(kind, node, place)
@@ -277,20 +277,16 @@ def bind(node: Mapping[str, Any], place: str, *first: Any) -> partial[Any]:
     return call
 
 
-def _plain_arguments(target: Any) -> dict[str, tuple[type, ...]]:
+def _plain_arguments(target: Any) -> dict[str, list[type]]:
     """Arguments of a target that can only be plain values or None, with their types."""
     try:
         hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
     except Exception:  # an annotation that does not exist at run time; no annotations
         return {}
-    alternatives = {name: _alternatives(hint) for name, hint in hints.items()}
-    return {name: kinds for name, kinds in alternatives.items() if set(kinds) <= set(PLAIN)}
-
-
-def _alternatives(hint: Any) -> tuple[Any, ...]:
-    """The types of a union without None; a single type by itself."""
-    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    return tuple(part for part in parts if part is not type(None))
+    unions = {n: get_origin(hint) in (Union, UnionType) for n, hint in hints.items()}
+    kinds = {n: get_args(hint) if unions[n] else (hint,) for n, hint in hints.items()}
+    without = {n: [kind for kind in each if kind is not NoneType] for n, each in kinds.items()}
+    return {n: each for n, each in without.items() if set(each) <= set(PLAIN)}
 
 
 def _argument(kinds: Collection[type], node: Any, place: str) -> Any:

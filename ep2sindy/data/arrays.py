@@ -59,8 +59,9 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     """Read one array and summarise it."""
     try:
         array = read_array(source, name, name)
-    except ValueError as error:
-        return ArrayInfo(name, problem=_short(str(error), source))
+    except ValueError as error:  # its reason, without the file's name
+        reason = str(error).removeprefix(f"{source.path} cannot be read: ")
+        return ArrayInfo(name, problem=TEXT if "real numbers" in reason else reason)
     values = np.asarray(array.values, dtype=np.float64)
     finite = values[np.isfinite(values)]
     attribute = str(array.attrs.get("units", "") or source.units.get(name, ""))
@@ -73,8 +74,7 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     steps = steps if steps.size > 1 and not falls else np.empty(0)
     return ArrayInfo(
         name, values.shape, stated, dims,
-        float(finite.min()) if finite.size else np.nan,
-        float(finite.max()) if finite.size else np.nan,
+        *((float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)),
         int(values.size - finite.size),
         int(array.attrs.get(N_MARKS, 0)),
         float(np.median(steps)) if steps.size else None,
@@ -83,11 +83,6 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
         _gap(steps),
         falls,
     )  # fmt: skip
-
-
-def _short(text: str, source: FileSource) -> str:
-    """Why an array cannot be used, without the file's name."""
-    return TEXT if "real numbers" in text else text.removeprefix(f"{source.path} cannot be read: ")
 
 
 def _fall(points: np.ndarray, steps: np.ndarray) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -61,21 +61,16 @@ class Problems:
         """Raise ValueError if there are errors; if a name is missing, list the file's arrays."""
         if not self.found:
             return
-        if len(self.found) == 1:
-            raise ValueError(
-                f"the mapping must be put right: {self.found[0]}{self._held(source, '; it')}"
-            )
+        one, held = len(self.found) == 1, ""
+        if any(" no variable " in each for each in self.found):
+            held = f"{'; it' if one else '. It'} holds {list_arrays(source)}; set the name, or null"
+            held += " if the file has it not"
+        if one:
+            raise ValueError(f"the mapping must be put right: {self.found[0]}{held}")
         lines = "".join(f"\n  - {each}" for each in self.found)
         raise ValueError(
-            f"{len(self.found)} things must be put right for {source.path}:{lines}"
-            f"{self._held(source, '. It')}"
+            f"{len(self.found)} things must be put right for {source.path}:{lines}{held}"
         )
-
-    def _held(self, source: FileSource, joined: str) -> str:
-        """List of the file's arrays if a missing name was asked for, else an empty text."""
-        if not any(" no variable " in each for each in self.found):
-            return ""
-        return f"{joined} holds {list_arrays(source)}; set the name, or null if the file has it not"
 
 
 def in_file(
@@ -92,10 +87,9 @@ def in_file(
                     f"{ours} needs a name, a unit, perhaps dims: {dict(value)} came"
                 )
                 continue
-            name = None if value["name"] is None else str(value["name"])
-            value = Variable(name, str(value["unit"]), value.get("dims"))
+            value = Variable(value["name"], str(value["unit"]), value.get("dims"))
         if value is not None and value.name is not None:
-            found[ours] = value
+            found[ours] = replace(value, name=str(value.name))
     return found
 
 

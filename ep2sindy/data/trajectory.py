@@ -107,10 +107,8 @@ class Trajectory:
                 f"{missing.dtype} of shape {missing.shape} came with states of shape "
                 f"{states.shape}; write missing=np.isnan(states)"
             )
-        empty = [
-            name for name, lacks in zip(self.state_names, missing.T, strict=False) if lacks.all()
-        ]
-        if empty:
+        lacking = zip(self.state_names, missing.all(axis=0), strict=False)
+        if empty := [name for name, lacks in lacking if lacks]:
             raise ValueError(
                 f"every state needs samples: all of {empty} are missing; leave them out, or name "
                 "them in hidden=..."
@@ -118,10 +116,8 @@ class Trajectory:
         t, filled = seconds(self.t), np.array(states, dtype=np.float64)
         for column, lacks in zip(filled.T, missing.T, strict=True):
             column[lacks] = np.interp(t[lacks], t[~lacks], column[~lacks])
-        missing = missing.copy()
-        missing.flags.writeable = False
-        object.__setattr__(self, "missing", missing if missing.any() else None)
-        return read_only(filled)
+        object.__setattr__(self, "missing", locked(missing.copy()) if missing.any() else None)
+        return locked(filled)
 
     def complete(self) -> Trajectory:
         """The samples at which every state was measured, for methods that need all of them.
