@@ -14,8 +14,7 @@ from scipy.io import savemat
 import ep2sindy as ep
 from ep2sindy.app import inspection
 from ep2sindy.app.inspection import experiments
-from ep2sindy.data.conversion import conversion
-from ep2sindy.data.quantities import axis_of, axis_unit, quantity_of, split_unit
+from ep2sindy.data.quantities import axis_of, axis_unit, conversion, quantity_of, split_unit
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.recognition import recognise
 from ep2sindy.data.runs import trajectories_of

@@ -12,10 +12,10 @@ from hydra.utils import instantiate
 from nptdms import ChannelObject, TdmsWriter
 from scipy.io import savemat
 
-from ep2sindy.data.conversion import conversion, same_unit
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import inspect_file, open_field, read_field, write_field
 from ep2sindy.data.prepare import keep_where
+from ep2sindy.data.quantities import conversion, same_unit
 from ep2sindy.data.readers.source import look_at
 from ep2sindy.data.zones import Zone, zone_average
 from tests.programs import composed

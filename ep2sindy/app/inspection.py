@@ -12,10 +12,10 @@ from typing import Any
 
 import yaml
 
-from ep2sindy.data.conversion import COORDINATE_UNITS, KNOWN_UNITS
 from ep2sindy.data.inspection import STEP, Inspection, compare_files, unlike
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import inspect_file
+from ep2sindy.data.quantities import COORDINATE_UNITS, KNOWN_UNITS
 from ep2sindy.data.steps import records_of
 from ep2sindy.operating.file_names import FilePattern, propose_pattern
 from ep2sindy.operating.records import point_label

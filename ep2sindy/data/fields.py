@@ -17,9 +17,8 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.conversion import COORDINATE_UNITS
-from ep2sindy.data.export import CLOCK
-from ep2sindy.data.trajectory import check_time
+from ep2sindy.data.quantities import COORDINATE_UNITS
+from ep2sindy.data.trajectory import CLOCK, check_time
 from ep2sindy.library.names import check_variable
 from ep2sindy.library.units import Clock
 from ep2sindy.runtime.files import read_json, write_bytes

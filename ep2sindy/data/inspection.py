@@ -9,10 +9,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from shlex import quote
 
-from ep2sindy.data.arrays import TEXT, ArrayInfo
-from ep2sindy.data.conversion import KNOWN_UNITS
-from ep2sindy.data.mapping import Variable
-from ep2sindy.data.quantities import MADE_FROM, is_counter_name
+from ep2sindy.data.mapping import TEXT, ArrayInfo, Variable
+from ep2sindy.data.quantities import KNOWN_UNITS, MADE_FROM, is_counter_name
 from ep2sindy.data.readers.source import FileSource
 from ep2sindy.runtime.screen import WIDTH, html_table, in_line, one_screen, text_table
 

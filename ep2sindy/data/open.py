@@ -13,20 +13,26 @@ from pathlib import Path
 
 import xarray as xr
 
-from ep2sindy.data.arrays import describe_array
-from ep2sindy.data.conversion import conversion, to_si
-from ep2sindy.data.dimensions import assign_dims, read_axes
-from ep2sindy.data.export import CLOCK
 from ep2sindy.data.fields import DIMS, check_field, mask_outside, write_netcdf
 from ep2sindy.data.gaps import usual_step
 from ep2sindy.data.inspection import Inspection
-from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
-from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit
+from ep2sindy.data.mapping import (
+    Keys,
+    Problems,
+    Variable,
+    assign_dims,
+    describe_array,
+    in_file,
+    read_array,
+    read_axes,
+)
+from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit, conversion, to_si
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import reader_of
 from ep2sindy.data.readers.source import UNDECODED, FileSource, damage_named, file_named
 from ep2sindy.data.recognition import recognise
 from ep2sindy.data.steps import open_record
+from ep2sindy.data.trajectory import CLOCK
 
 
 def open_field(

@@ -16,16 +16,17 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ep2sindy.data.arrays import TEXT, ArrayInfo, describe_array
-from ep2sindy.data.conversion import COORDINATE_UNITS, KNOWN_UNITS, conversion, converts
-from ep2sindy.data.dimensions import fitting, time_length
 from ep2sindy.data.fields import DIMS
 from ep2sindy.data.inspection import STEP, Inspection
-from ep2sindy.data.mapping import Variable
+from ep2sindy.data.mapping import TEXT, ArrayInfo, Variable, describe_array, fitting, time_length
 from ep2sindy.data.quantities import (
+    COORDINATE_UNITS,
     ELECTRONS,
+    KNOWN_UNITS,
     axis_of,
     axis_unit,
+    conversion,
+    converts,
     is_counter_name,
     last_of,
     own_unit,

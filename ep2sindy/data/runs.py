@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.export import CLOCK
 from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
 from ep2sindy.data.numbers import count_dates, real_numbers, seconds
 from ep2sindy.data.quantities import axis_of, columns_in_si, time_unit
-from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.trajectory import CLOCK, Trajectory
 from ep2sindy.library.units import SECONDS, Clock, seconds_in
 from ep2sindy.runtime.values import check_list, check_positive
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from ep2sindy.data.conversion import KNOWN_UNITS
+from ep2sindy.data.quantities import KNOWN_UNITS
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.method import AnyMethod, Regression

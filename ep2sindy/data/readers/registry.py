@@ -7,14 +7,12 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
-from ep2sindy.data.readers.csv import CSV
 from ep2sindy.data.readers.hallthruster import HALLTHRUSTER
 from ep2sindy.data.readers.hdf5 import HDF5
 from ep2sindy.data.readers.matlab import MATLAB, NPZ
 from ep2sindy.data.readers.netcdf import NETCDF, ZARR
 from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_at
-from ep2sindy.data.readers.tables import EXCEL, NPY, PARQUET
-from ep2sindy.data.readers.tdms import TDMS
+from ep2sindy.data.readers.tables import CSV, EXCEL, NPY, PARQUET, TDMS
 from ep2sindy.runtime.screen import joined
 
 # The first that takes a file reads it: those by their first bytes, then those by form and ending.
