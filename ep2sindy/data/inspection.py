@@ -49,8 +49,8 @@ class Inspection:
         """Questions that the user must answer."""
         return [*filter(None, [self.no_time]), *self.no_unit.values()]
 
-    def check(self) -> None:
-        """Raise ValueError unless this mapping gives a field without any doubt."""
+    def checked(self) -> Inspection:
+        """This mapping, if it gives a field without any doubt; else raises ValueError."""
         none = [] if self.variables else ["no array of the file fits its axes"]
         if doubts := [*self.asked, *none]:
             raise ValueError(
@@ -59,6 +59,7 @@ class Inspection:
                 f"{quote(str(self.source.path))} --write` (in Python ep2sindy.inspect_file) shows "
                 "what it holds and writes a mapping"
             )
+        return self
 
     @property
     def time(self) -> Variable | None:

@@ -77,8 +77,7 @@ def open_field(
     times: Sequence[Variable] = [axes["time"]] if "time" in axes else []
     if variables is None:
         problems.check(source)
-        found = recognise(source, dt_s=dt_s, given=axes, units=units, plasma=plasma)
-        found.check()
+        found = recognise(source, dt_s=dt_s, given=axes, units=units, plasma=plasma).checked()
         variables, axes, dt_s, times = found.variables, found.axes, found.dt_s, found.replaced
     with file_named(source.path):
         field = _field(source, variables, axes, dt_s, mask, chunks, problems)
