@@ -355,10 +355,13 @@ def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
         (["+library.variables_if_present=[u_ir]"], LIBRARY_KEYS),
         (["~library.products", "+library.n_norm=max_terms"], LIBRARY_KEYS),
         (["trends=[{along: V_D_V, at: {}}]"], "a trend goes along one parameter and holds"),
-        (["+figures.panels=[[L]]"], "figures may have labels alone: ['labels', 'panels'] came"),
+        (
+            ["+figures.panels=[[L]]"],
+            "figures may have ['labels'] and needs labels: ['labels', 'panels'] came",
+        ),
         (["+laws=1"], "unknown keys ['laws']"),
         (["law.max_terms=0"], "max_terms must be a whole number, one or more: 0 came"),
-        (["+law.terms=3"], "law may have degree, max_terms and tied_degree alone"),
+        (["+law.terms=3"], "law may have ['degree', 'max_terms', 'tied_degree'] and needs"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(

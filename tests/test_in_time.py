@@ -127,7 +127,7 @@ def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> No
          "a new name: the field already has 'I_d'"),
         (ep.prepare.derivative, {"variable": "B"}, "unknown variable of time 'B'"),
         (ep.prepare.derivative, {"variable": "x", "name": "a b"},
-         "letters, digits and _: 'a b' came"),
+         "letters, digits and _, such as 'n_i': 'a b' came"),
         (ep.prepare.detrend, {"degree": 0}, "degree must be 1 or more, .*: 0 came"),
         (ep.prepare.detrend, {"variables": ["q"]}, "unknown variable of time 'q'"),
     ],

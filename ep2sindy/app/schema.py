@@ -209,11 +209,6 @@ def _dataclass(kind: Any, node: Any, place: str) -> Any:
     if given is None or given - set(hints) or set(needed) - given:
         came = sorted(given) if given is not None else node
         near = "".join(near_words(each, hints) for each in sorted((given or set()) - set(hints)))
-        if len(needed) == len(hints):
-            how = f"must have {joined(needed)}"
-            if given is not None and given >= set(needed):  # nothing is lacking
-                how = f"may have {joined(needed)} alone"
-            raise ValueError(f"{place} {how}: {came} came{near}")
         raise ValueError(
             f"{place} may have {sorted(hints)} and needs {joined(needed) or 'none'}: {came} came"
             f"{near}"

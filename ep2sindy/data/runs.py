@@ -273,10 +273,6 @@ def _from_arrays(t: object, x: object, partial: bool) -> Trajectory:
             "arrays (t, x) must have shapes (samples,) and (samples,) or (samples, n_states): "
             f"{times.shape} and {states.shape} came"
         )
-    if times.dtype.kind not in "iufmM" or states.dtype.kind not in "iuf":
-        raise ValueError(
-            f"arrays (t, x) must hold real numbers: {times.dtype} and {states.dtype} came"
-        )
     columns = real_numbers(states[:, None] if states.ndim == 1 else states, "states")
     names = ["x"] if states.ndim == 1 else [f"x{k}" for k in range(states.shape[1])]
     return _present(seconds(times), columns, names, partial)

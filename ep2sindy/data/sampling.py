@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.fields import SPACE, cell_edges, cell_sizes, check_field, grid_points
+from ep2sindy.data.fields import SPACE, cell_edges, cell_sizes, grid_points
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone, describe_zone, resolve_zone, zone_average, zone_slices
 
@@ -220,7 +220,6 @@ def point_samples(
 
     Raises ValueError for a place outside the grid's cells or without plasma.
     """
-    check_field(field)
     nearest = _nearest(field, z=z, r=r)
     return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)
 

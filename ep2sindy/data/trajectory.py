@@ -300,18 +300,23 @@ def check_time(t: Float[np.ndarray, " samples"]) -> None:
     """Raise ValueError unless t has two samples or more, is finite and increases."""
     if t.ndim != 1 or len(t) < 2:
         raise ValueError(f"a trajectory needs at least two samples: t has shape {t.shape}")
-    bad = np.flatnonzero(~np.isfinite(t))
+    check_increasing("t", t, "s")
+
+
+def check_increasing(name: str, points: Float[np.ndarray, " points"], unit: str) -> None:
+    """Raise ValueError unless points are finite and increase."""
+    bad = np.flatnonzero(~np.isfinite(points))
     if bad.size:
         raise ValueError(
-            f"t must be finite: t[{bad[0]}] = {t[bad[0]]} ({bad.size} such samples); "
-            "cut or fill them first"
+            f"{name} must be finite: {name}[{bad[0]}] = {points[bad[0]]} ({bad.size} such "
+            "samples); cut or fill them first"
         )
-    stalls = np.flatnonzero(np.diff(t) <= 0)
+    stalls = np.flatnonzero(np.diff(points) <= 0)
     if stalls.size:
         k = int(stalls[0])
         raise ValueError(
-            f"t must increase: t[{k + 1}] = {t[k + 1]:.9g} s follows {t[k]:.9g} s; "
-            "drop repeated samples or sort by time first"
+            f"{name} must increase: {name}[{k + 1}] = {points[k + 1]:.9g} {unit} follows "
+            f"{points[k]:.9g} {unit}; drop what repeats, or sort by {name} first"
         )
 
 
