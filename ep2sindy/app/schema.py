@@ -64,7 +64,9 @@ def study_of(study: type, config: DictConfig) -> Any:
     for place, value in nodes_of({name: typed[name] for name in typed if name in used}):
         if value == "???":
             raise ValueError(f"{place} must be set: it is still '???'")
-    return _fill(study, _without_formats(plain(config), has_own="figures" in used))
+    hints = hints_of(study)
+    needed = [name for name in hints if is_required(study, name)]
+    return _fill(study, hints, needed, _without_formats(plain(config), has_own="figures" in used))
 
 
 def plain(config: Any) -> Any:
@@ -88,28 +90,27 @@ def _without_formats(settings: dict[str, Any], *, has_own: bool) -> dict[str, An
     return settings | {"figures": own}
 
 
-def _fill(study: type, settings: Mapping[str, Any]) -> Any:
-    """Fill a dataclass from the top level of the config."""
+def _fill(
+    call: Callable[..., Any],
+    hints: Mapping[str, Any],
+    needed: Collection[str],
+    settings: Mapping[str, Any],
+) -> Any:
+    """A study, or a method or source made of groups, from the top level of the config.
+
+    A group that is left out (`~search`) gets no default.
+    """
     arguments = {}
-    for name, kind in hints_of(study).items():
+    for name, kind in hints.items():
         if kind in GATHERED:
-            arguments[name] = _gather_groups(kind, settings)
+            groups = _groups(kind)
+            arguments[name] = _fill(GATHERED[kind], groups, groups, settings)
         elif name in settings:
             arguments[name] = value_of(kind, settings[name], name)
-        elif is_required(study, name):
-            raise ValueError(f"the config of this experiment must have {name!r}")
-    return study(**arguments)
-
-
-def _gather_groups(kind: Any, settings: Mapping[str, Any]) -> Any:
-    """Build a method or source from its groups; one left out (`~search`) gets no default."""
-    groups = _groups(kind)
-    if lacking := [name for name in groups if name not in settings]:
-        raise ValueError(
-            f"the config of this experiment must have {lacking[0]!r}: choose one with "
-            f"{lacking[0]}=NAME, see --help"
-        )
-    return GATHERED[kind](**{n: value_of(each, settings[n], n) for n, each in groups.items()})
+        elif name in needed:
+            way = f": choose one with {name}=NAME, see --help" if name in GROUPS else ""
+            raise ValueError(f"the config of this experiment must have {name!r}{way}")
+    return call(**arguments)
 
 
 def _groups(kind: Any) -> dict[str, Any]:
