@@ -421,7 +421,7 @@ def test_hdf5_is_recognised_as_its_own_library_does(tmp_path: Path, name: str) -
 
 
 KNOWN = (
-    r"NetCDF, HDF5, MATLAB \(v5, v7.3\), npz, npy, Excel, Parquet or TDMS, or end in .csv, .* or "
+    r"MATLAB \(v5, v7.3\), npy, Parquet, TDMS, Excel, NetCDF, HDF5 or npz, or end in .csv, .* or "
     ".zarr: "
 )
 

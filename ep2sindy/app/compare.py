@@ -97,10 +97,11 @@ def folders_of(path: Path) -> list[Path]:
     for place in records:
         with damage_named(place):
             record = {"error": "", "folder": "", **read_json(place.read_text("utf-8"))}
+            folder = Path(record["folder"])
         if record["error"] or not record["folder"]:
             say(f"left out: job {place.stem} failed: {record['error']}")
         else:
-            found.append(Path(record["folder"]))
+            found.append(folder)
     return found if records else [path]
 
 
