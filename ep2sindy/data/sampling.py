@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
@@ -40,20 +40,8 @@ def zone_averages(
     >>> ep.zone_averages(field, zones, states=["n_i", "n_n"]).state_names
     ('n_i@anode', 'n_n@anode', 'n_i@exit', 'n_n@exit')
     """
-    average = partial(
-        zone_average, field, states=states, inputs=inputs, products=products,
-        axisymmetric=axisymmetric, label=label,
-    )  # fmt: skip
-    runs = {name: average(zone) for name, zone in side_by_side(zones, field).items()}
-    first = next(iter(runs.values()))
-    return replace(
-        first,
-        states=np.column_stack([run.states for run in runs.values()]),
-        state_names=in_zones(runs, first.state_names),
-        inputs=np.column_stack([run.inputs for run in runs.values()]),
-        input_names=in_zones(runs, first.input_names),
-        units={f"{n}@{name}": unit for name, run in runs.items() for n, unit in run.units.items()},
-    )
+    average = ZoneAverage(states, None, products, axisymmetric, zones)
+    return average.trajectory(field, inputs=inputs, label=label)
 
 
 def in_zones(zones: Iterable[str], names: Sequence[str]) -> list[str]:
@@ -63,11 +51,6 @@ def in_zones(zones: Iterable[str], names: Sequence[str]) -> list[str]:
 
 def side_by_side(zones: Mapping[str, Zone | Sequence[float]], field: xr.Dataset) -> dict[str, Zone]:
     """Zones with ends in m that share no grid point; see `zone_averages`."""
-    if not isinstance(zones, Mapping) or not zones:
-        raise ValueError(
-            "zones must be given by name, with their ends in z in m, as in "
-            f"{{anode: [0, 0.0125], exit: [0.0125, 0.025]}}: {zones!r} came"
-        )
     found: dict[str, Zone] = {}
     taken, reached_m = 0, -math.inf
     for name, given in zones.items():
@@ -111,9 +94,8 @@ class ZoneAverage:
 
     def __post_init__(self) -> None:
         zones = self.zones
-        if zones is None or isinstance(zones, Mapping):
-            return
-        if isinstance(zones, bool) or not isinstance(zones, int) or zones < 1:
+        is_number = type(zones) is int and zones >= 1
+        if not (zones is None or is_number or (isinstance(zones, Mapping) and zones)):
             raise ValueError(
                 "zones must be a whole number of parts, one or more, or zones by name, such as "
                 f"{{anode: [0, 0.01], exit: [0.01, 0.025]}} in m: {zones!r} came"
@@ -139,15 +121,23 @@ class ZoneAverage:
         return list(self.zones or {})
 
     def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
-        average: Any = zone_average if self.zones is None else zone_averages
-        return average(
-            field,
-            self.zone if self.zones is None else self.parts(field),
-            states=self.states,
-            inputs=inputs,
-            products=self.products,
-            axisymmetric=self.axisymmetric,
-            label=label,
+        average = partial(
+            zone_average, field, states=self.states, inputs=inputs, products=self.products,
+            axisymmetric=self.axisymmetric, label=label,
+        )  # fmt: skip
+        if self.zones is None:
+            return average(self.zone)
+        runs = {name: average(zone) for name, zone in self.parts(field).items()}
+        first = next(iter(runs.values()))
+        return replace(
+            first,
+            states=np.column_stack([run.states for run in runs.values()]),
+            state_names=in_zones(runs, first.state_names),
+            inputs=np.column_stack([run.inputs for run in runs.values()]),
+            input_names=in_zones(runs, first.input_names),
+            units={
+                f"{n}@{zone}": unit for zone, run in runs.items() for n, unit in run.units.items()
+            },
         )
 
     def columns(self, names: Sequence[str]) -> list[str]:
