@@ -91,7 +91,7 @@ class Trajectory:
             check_state(name)
         self._check_shapes()
         check_time(self.t)
-        check_finite(self.t, self.values, self.names)
+        self._check_finite()
         check_magnitude(self.values, self.names)
         self._check_variation()
 
@@ -283,6 +283,16 @@ class Trajectory:
         if not self.state_names:
             raise ValueError("a trajectory needs at least one state; name one in state_names")
 
+    def _check_finite(self) -> None:
+        rows, columns = np.nonzero(~np.isfinite(self.values))
+        if rows.size:
+            k, name = rows[0], self.names[columns[0]]
+            raise ValueError(
+                f"samples must be finite: {name}[{k}] = {self.values[k, columns[0]]} at t = "
+                f"{self.t[k]:.6g} s ({rows.size} such values); crop, mask or interpolate them "
+                "first, or say that they were not measured (missing=np.isnan(states))"
+            )
+
     def _check_variation(self) -> None:
         columns = np.ascontiguousarray(self.states.T)  # reductions over few columns are slow
         for name, width, level in zip(
@@ -317,22 +327,6 @@ def check_increasing(name: str, points: Float[np.ndarray, " points"], unit: str)
         raise ValueError(
             f"{name} must increase: {name}[{k + 1}] = {points[k + 1]:.9g} {unit} follows "
             f"{points[k]:.9g} {unit}; drop what repeats, or sort by {name} first"
-        )
-
-
-def check_finite(
-    t: Float[np.ndarray, " samples"],
-    values: Float[np.ndarray, "samples variables"],
-    names: Sequence[str],
-) -> None:
-    """Raise ValueError naming the first sample that is NaN or infinite."""
-    rows, columns = np.nonzero(~np.isfinite(values))
-    if rows.size:
-        k, j = rows[0], columns[0]
-        raise ValueError(
-            f"samples must be finite: {names[j]}[{k}] = {values[k, j]} at t = {t[k]:.6g} s "
-            f"({rows.size} such values); crop, mask or interpolate them first, or say that they "
-            "were not measured (missing=np.isnan(states))"
         )
 
 
