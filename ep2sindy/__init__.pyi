@@ -4,7 +4,7 @@ __version__: str
 # Data
 from ep2sindy.data.trajectory import Trajectory as Trajectory
 from ep2sindy.data.open import open_field as open_field  # for configs
-from ep2sindy.data.inspection import inspect_file as inspect_file
+from ep2sindy.data.open import inspect_file as inspect_file
 from ep2sindy.data.open import read_field as read_field  # for configs
 from ep2sindy.data.open import write_field as write_field
 from ep2sindy.data.zones import zone_average as zone_average

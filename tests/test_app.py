@@ -167,7 +167,7 @@ def test_a_key_that_is_missing_is_named_and_a_group_does_not_become_another(
 
 def test_what_is_built_later_can_be_changed_by_place() -> None:
     point = {"voltage": 300.0, "mass_flow_mg_s": 5.0}
-    node = OmegaConf.create({"_target_": "ep2sindy.thruster.OperatingPoint", **point})
+    node = {"_target_": "ep2sindy.thruster.OperatingPoint", **point}
     later = Configured(node, "data")
     changed = later.changed({"voltage": 200.0}, {"neutral_speed": 190.0})
     assert changed.build().voltage == 200.0
@@ -208,7 +208,7 @@ def test_a_value_of_two_kinds_is_taken_as_the_first_that_fits() -> None:
     assert value_of(int | str, 3, "x") == 3
     assert value_of(int | str, "a", "x") == "a"
     assert value_of(float | None, None, "x") is None
-    later = OmegaConf.create({"_target_": "ep2sindy.Knee"})
+    later = {"_target_": "ep2sindy.Knee"}
     assert isinstance(value_of(Deferred | None, later, "x"), Deferred)
     assert value_of(ep.Knee | ep.EBIC, later, "x") == ep.Knee()
     with pytest.raises(ValueError, match="x must name a _target_ that is a Mapping"):

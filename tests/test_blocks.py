@@ -67,7 +67,7 @@ def test_ranges_and_averages_in_blocks_are_those_of_the_whole(
     tmp_path: Path, name: str, chunks: tuple[int, ...]
 ) -> None:
     path = written(tmp_path / name, chunks)
-    held = {one.name: one for one in ep.inspect_file(path).found.held}
+    held = {one.name: one for one in ep.inspect_file(path).held}
     assert (held["n_i"].low, held["n_i"].high) == (np.nanmin(density(0)), np.nanmax(density(0)))
     assert held["n_i"].n_missing == 30 * 8
     field = ep.open_field(path)

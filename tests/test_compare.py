@@ -144,7 +144,7 @@ def test_the_jobs_of_a_sweep_are_compared_but_for_those_that_failed(
     assert "search.max_terms" in said
     assert page.is_file()
     write_json(sweep / "jobs" / "3.json", {"folder": 1})
-    with pytest.raises(ValueError, match=r"3\.json cannot be read \(folder cannot be 1\)"):
+    with pytest.raises(ValueError, match=r"3\.json cannot be read: it is damaged"):
         compare([str(sweep)])
 
 

@@ -137,7 +137,7 @@ def test_iterations_go_to_tensorboard(toy_run: Path) -> None:
         (["relations=[]"], "relations must be a list of relations, such as"),
         (["relations=['n_i: n_n == 1']"], "'n_n' is not in the support of 'n_i'"),
         (["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
-        (["+figures.colour=1"], "figures may have duration_s and f_max_Hz alone"),
+        (["+figures.colour=1"], "figures may have ['duration_s', 'f_max_Hz'] and needs"),
         (["+n_points=3"], "unknown keys ['n_points']"),
     ],
 )

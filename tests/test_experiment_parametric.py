@@ -347,7 +347,10 @@ def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
         (["parameters.V_D_V=operating_point.volts"], "data.operating_point.volts must be there"),
         (["points=[{V_D_V: 1, mdot_mg_s: 5, data: {n_cels: 3}}]"], "n_cels"),
         (["cases=null"], "cases must be like {free: {relations: [], quantities:"),
-        (["~cases.free.relations"], "cases.free must have relations and quantities"),
+        (
+            ["~cases.free.relations"],
+            "cases.free may have ['quantities', 'relations'] and needs relations",
+        ),
         (["cases.free.quantities.L_m.coefficient='n_i: n_n'"], "unknown term 'n_n'; this library"),
         (["cases.free.quantities.L_m.power=3"], "the power 1 or -1"),
         (["+cases.free.quantities.L_m.exponent=3"], "L_m may have ['coefficient', 'factor', 'po"),
@@ -355,10 +358,13 @@ def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
         (["+library.variables_if_present=[u_ir]"], LIBRARY_KEYS),
         (["~library.products", "+library.n_norm=max_terms"], LIBRARY_KEYS),
         (["trends=[{along: V_D_V, at: {}}]"], "a trend goes along one parameter and holds"),
-        (["+figures.panels=[[L]]"], "figures may have labels alone: ['labels', 'panels'] came"),
+        (
+            ["+figures.panels=[[L]]"],
+            "figures may have ['labels'] and needs labels: ['labels', 'panels'] came",
+        ),
         (["+laws=1"], "unknown keys ['laws']"),
         (["law.max_terms=0"], "max_terms must be a whole number, one or more: 0 came"),
-        (["+law.terms=3"], "law may have degree, max_terms and tied_degree alone"),
+        (["+law.terms=3"], "law may have ['degree', 'max_terms', 'tied_degree'] and needs"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(

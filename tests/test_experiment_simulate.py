@@ -12,7 +12,7 @@ import xarray as xr
 from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
-from ep2sindy.app.schema import Configured, study_of
+from ep2sindy.app.schema import Configured, plain, study_of
 from ep2sindy.figures import breathing
 from ep2sindy.figures.stability import curves_figure, stability_figure
 from ep2sindy.runtime.files import WriteError
@@ -207,7 +207,7 @@ def test_settings_that_cannot_be_are_refused_before_a_run(
 
 
 def test_a_place_that_the_config_leaves_to_its_default_can_be_scanned() -> None:
-    data = Configured(composed().data, "data")
+    data = Configured(plain(composed().data), "data")
     points = scan_points(data, {"thruster.transport.c_plume": [0.01, 0.02], "cfl": [0.5]})
     transport = [point.data.settings["thruster"]["transport"] for point in points]
     assert [each["c_plume"] for each in transport] == [0.01, 0.02]
@@ -221,7 +221,7 @@ def test_a_place_that_the_config_leaves_to_its_default_can_be_scanned() -> None:
 def test_kernels_are_compiled_without_a_trace(tmp_path: Path) -> None:
     config = composed(*toy(tmp_path), VOLTAGES)
     points = scan_points(
-        Configured(config.data, "data"), {"operating_point.voltage": [-5.0, 300.0]}
+        Configured(plain(config.data), "data"), {"operating_point.voltage": [-5.0, 300.0]}
     )
     compile_kernels([point.data for point in points])
     assert not (tmp_path / "cache").exists()
@@ -237,7 +237,7 @@ def test_a_point_of_a_scan_without_a_simulation_says_the_way_out(
     predator_prey: Path, tmp_path: Path
 ) -> None:
     config = composed("data=file", f"data.path={predator_prey}", f"output={tmp_path}")
-    found = run_point(Point({}, Configured(config.data, "data")))
+    found = run_point(Point({}, Configured(plain(config.data), "data")))
     assert found.status == "failed"
     assert "open_field gave none; choose data=simulation" in found.message
 

@@ -304,10 +304,10 @@ def test_names_of_any_field_of_science_work() -> None:
         (GOOD.assign_coords(time=np.r_[T[:5], T[4:10]]), r"t\[5\] = 4e-05 s follows 4e-05 s"),
         (GOOD.isel(time=slice(None, None, -1)), r"t must increase: t\[1\] = 9e-05 s"),
         (GOOD.isel(time=[0]), "at least two samples"),
-        (GOOD.isel(z=[1, 0]), r"z must be finite and increase: z\[0:2\] = \[1. 0.\] m"),
+        (GOOD.isel(z=[1, 0]), r"z must increase: z\[1\] = 0 m follows 1 m"),
         (GOOD.assign_coords(z=[0.0, np.nan]), "z must be finite"),
         (GOOD.astype(complex), "n_i must hold real numbers: its type is complex128"),
-        (GOOD.rename(n_i="n i"), "a variable's name must be letters, digits and _: 'n i' came"),
+        (GOOD.rename(n_i="n i"), "a variable's name must be a word of .*: 'n i' came"),
         (GOOD.drop_attrs(), "n_i must name its unit"),
     ],
 )

@@ -76,7 +76,7 @@ def test_a_list_holds_several_runs_of_any_kind() -> None:
         (pd.DataFrame({"t": T, "x": ["a"] * len(T)}), "must hold real numbers: {'x': .*; drop"),
         (pd.DataFrame({"t": T > 0, "x": T}), "{.t.: .bool.} came; give time in s, as numbers or"),
         ((T, X.T), r"must have shapes .*: \(31,\) and \(2, 31\) came"),
-        ((T, X + 1j), "must hold real numbers: float64 and complex128 came"),
+        ((T, X + 1j), "states must hold real numbers: complex128 came"),
     ],
     ids=str,
 )

@@ -14,8 +14,7 @@ from scipy.io import savemat
 import ep2sindy as ep
 from ep2sindy.app import inspection
 from ep2sindy.app.inspection import experiments
-from ep2sindy.data.conversion import conversion
-from ep2sindy.data.quantities import axis_of, axis_unit, quantity_of, split_unit
+from ep2sindy.data.quantities import axis_of, axis_unit, conversion, quantity_of, split_unit
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.recognition import recognise
 from ep2sindy.data.runs import trajectories_of
@@ -395,7 +394,7 @@ def test_marks_of_overload_that_repeat_are_missing_samples_and_said(
     x[[3, 9]] = mark
     path = write_csv(tmp_path / "a.csv", t_s=T, x=x)
     found = ep.inspect_file(path)
-    assert found.found.held[1].n_missing == 2
+    assert found.held[1].n_missing == 2
     assert "'x': 2 samples are marks of an overload or of absence, and left out" in found.notes()
     assert np.isnan(ep.open_field(path)["x"].values[[3, 9]]).all()
     (run,) = trajectories_of(pd.read_csv(path))

@@ -9,7 +9,7 @@ import ep2sindy as ep
 from benchmarks.regions import three_regions
 from ep2sindy.app.arguments import mend, options_first
 from ep2sindy.app.runner import study_class
-from ep2sindy.app.schema import bind_step, study_of
+from ep2sindy.app.schema import bind_step, plain, study_of
 from ep2sindy.data.fields import check_field
 from tests import programs
 from tests.programs import composed, ended
@@ -125,7 +125,7 @@ def test_the_page_names_every_step() -> None:
 def test_a_step_that_the_page_names_is_composed_and_called(name: str) -> None:
     room = "thruster" if name == "ionization_rate" else "prepare"
     text = f"prepare=[{{_target_: ep2sindy.{room}.{name}, {STEPS[name]}}}]"
-    step = bind_step(composed("+exp=breathing", mend(text)).prepare[0], "prepare[0]")
+    step = bind_step(plain(composed("+exp=breathing", mend(text)).prepare[0]), "prepare[0]")
     arguments = steps_of_the_page()[name]
     assert set(step.keywords) <= set(arguments)
     field = three_regions(n_z=6, n_r=5, n_samples=64).field

@@ -178,7 +178,7 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
     lorenz_csv(folder / "whole.csv")
     lines = (folder / "whole.csv").read_text().splitlines()
     (folder / "a.csv").write_text("\n".join(lines[:204] + lines[704:]))
-    step = ep.inspect_file("whole.csv").found.held[0].step
+    step = ep.inspect_file("whole.csv").held[0].step
     assert not ended("inspect", "a.csv")
     said = capsys.readouterr().out
     assert f"about {step:.4g} apart" in said

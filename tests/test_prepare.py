@@ -5,8 +5,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy.data.in_time import crop, decimate, low_pass
-from ep2sindy.data.prepare import derive, gradient, keep_where, radial_from_middle
+from ep2sindy.data.prepare import (
+    crop,
+    decimate,
+    derive,
+    gradient,
+    keep_where,
+    low_pass,
+    radial_from_middle,
+)
 from ep2sindy.thruster import propellants
 from ep2sindy.thruster.ionization import ionization_rate, read_rate_table
 from ep2sindy.thruster.propellant_files import propellant

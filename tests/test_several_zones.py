@@ -73,8 +73,8 @@ def test_inputs_and_products_are_averaged_in_every_zone(field, zones) -> None:
 @pytest.mark.parametrize(
     ("zones", "message"),
     [
-        ({}, "zones must be given by name"),
-        ([(0.0, 0.01)], "zones must be given by name"),
+        ({}, "or zones by name, such as"),
+        ([(0.0, 0.01)], "or zones by name, such as"),
         ({"an ode": (0.0, 0.01)}, "name must be a word"),
         ({"a": (0.0, 0.015), "b": (0.01, 0.02)}, "without overlap.*after one that ends at 0.015"),
         ({"b": (0.01, 0.02), "a": (0.0, 0.01)}, "must follow each other"),

@@ -79,7 +79,7 @@ def test_groups_of_steps_are_joined_along_time(
         for k in (*range(5, N), *range(5)):  # in any order
             layout(file, k)
     found = ep.inspect_file(tmp_path / "a.h5")
-    assert f"{N} groups joined along time, steps 0 to" in found.words
+    assert f"{N} groups joined along time, steps 0 to" in found.source.words
     check(ep.open_field(tmp_path / "a.h5", plasma=True))
 
 
@@ -94,7 +94,7 @@ def test_particles_whose_number_changes_are_left_out_and_said(tmp_path: Path) ->
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for k in range(N):
             openpmd(file, k)
-    words = ep.inspect_file(tmp_path / "a.h5").words
+    words = ep.inspect_file(tmp_path / "a.h5").source.words
     assert "left out, not in every step or of changing size: data/particles/e/position/x" in words
 
 
@@ -166,7 +166,7 @@ def test_groups_of_kinds_are_no_steps(tmp_path: Path, names: tuple[str, ...]) ->
         for name in names:
             file[f"{name}/current"] = N_I[:, 0]
     found = ep.inspect_file(tmp_path / "a.h5")
-    assert len(found.found.held) == len(names)
+    assert len(found.held) == len(names)
 
 
 def test_numbered_groups_beside_times_are_no_steps(tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ def test_durations_are_times(tmp_path: Path) -> None:
 def test_dates_that_may_be_read_in_two_ways_are_left_out(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("date,x\n01/02/2024,1\n02/02/2024,3\n03/02/2024,2\n")
     found = ep.inspect_file(tmp_path / "a.csv")
-    assert "left out: date; dates are read if written as 2024-01-31" in found.words
+    assert "left out: date; dates are read if written as 2024-01-31" in found.source.words
     assert list(found.variables) == ["x"]
 
 

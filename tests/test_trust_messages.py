@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import ep2sindy
-from ep2sindy.data.conversion import conversion, same_unit
+from ep2sindy.data.quantities import conversion, same_unit
 from ep2sindy.library.units import Clock, registry, unit_product
 
 PACKAGE = Path(ep2sindy.__file__).parent

@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 import xarray as xr
 from matplotlib.figure import Figure
-from omegaconf import OmegaConf
 from programs import composed
 
 import ep2sindy as ep
@@ -41,7 +40,7 @@ class Inner:
 @pytest.mark.parametrize("name", [*PATHS, *MARKUP])
 def test_what_a_config_names_is_called_by_words(name: str) -> None:
     with pytest.raises(ValueError, match="models must be named by words, for files are named so"):
-        value_of(Mapping[str, Inner], OmegaConf.create({name: {"width": 1.0}}), "models")
+        value_of(Mapping[str, Inner], {name: {"width": 1.0}}, "models")
 
 
 @pytest.mark.parametrize("name", [*PATHS, *MARKUP, "1x", "a b"])

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 import ep2sindy as ep
 from ep2sindy.app import program
 from ep2sindy.app.inspection import commands, config_text
-from ep2sindy.data.inspection import inspect_file
+from ep2sindy.data.open import inspect_file
 from ep2sindy.report.document import Section, Table, Text
 from ep2sindy.report.screen import Screen
 from ep2sindy.runtime import progress

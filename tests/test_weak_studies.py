@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from omegaconf import OmegaConf
 
 from ep2sindy.app.schema import Configured
 from ep2sindy.data.trajectory import Trajectory
@@ -56,7 +55,7 @@ def coefficient_errors(
     seed: int = 0,
 ) -> pd.DataFrame:
     forms = {"formulation": Differential(), "automatic": AUTOMATIC, "parallel": Serial()}
-    form = Configured(OmegaConf.create({"_target_": "ep2sindy.Weak"}), "boxes")
+    form = Configured({"_target_": "ep2sindy.Weak"}, "boxes")
     study = weak_windows.Study(
         system=system, rate_Hz=system.rate_Hz, boxes=form, n_windows=[1], n_points=[2],
         noises=noises, n_realizations=n_realizations, **forms,

@@ -8,6 +8,7 @@ Only Hydra is imported here: a command must not wait for the numerics.
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
+from ep2sindy.app.targets import nodes_of, target_of
 from ep2sindy.runtime.screen import listed, near_words
 
 JOBS = "jobs"  # folder of a sweep with a record of each job
@@ -116,8 +118,12 @@ class Loader(ConfigLoaderImpl):
         def compose(overrides: list[str]) -> DictConfig:
             return ConfigLoaderImpl.load_configuration(self, config_name, overrides, *how, **more)
 
-        with explained(overrides, compose):
+        try:
             found = compose(overrides)
+        except MissingConfigException as error:
+            raise ValueError(_no_choice(error)) from error
+        except ConfigCompositionException as error:
+            raise ValueError(_not_set(error, overrides, compose)) from error
         for name, value in FIXED.items():
             if (came := OmegaConf.to_container(found.hydra[name], resolve=True)) != value:
                 raise ValueError(
@@ -151,20 +157,6 @@ def our_loader() -> Iterator[None]:
         yield
     finally:
         program.ConfigLoaderImpl = ConfigLoaderImpl  # type: ignore[misc]
-
-
-@contextmanager
-def explained(overrides: Sequence[str], compose: Compose) -> Iterator[None]:
-    """Turn errors of Hydra into a ValueError that names the nearest key, choice or form.
-
-    overrides: that are being composed. compose: makes a config of some of them.
-    """
-    try:
-        yield
-    except MissingConfigException as error:
-        raise ValueError(_no_choice(error)) from error
-    except ConfigCompositionException as error:
-        raise ValueError(_not_set(error, overrides, compose)) from error
 
 
 def _no_choice(error: MissingConfigException) -> str:
@@ -236,38 +228,25 @@ def _no_key(key: str, config: DictConfig) -> str:
     if not isinstance(node, DictConfig):
         return f"unknown key {key!r}: {place} is {node!r}, and has no keys"
     names = sorted(set(map(str, node)) - {"_target_", "hydra"})
-    taken = _arguments(node, place)
+    arguments: Any = {}
+    if "_target_" in node:  # what the target takes, though the config leaves it to its default
+        arguments = inspect.signature(target_of(node, place)).parameters
+    taken = set(arguments)
     prefix = f"{place}." if place else ""
     if name in taken:
         return f"{key!r} is left to its default here: a plus sets it, +{key}=VALUE"
     near = near_words(name, {*names, *taken}, form=f"{prefix}{{}}")
     if not near:
-        elsewhere = list(_places(config))
-        alike = get_close_matches(name, {place.rpartition(".")[2] for place in elsewhere}, n=1)
-        found = [place for place in elsewhere if place.rpartition(".")[2] in alike]
+        plain: Any = OmegaConf.to_container(config)
+        elsewhere = [each for each, _ in nodes_of(plain | {"hydra": None}) if "[" not in each]
+        lasts = {each: each.rpartition(".")[2] for each in sorted(elsewhere, key=_depth)}
+        alike = get_close_matches(name, {*lasts.values()}, n=1)
+        found = [each for each, last in lasts.items() if last in alike]
         near = f"; near it is {' or '.join(found)}" if found else ""
     whose = f"{place} has" if place else "there are"
     free = "" if taken or not place else f"; a new one, where any may stand, takes a plus: +{key}"
     return f"unknown key {key!r}{near}; {whose} {listed(sorted({*names, *taken}))}{free}"
 
 
-def _arguments(node: DictConfig, place: str) -> set[str]:
-    """Names of the arguments that a node's target takes; none for a node without one."""
-    if "_target_" not in node:
-        return set()
-    import inspect
-
-    from ep2sindy.app.targets import target_of
-
-    return set(inspect.signature(target_of(node, place)).parameters)
-
-
-def _places(config: DictConfig) -> Iterator[str]:
-    """Dotted places of all keys of a config, those of lists left out."""
-    plain: Any = OmegaConf.to_container(config, resolve=False)
-    waiting = [(str(key), value) for key, value in plain.items() if key != "hydra"]
-    while waiting:
-        place, value = waiting.pop(0)
-        yield place
-        if isinstance(value, dict):
-            waiting += [(f"{place}.{key}", inner) for key, inner in value.items()]
+def _depth(place: str) -> int:
+    return place.count(".")

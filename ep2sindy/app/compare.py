@@ -7,26 +7,25 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from math import isnan, nan
 from pathlib import Path
 from string import ascii_uppercase
 from typing import Any
 
 import pandas as pd
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from ep2sindy.app.arguments import JOBS
+from ep2sindy.data.readers.source import damage_named
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import by_place
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text, cell_text
 from ep2sindy.report.page import TEMPLATES, page_html
-from ep2sindy.report.picture import Drawn, read_png
+from ep2sindy.report.picture import read_png
 from ep2sindy.report.results import in_words, value_text
 from ep2sindy.report.screen import Screen
 from ep2sindy.runtime.files import read_json, write_text
@@ -40,12 +39,6 @@ NOTE = (
     "Apart: the 95 % intervals of two runs have no value in common; overlap: all have. A dash: "
     "the term is not in the model, or its interval is not known."
 )
-
-# Entries of the files that a page needs, with their types.
-SUMMARY = {"experiment": str, "seed": int, "headline": dict, "warnings": list, "data": dict}
-PROVENANCE = {"commit": str, "versions": dict}
-REQUIRED = {"experiment", "seed"}
-JOB = {"folder": str, "error": str}
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -64,8 +57,14 @@ def main(arguments: Sequence[str]) -> None:
     runs = [read_run(folder, k) for k, folder in enumerate(folders)]
     page = Path(given.page)
     template = Path(given.template) if given.template else TEMPLATES / "page.html"
-    sections = compare_runs(runs, beside=page.parent)
-    html = page_html("Runs compared", sections, figures_of(runs), template=template)
+    names = sorted(set.intersection(*({*run.figures} for run in runs)))
+    figures = {
+        f"{run.label}-{name}": read_png(run.figures[name], f"Run {run.label}.")
+        for name in names
+        for run in runs
+    }
+    sections = compare_runs(runs, names, beside=page.parent)
+    html = page_html("Runs compared", sections, figures, template=template)
     Screen().show(sections)
     write_text(page, html)
     say(str(page))
@@ -73,25 +72,22 @@ def main(arguments: Sequence[str]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class ReadRun:
-    """The contents of a run folder. settings: by dotted place. label: the run's name in tables."""
+    """The contents of a run folder.
+
+    label: the run's name in tables. about: experiment, seed and number of warnings. clock: the time
+    unit in which it is shown. headline: the headline figures; null in the file is NaN. settings: by
+    dotted place. figures: their files.
+    """
 
     folder: Path
     label: str
-    summary: dict[str, Any]
+    about: dict[str, str]
+    clock: Clock
+    headline: dict[str, float]
     provenance: dict[str, Any]
     settings: dict[str, Any]
     models: dict[str, SparseModel]
-
-    @property
-    def clock(self) -> Clock:
-        """The time unit in which the run is shown."""
-        return Clock.of(self.summary.get("data", {}).get("time_unit", "s"))
-
-    @property
-    def headline(self) -> dict[str, float]:
-        """The headline figures; null in the file becomes NaN."""
-        found = self.summary.get("headline", {})
-        return {name: float("nan") if v is None else float(v) for name, v in found.items()}
+    figures: dict[str, Path]
 
 
 def folders_of(path: Path) -> list[Path]:
@@ -99,11 +95,13 @@ def folders_of(path: Path) -> list[Path]:
     records = sorted((path / JOBS).glob("[!.]*.json"), key=lambda each: (len(each.stem), each.stem))
     found = []
     for place in records:
-        record = _checked(place, JOB)
+        with damage_named(place):
+            record = {"error": "", "folder": "", **read_json(place.read_text("utf-8"))}
+            folder = Path(record["folder"])
         if record["error"] or not record["folder"]:
             say(f"left out: job {place.stem} failed: {record['error']}")
         else:
-            found.append(Path(record["folder"]))
+            found.append(folder)
     return found if records else [path]
 
 
@@ -117,48 +115,32 @@ def read_run(folder: Path, number: int) -> ReadRun:
     if not (folder / "summary.json").is_file():
         said = "it ended early, see its run.log" if (folder / "run.log").is_file() else "no run"
         raise ValueError(f"{folder} has no summary.json: {said}; {_nearby(folder)}")
-    paths = sorted((folder / "models").glob("[!.]*.json"))
+    with damage_named(folder / "summary.json"):
+        summary = read_json((folder / "summary.json").read_text("utf-8"))
+        about = {"experiment": str(summary["experiment"]), "seed": str(summary["seed"])}
+        about["warnings"] = str(len(summary.get("warnings", [])))
+        headline = {
+            n: nan if v is None else float(v) for n, v in summary.get("headline", {}).items()
+        }
+        clock = Clock.of(summary.get("data", {}).get("time_unit", "s"))
+    with damage_named(folder / "provenance.json"):
+        told = read_json((folder / "provenance.json").read_text("utf-8"))
+        provenance = {"commit": "-", "versions": {}, **told}
+    with damage_named(folder / "config.yaml"):
+        config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+        placed = [by_place(str(key), each) for key, each in config.items() if key != "output"]
+    models = sorted((folder / "models").glob("[!.]*.json"))
     return ReadRun(
         folder=folder,
         label=ascii_uppercase[number % 26] * (1 + number // 26),
-        summary=_checked(folder / "summary.json", SUMMARY),
-        provenance=_checked(folder / "provenance.json", PROVENANCE),
-        settings=_read_settings(folder / "config.yaml"),
-        models={path.stem: SparseModel.load(path) for path in paths},
+        about=about,
+        clock=clock,
+        headline=headline,
+        provenance=provenance,
+        settings={place: value for each in placed for place, value in each.items()},
+        models={path.stem: SparseModel.load(path) for path in models},
+        figures={path.stem: path for path in (folder / "figures").glob("[!.]*.png")},
     )
-
-
-def _checked(path: Path, kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """A JSON object, checked for the keys and types that a page needs."""
-    with _damage_named(path):
-        found = read_json(path.read_text("utf-8"))
-        if not isinstance(found, dict) or not REQUIRED & {*kinds} <= {*found}:
-            raise ValueError(f"an object with {sorted(REQUIRED & {*kinds})} must stand there")
-        for name, kind in kinds.items():
-            if not isinstance(found.setdefault(name, kind()), kind):
-                raise ValueError(f"{name} cannot be {found[name]!r:.80}")
-        figures = found.get("headline", {})
-        if not all(isinstance(each, int | float | None) for each in figures.values()):
-            raise ValueError(f"headline must be of numbers: {figures!r:.80} came")
-        Clock.of(found.get("data", {}).get("time_unit", "s"))
-    return found
-
-
-def _read_settings(path: Path) -> dict[str, Any]:
-    """The run's settings by dotted place."""
-    with _damage_named(path):
-        config: Any = OmegaConf.to_container(OmegaConf.load(path))
-        if not isinstance(config, dict):
-            raise ValueError("a mapping must stand there")
-        return {k: v for key, each in config.items() for k, v in by_place(str(key), each).items()}
-
-
-@contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, ValueError, RecursionError, OmegaConfBaseException, YAMLError) as error:
-        raise ValueError(f"{path} cannot be read ({error}): the run's folder is damaged") from error
 
 
 def _nearby(folder: Path) -> str:
@@ -170,73 +152,54 @@ def _nearby(folder: Path) -> str:
     return "a run's folder is the one that it prints last"
 
 
-def link_to(run: ReadRun, beside: Path) -> str:
-    """Link to the run's page, relative to this folder."""
-    return os.path.relpath(run.folder / "report.html", beside)
-
-
-def compare_runs(runs: Sequence[ReadRun], *, beside: Path) -> list[Section]:
+def compare_runs(runs: Sequence[ReadRun], figures: Sequence[str], *, beside: Path) -> list[Section]:
     """Sections on runs, differing settings, headline figures, equations and figures.
 
-    beside: folder of the page.
+    figures: names of those that all runs have. beside: folder of the page.
     """
-    return [
-        Section("Runs", [_runs(runs, beside), *_versions(runs)]),
-        Section("Settings that differ", [_differing(_settings(runs), "setting", "the same")]),
-        Section("Headline figures", [_headlines(runs)]),
-        *_models(runs),
-        *_pictures(runs),
-    ]
-
-
-def _runs(runs: Sequence[ReadRun], beside: Path) -> Table:
     rows = [
         {
             "run": run.label,
-            "experiment": run.summary["experiment"],
-            "folder": Link(str(run.folder), link_to(run, beside)),
-            "seed": str(run.summary["seed"]),
-            "code": str(run.provenance.get("commit", "-"))[:12],
-            "warnings": str(len(run.summary.get("warnings", []))),
+            "experiment": run.about["experiment"],
+            "folder": Link(str(run.folder), os.path.relpath(run.folder / "report.html", beside)),
+            "seed": run.about["seed"],
+            "code": str(run.provenance["commit"])[:12],
+            "warnings": run.about["warnings"],
         }
         for run in runs
     ]
-    return Table(pd.DataFrame(rows))
+    versions = _differing({run.label: run.provenance["versions"] for run in runs}, "package")
+    settings = _differing({run.label: run.settings for run in runs}, "setting")
+    pictures = {name: [Picture(f"{run.label}-{name}") for run in runs] for name in figures}
+    return [
+        Section("Runs", [Table(pd.DataFrame(rows)), *versions]),
+        Section("Settings that differ", settings or [Text("None: they are the same.")]),
+        Section("Headline figures", [_headlines(runs)]),
+        *_models(runs),
+        *(Section(f"Figure: {name.replace('_', ' ')}", shown) for name, shown in pictures.items()),
+    ]
 
 
-def _versions(runs: Sequence[ReadRun]) -> list[Block]:
-    """Versions of packages, if they differ."""
-    versions = {run.label: run.provenance.get("versions", {}) for run in runs}
-    table = _differing(versions, "package", "")
-    return [table] if isinstance(table, Table) else []
-
-
-def _settings(runs: Sequence[ReadRun]) -> dict[str, Mapping[str, Any]]:
-    return {run.label: {k: v for k, v in run.settings.items() if k != "output"} for run in runs}
-
-
-def _differing(values: Mapping[str, Mapping[str, Any]], heading: str, none: str) -> Block:
-    """One row per name whose value differs between runs; a sentence if none differs."""
-    names = dict.fromkeys(name for each in values.values() for name in each)
+def _differing(values: Mapping[str, Mapping[str, Any]], heading: str) -> list[Block]:
+    """A table with one row per name whose value differs between runs; none if no value does."""
     rows = []
-    for name in names:
+    for name in dict.fromkeys(name for each in values.values() for name in each):
         row = {label: cell_text(each.get(name)) for label, each in values.items()}
         if len(set(row.values())) > 1:
             rows.append({heading: name, **row})
-    return Table(pd.DataFrame(rows)) if rows else Text(f"None: they are {none}." if none else "")
+    return [Table(pd.DataFrame(rows))] if rows else []
 
 
 def _headlines(runs: Sequence[ReadRun]) -> Table:
     """Headline figures by name; for two runs also the second's difference from the first."""
-    names = dict.fromkeys(name for run in runs for name in run.headline)
     rows = []
-    for name in names:
-        found = [run.headline.get(name, float("nan")) for run in runs]
-        row: dict[str, Any] = {"figure": in_words(name)}
-        texts = [value_text(name, v, run.clock) for run, v in zip(runs, found, strict=True)]
-        row |= dict(zip((run.label for run in runs), texts, strict=True))
-        if any(value == value for value in found):
-            rows.append(row | ({"change": _change(*found)} if len(found) == 2 else {}))
+    for name in dict.fromkeys(name for run in runs for name in run.headline):
+        found = [run.headline.get(name, nan) for run in runs]
+        row = {"figure": in_words(name)}
+        row |= {r.label: value_text(name, v, r.clock) for r, v in zip(runs, found, strict=True)}
+        row |= {"change": _change(*found)} if len(found) == 2 else {}
+        if not all(map(isnan, found)):
+            rows.append(row)
     return Table(pd.DataFrame(rows))
 
 
@@ -276,24 +239,19 @@ def _coefficients(models: Mapping[str, SparseModel], clock: Clock) -> pd.DataFra
     rows = []
     for state in dict.fromkeys(s for model in models.values() for s in model.states):
         own = {n: m.terms(state) if state in m.states else {} for n, m in models.items()}
-        ends = {n: _intervals(m, state) for n, m in models.items()}
+        ends: dict[str, Any] = {
+            n: {} if m.covariance is None or state not in m.states else m.intervals(state)
+            for n, m in models.items()
+        }
         for term in dict.fromkeys(t for terms in own.values() for t in terms):
             row = {"equation": f"{state}'", "term": term.replace("*", " ")}
             for label in models:
                 value, known = own[label].get(term), ends[label].get(term)
-                text = "-" if value is None else f"{clock.seconds * value:.4g}"
-                reach = (
-                    "" if known is None else f" ±{0.5 * clock.seconds * (known[1] - known[0]):.2g}"
-                )
-                row[label] = text + reach
+                row[label] = "-" if value is None else f"{clock.seconds * value:.4g}"
+                if known is not None:
+                    row[label] += f" ±{0.5 * clock.seconds * (known[1] - known[0]):.2g}"
             rows.append(row | {"intervals": _overlap([ends[n].get(term) for n in models])})
     return pd.DataFrame(rows)
-
-
-def _intervals(model: SparseModel, state: str) -> dict[str, tuple[float, float]]:
-    if model.covariance is None or state not in model.states:
-        return {}
-    return model.intervals(state)
 
 
 def _overlap(ends: Sequence[tuple[float, float] | None]) -> str:
@@ -302,25 +260,3 @@ def _overlap(ends: Sequence[tuple[float, float] | None]) -> str:
         return "-"
     common = all(a[0] <= b[1] and b[0] <= a[1] for a, b in combinations(known, 2))
     return "overlap" if common else "apart"
-
-
-def _pictures(runs: Sequence[ReadRun]) -> list[Section]:
-    """Figures that all runs have, each under its name."""
-    return [
-        Section(f"Figure: {name.replace('_', ' ')}", [Picture(f"{r.label}-{name}") for r in runs])
-        for name in _shared_figures(runs)
-    ]
-
-
-def figures_of(runs: Sequence[ReadRun]) -> dict[str, Drawn]:
-    """Figures by name, from the runs' folders."""
-    return {
-        f"{run.label}-{name}": read_png(run.folder / "figures" / f"{name}.png", f"Run {run.label}.")
-        for name in _shared_figures(runs)
-        for run in runs
-    }
-
-
-def _shared_figures(runs: Sequence[ReadRun]) -> list[str]:
-    names = [{path.stem for path in (r.folder / "figures").glob("[!.]*.png")} for r in runs]
-    return sorted(set.intersection(*names))

@@ -6,15 +6,16 @@ import argparse
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from ep2sindy.data.conversion import KNOWN_UNITS
-from ep2sindy.data.inspection import Inspection, compare_files, inspect_file, unlike
+from ep2sindy.data.inspection import STEP, Inspection, compare_files, unlike
 from ep2sindy.data.mapping import Variable
-from ep2sindy.data.recognition import STEP
+from ep2sindy.data.open import inspect_file
+from ep2sindy.data.quantities import COORDINATE_UNITS, KNOWN_UNITS
 from ep2sindy.data.steps import records_of
 from ep2sindy.operating.file_names import FilePattern, propose_pattern
 from ep2sindy.operating.records import point_label
@@ -67,28 +68,25 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     say("\n".join(found[0].lines(experiments(found[0]))) + "\n")
     if len(found) > 1:
         say("\n".join(compare_files(found[0], found[1:])) + "\n")
-    pattern = None
-    if len(paths) > 1:
-        pattern = propose_pattern([path for path in paths if isinstance(path, str)])
+    names = [path for path in paths if isinstance(path, str)]
+    pattern = propose_pattern(names) if len(paths) > 1 else None
     if pattern:
         say("\n".join(point_lines(pattern)))
-    name = given.write or _word_for(found[0].path)
-    differing = unlike(found) if len(found) > 1 else ""
-    if given.write is None and differing:
+    name = re.sub(r"\W+", "_", given.write or _word_for(found[0].source.path)).strip("_")
+    differing = unlike(found)
+    if given.write is not None:
+        if differing:
+            raise ValueError(f"no mapping is written: {differing}")
+        path = own_config(name, conf)
+        write_text(path, config_text(found, paths))
+        say(f"written: {path}")
+        say_next(commands(found, name, pattern))
+    elif differing:
         say(differing)
-        return
-    if given.write is None:
+    else:
         more = ["data.plasma=true"] if given.plasma else []
         say_next(commands(found, "recognised", pattern, path=_hydra(given.path), more=more))
         say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
-        return
-    if differing:
-        raise ValueError(f"no mapping is written: {differing}")
-    name = re.sub(r"\W+", "_", name).strip("_")
-    path = own_config(name, conf)
-    write_text(path, config_text(found, paths))
-    say(f"written: {path}")
-    say_next(commands(found, name, pattern))
 
 
 def say_next(commands: Sequence[str]) -> None:
@@ -99,11 +97,10 @@ def say_next(commands: Sequence[str]) -> None:
 def point_lines(pattern: FilePattern) -> list[str]:
     """The operating points that the names of files tell, and their pattern."""
     points, _ = pattern.points()
-    rows = [f"  {point_label(values)}: {file}" for file, values in points.items()]
     return [
         f"{len(points)} operating points, if the numbers in the names are such "
         f"({', '.join(pattern.names)}; V_D_V in V, mdot_mg_s in mg/s):",
-        *map(in_line, rows),
+        *(in_line(f"  {point_label(values)}: {file}") for file, values in points.items()),
         in_line(f"their pattern: points.files={pattern.text}"),
         "",
     ]
@@ -124,11 +121,11 @@ def commands(
     names no file, and in which `more` and units are given too.
     """
     first = found[0]
-    units = ",".join(f"{name}:UNIT" for name in first.found.no_unit)
-    step = [STEP] * bool(first.found.no_time)
+    units = ",".join(f"{name}:UNIT" for name in first.no_unit)
+    step = [STEP] * bool(first.no_time)
     if group == "recognised":
         step += [*more, *[f"data.units={{{units}}}"] * bool(units)]
-    lines = []
+    lines: list[list[str]] = []
     if pattern is not None:
         data = [f"data={group}", f"points.files={pattern.text}", *step]
         lines = point_commands(first, data, pattern.names, n_points=len(found))
@@ -178,18 +175,12 @@ def record_commands(found: Inspection, data: list[str], *, are_several: bool) ->
 
 def point_command(found: Inspection, path: str) -> list[str]:
     """The command that studies a point in the middle of arrays over axes that are not z and r."""
-    time = found.found.axes.get("time")
-    over = [
-        each
-        for each in found.found.held
-        if len(each.shape) > 1 and each.shape[0] == found.found.n_samples and not each.problem
-    ]
+    time, n = found.time, found.n_samples
+    over = [e for e in found.held if len(e.shape) > 1 and e.shape[0] == n and not e.problem]
     if time is None or len(over) < 2:
         return []
-    named = []
-    for each in over:
-        place = ", ".join([":", *(str(n // 2) for n in each.shape[1:])])
-        named.append(f'{each.name}:{{name:"{each.name}[{place}]",unit:"{each.unit or 1}"}}')
+    places = {e.name: ", ".join([":", *(str(n // 2) for n in e.shape[1:])]) for e in over}
+    named = [f'{e.name}:{{name:"{e.name}[{places[e.name]}]",unit:"{e.unit or 1}"}}' for e in over]
     return [
         "+exp=discover", "data=file", f"data.path={path}", f"data.time.name={time.name}",
         f"data.time.unit={time.unit}", "data.z.name=null", "~data.variables",
@@ -232,7 +223,7 @@ def experiments(found: Inspection) -> list[str]:
     for name, needed in NEEDS.items():
         lacking = found.lacking(needed) or (() if found.signals else ("a signal",))
         groups.setdefault(lacking, []).append(f"+exp={name}")
-    ready = "all but what is asked is there" if found.found.asked else "all there"
+    ready = "all but what is asked is there" if found.asked else "all there"
     return [
         f"{'missing ' + ', '.join(lacking) if lacking else ready} for {', '.join(names)}"
         for lacking, names in groups.items()
@@ -252,25 +243,25 @@ def own_config(name: str, conf: Path) -> Path:
 def config_text(found: Sequence[Inspection], paths: Sequence[str | list[str]]) -> str:
     """The config of the data group, with a comment on every unit that the file does not name."""
     first = found[0]
-    variables = {n: Variable(None, u) for n, u in {**KNOWN_UNITS, "T_e_eV": "eV"}.items()}
-    variables |= first.variables
+    variables = {n: Variable(None, u) for n, u in KNOWN_UNITS.items()} | {**first.variables}
+
+    def line(name: str, variable: Variable) -> str:
+        doubt = "  # the file names no unit: put it right" if name in first.no_unit else ""
+        return f"{_flow(name)}: {_flow(asdict(variable))}{doubt}"
+
+    more = " ..." * (len(paths) > 1)
     lines = [
-        f"# {in_line(str(first.path))}{' ...' * (len(paths) > 1)}, as `ep2sindy inspect` found it.",
+        f"# {in_line(str(first.source.path))}{more}, as `ep2sindy inspect` found it.",
         "# A name is the one in the file; null: the file has it not. Correct what is wrong.",
         "_target_: ep2sindy.open_field",
         f"path: {_flow(paths[0] if len(paths) == 1 else list(paths))}",
         "",
         "variables:",
-        *(f"  {_flow(n)}: {_flow(_node(v))}{_word(first, n)}" for n, v in variables.items()),
+        *(f"  {line(n, variable)}" for n, variable in variables.items()),
         "",
-    ]
-    units = {"time": "s", "z": "m", "r": "m"}
-    for axis, unit in units.items():
-        variable = getattr(first, axis) or Variable(None, unit)
-        lines.append(f"{axis}: {_flow(_node(variable))}{_word(first, axis)}")
-    steps = "null" if first.dt_s is None else repr(first.dt_s)
-    lines += [
-        f"dt_s: {steps}  # time step in s where the file has no time; taken instead of it",
+        *(line(n, first.axes.get(n, Variable(None, u))) for n, u in COORDINATE_UNITS.items()),
+        f"dt_s: {_flow(first.dt_s)}"
+        "  # time step in s where the file has no time; taken instead of it",
         'mask: {name: null, unit: "1", dims: null}  # nonzero in the plasma',
         "channel_m: null  # length of the channel from z = 0; null: as the file says",
         "chunks: null  # such as {time: 1000}, for steps on what exceeds memory (needs dask)",
@@ -278,16 +269,11 @@ def config_text(found: Sequence[Inspection], paths: Sequence[str | list[str]]) -
     return "\n".join(lines) + "\n"
 
 
-def _node(variable: Variable) -> dict[str, Any]:
-    dims = None if variable.dims is None else list(variable.dims)
-    return {"name": variable.name, "unit": variable.unit, "dims": dims}
-
-
 def _flow(value: Any) -> str:
     """A value as YAML on one line that Hydra reads back unchanged; ambiguous text is quoted."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_flow, value)) + "]"
     if not isinstance(value, str):
         return "null" if value is None else repr(value)
@@ -296,7 +282,3 @@ def _flow(value: Any) -> str:
         return yaml.safe_dump(text, default_style='"', width=float("inf")).strip()
     is_plain = re.fullmatch(r"[\w./^-]+", text) and yaml.safe_load(text) == text
     return text if is_plain else "'" + text.replace("'", "''") + "'"
-
-
-def _word(found: Inspection, name: str) -> str:
-    return "  # the file names no unit: put it right" if name in found.found.no_unit else ""

@@ -155,47 +155,35 @@ def prepare_arguments(conf: Path) -> None:
 
 
 def run_job(config: DictConfig, conf: Path) -> list[str]:
-    """Run one job; returns why it ended early, if it did. A sweep notes that and goes on."""
-    with note_job() as record:
-        try:
-            if config.experiment is None:
-                raise _no_experiment(HydraConfig.get().overrides.task, conf)
-            say(first_word(config))  # the imports below take seconds
-            from ep2sindy.app.runner import run_config
+    """Run one job; returns why it ended early, if it did. A sweep notes that and goes on.
 
-            record["folder"] = str(run_config(config))
-        except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
-            record["error"] = str(error)
-    return [record["error"]] if "error" in record else []
-
-
-@contextmanager
-def note_job() -> Iterator[dict[str, Any]]:
-    """In a sweep, report a job's begin, and write its record for `compare` when it ends.
-
-    Yields the record, which gets the run's `folder` or the `error` that ended it.
+    In a sweep, its record for `compare` is written when it ends, in whichever way.
     """
     run = HydraConfig.get()
+    job = f"job {run.job.num}" if run.mode == RunMode.MULTIRUN else ""
     record: dict[str, Any] = {"overrides": list(run.overrides.task)}
-    if run.mode != RunMode.MULTIRUN:
-        yield record
-        return
-    say(f"job {run.job.num}: {' '.join(record['overrides'])}")
+    if job:
+        say(f"{job}: {' '.join(record['overrides'])}")
     try:
-        yield record
+        if config.experiment is None:
+            raise _no_experiment(record["overrides"], conf)
+        folder = Path(str(config.get("output")), str(config.experiment))
+        study = config.get("study")  # the imports below take seconds
+        say(f"{config.experiment}: loading study={study}; writes below {folder}/")
+        from ep2sindy.app.runner import run_config
+
+        record["folder"] = str(run_config(config))
+    except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
+        record["error"] = str(error)
     except BaseException as error:
         record["error"] = str(error) or type(error).__name__
         raise
     finally:
-        if "error" in record:
-            say(f"job {run.job.num} failed: {record['error']}")
-        write_json(Path(run.sweep.dir) / JOBS / f"{run.job.num}.json", record)
-
-
-def first_word(config: DictConfig) -> str:
-    """First line of a run's output: what it runs, and its output folder."""
-    folder = Path(str(config.get("output")), str(config.experiment))
-    return f"{config.experiment}: loading study={config.get('study')}; writes below {folder}/"
+        if job and "error" in record:
+            say(f"{job} failed: {record['error']}")
+        if job:
+            write_json(Path(run.sweep.dir) / JOBS / f"{run.job.num}.json", record)
+    return [record["error"]] if "error" in record else []
 
 
 def _no_experiment(typed: Sequence[str], conf: Path) -> ValueError:

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
 from traceback import format_exc
 from typing import Any
 
@@ -36,7 +35,7 @@ def run_config(config: DictConfig) -> Path:
     check_common(config)
     formats = formats_of(config)
     with Bars().stage(3, "step", "loading") as advance:
-        check_targets(config)
+        check_targets(OmegaConf.to_container(config))
         advance(1)
         kind = study_class(config.get("study"))
         advance(1)
@@ -52,8 +51,8 @@ def run_config(config: DictConfig) -> Path:
 def study_class(name: object) -> type:
     """The class `Study` of a module of `ep2sindy.studies`, or of a user's module by dotted name.
 
-    If the name is a folder, its module `study` holds the class. A user's module must lie below the
-    current folder.
+    A user's module must lie below the current folder; if it is a folder, its module `study` holds
+    the class.
     """
     text = str(name)
     inside = "." not in text or text.startswith("ep2sindy.")
@@ -77,13 +76,9 @@ def study_class(name: object) -> type:
 
 def list_studies() -> list[str]:
     """Modules of `studies` that define a study; they are read as text, as imports take seconds."""
-    folder = Path(ep2sindy.studies.__file__ or "").parent
-    found = []
-    for module in iter_modules([str(folder)]):
-        path = folder / (f"{module.name}/study.py" if module.ispkg else f"{module.name}.py")
-        if path.is_file() and re.search(r"^class Study\b", path.read_text("utf-8"), re.M):
-            found.append(module.name)
-    return found
+    (folder,) = ep2sindy.studies.__path__
+    texts = {path.stem: path.read_text("utf-8") for path in sorted(Path(folder).glob("*.py"))}
+    return [name for name, text in texts.items() if re.search(r"^class Study\b", text, re.M)]
 
 
 def check_common(config: DictConfig) -> None:
@@ -108,8 +103,8 @@ def formats_of(config: DictConfig) -> list[str]:
 
     Raises ValueError for an invalid list.
     """
-    given: Any = OmegaConf.select(config, "figures.formats", default=["png"])
-    formats = OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
+    figures: Any = OmegaConf.to_container(config.get("figures") or OmegaConf.create({}))
+    formats = figures.get("formats", ["png"])
     if not isinstance(formats, list) or "png" not in formats or not {*formats} <= {*FORMATS}:
         raise ValueError(
             f"figures.formats must be a list of {', '.join(FORMATS)} that has png, which pages "

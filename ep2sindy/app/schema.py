@@ -1,7 +1,7 @@
 """Build a study from a config; the study's signature is the schema of its config.
 
-The module holds the only type checker of configs, for fields of studies and arguments of
-`_target_`s.
+A config is made plain once: mappings, lists and values, with interpolations resolved. The module
+holds the only type checker of configs, for fields of studies and arguments of `_target_`s.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import partial
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy._stubs import place_of
-from ep2sindy.app.targets import target_of
+from ep2sindy.app.targets import nodes_of, target_of
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.recipe import method_of
 from ep2sindy.runtime.screen import joined, near_words
@@ -50,7 +50,8 @@ def study_of(study: type, config: DictConfig) -> Any:
     Raises ValueError for a key that the study does not take, a missing key, or a value whose type
     differs from the study's.
     """
-    known = {*COMMON, *GROUPS, *keys_of(study)}
+    used = keys_of(study)
+    known = {*COMMON, *GROUPS, *used}
     unknown = set(map(str, config)) - known
     if unknown:
         hint = ""
@@ -59,7 +60,18 @@ def study_of(study: type, config: DictConfig) -> Any:
         near = "".join(near_words(name, known) for name in sorted(unknown))
         raise ValueError(f"unknown keys {sorted(unknown)}{near}; there are {sorted(known)}{hint}")
     _open_by_points(config)
-    return _fill(study, _without_formats(config, has_own="figures" in keys_of(study)))
+    typed: Any = OmegaConf.to_container(config)
+    for place, value in nodes_of({name: typed[name] for name in typed if name in used}):
+        if value == "???":
+            raise ValueError(f"{place} must be set: it is still '???'")
+    hints = hints_of(study)
+    needed = [name for name in hints if is_required(study, name)]
+    return _fill(study, hints, needed, _without_formats(plain(config), has_own="figures" in used))
+
+
+def plain(config: Any) -> Any:
+    """A config as mappings, lists and values, with interpolations resolved."""
+    return OmegaConf.to_container(config, resolve=True)
 
 
 def _open_by_points(config: DictConfig) -> None:
@@ -69,42 +81,36 @@ def _open_by_points(config: DictConfig) -> None:
         config.data.path = None
 
 
-def _without_formats(config: DictConfig, *, has_own: bool) -> DictConfig:
-    """The config without `figures.formats`, the list of file formats, which the runner uses."""
-    own = {name: v for name, v in (config.get("figures") or {}).items() if name != "formats"}
+def _without_formats(settings: dict[str, Any], *, has_own: bool) -> dict[str, Any]:
+    """Settings without `figures.formats`, the list of file formats, which the runner uses."""
+    own = {name: v for name, v in (settings.get("figures") or {}).items() if name != "formats"}
     if own and not has_own:
         first = f"figures.{next(iter(own))}"
         raise ValueError(f"unknown key {first!r}: this experiment has figures.formats alone")
-    found = config.copy()
-    OmegaConf.set_struct(found, False)
-    found.figures = own
-    return found
+    return settings | {"figures": own}
 
 
-def _fill(study: type, config: DictConfig) -> Any:
-    """Fill a dataclass from the top level of the config."""
+def _fill(
+    call: Callable[..., Any],
+    hints: Mapping[str, Any],
+    needed: Collection[str],
+    settings: Mapping[str, Any],
+) -> Any:
+    """A study, or a method or source made of groups, from the top level of the config.
+
+    A group that is left out (`~search`) gets no default.
+    """
     arguments = {}
-    for name, kind in hints_of(study).items():
+    for name, kind in hints.items():
         if kind in GATHERED:
-            arguments[name] = _gather_groups(kind, config)
-        elif name in config or OmegaConf.is_missing(config, name):
-            arguments[name] = value_of(kind, child(config, name, name), name)
-        elif is_required(study, name):
-            raise ValueError(f"the config of this experiment must have {name!r}")
-    return study(**arguments)
-
-
-def _gather_groups(kind: Any, config: DictConfig) -> Any:
-    """Build a method or source from its groups; one left out (`~search`) gets no default."""
-    groups = _groups(kind)
-    if lacking := [name for name in groups if name not in config]:
-        raise ValueError(
-            f"the config of this experiment must have {lacking[0]!r}: choose one with "
-            f"{lacking[0]}=NAME, see --help"
-        )
-    return GATHERED[kind](
-        **{name: value_of(each, child(config, name, name), name) for name, each in groups.items()}
-    )
+            groups = _groups(kind)
+            arguments[name] = _fill(GATHERED[kind], groups, groups, settings)
+        elif name in settings:
+            arguments[name] = value_of(kind, settings[name], name)
+        elif name in needed:
+            way = f": choose one with {name}=NAME, see --help" if name in GROUPS else ""
+            raise ValueError(f"the config of this experiment must have {name!r}{way}")
+    return call(**arguments)
 
 
 def _groups(kind: Any) -> dict[str, Any]:
@@ -113,7 +119,7 @@ def _groups(kind: Any) -> dict[str, Any]:
     return {name: hint for name, hint in hints.items() if name != "return"}
 
 
-# From nodes of a config to values: the only place where the type of a setting is checked.
+# From plain settings to values: the only place where the type of a setting is checked.
 #
 # The type comes from the signature that takes the setting: a field of a study, or an argument of a
 # `_target_`. Only plain arguments are checked here, since the class or function itself reports
@@ -124,42 +130,44 @@ PLAIN = {float: "a number", int: "a whole number", bool: "true or false", str: "
 
 
 def value_of(kind: Any, node: Any, place: str) -> Any:
-    """A value of this type from a node of the config. place: its dotted path, for errors."""
+    """A value of this type from a setting. place: its dotted path, for errors."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        value = contents(node)
-        if isinstance(parts[1], Check) and not parts[1].test(value):
-            raise ValueError(f"{place} must be {parts[1].message}: {value!r} came")
+        if isinstance(parts[1], Check) and not parts[1].test(node):
+            raise ValueError(f"{place} must be {parts[1].message}: {node!r} came")
         return value_of(parts[0], node, place)
     if kind is Any:
-        return contents(node)
+        return node
     if kind is Deferred:
         return Configured(node, place)
     if kind == Step:
         return bind_step(node, place)
     if origin in (Union, UnionType):
         return _one_of(parts, node, place)
-    if isinstance(node, DictConfig) and "_target_" in node:
-        return instantiate(node, origin or kind, place)
-    if isinstance(kind, type) and is_dataclass(kind):
+    if _names_target(node):
+        return _instance(node, origin or kind, place)
+    if is_dataclass(kind):
         return _dataclass(kind, node, place)
     if origin is not None:
         return _container(origin, parts, node, place)
-    return _scalar(kind, node, place)
+    value = check_plain((kind,), node, place)  # without a `_target_` its type is always plain
+    return float(value) if kind is float else value
+
+
+def _names_target(node: Any) -> bool:
+    return isinstance(node, Mapping) and "_target_" in node
 
 
 def _container(origin: type, parts: Sequence[Any], node: Any, place: str) -> Any:
     if issubclass(origin, Mapping):
-        if not OmegaConf.is_dict(node):
-            raise ValueError(f"{place} must be like {{name: ...}}: {contents(node)!r} came")
+        if not isinstance(node, Mapping):
+            raise ValueError(f"{place} must be like {{name: ...}}: {node!r} came")
         if parts[1] is Deferred or is_dataclass(parts[1]):
             check_names(map(str, node), place)
-        places = {key: f"{place}.{key}" for key in node}
-        return {str(k): value_of(parts[1], child(node, k, at), at) for k, at in places.items()}
-    if not OmegaConf.is_list(node):
-        raise ValueError(f"{place} must be a list: {contents(node)!r} came")
-    places = {k: f"{place}[{k}]" for k in range(len(node))}
-    return [value_of(parts[0], child(node, k, at), at) for k, at in places.items()]
+        return {str(k): value_of(parts[1], each, f"{place}.{k}") for k, each in node.items()}
+    if not isinstance(node, list):
+        raise ValueError(f"{place} must be a list: {node!r} came")
+    return [value_of(parts[0], each, f"{place}[{k}]") for k, each in enumerate(node)]
 
 
 def check_names(names: Iterable[str], place: str) -> None:
@@ -174,9 +182,9 @@ def check_names(names: Iterable[str], place: str) -> None:
 
 def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:
     """A value of the first type that fits; if none fits, the error is that of the last."""
-    if node is None and type(None) in kinds:
+    if node is None and NoneType in kinds:
         return None
-    kinds = [kind for kind in kinds if kind is not type(None)]
+    kinds = [kind for kind in kinds if kind is not NoneType]
     for kind in kinds[:-1]:
         try:
             return value_of(kind, node, place)
@@ -185,51 +193,29 @@ def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:
     return value_of(kinds[-1], node, place)
 
 
-def _scalar(kind: Any, node: Any, place: str) -> Any:
-    """A plain value. A value without a `_target_` never has a type that is not plain."""
-    value = check_plain((kind,), node, place)
-    return float(value) if kind is float else value
-
-
 def check_plain(kinds: Collection[type], node: Any, place: str) -> Any:
-    """The value of a node; raises ValueError if it has none of these types."""
-    value = contents(node)
-    if not any(_is_plain(value, kind) for kind in kinds):
+    """The value of a setting; raises ValueError if it has none of these types."""
+    # A whole number counts as a number, too; a truth value does not.
+    if not any(type(node) is kind or (kind, type(node)) == (float, int) for kind in kinds):
         wanted = [PLAIN.get(kind, f"a {kind.__name__}, named by its _target_") for kind in kinds]
-        raise ValueError(f"{place} must be {' or '.join(wanted)}: {value!r} came")
-    return value
+        raise ValueError(f"{place} must be {' or '.join(wanted)}: {node!r} came")
+    return node
 
 
-def _is_plain(value: object, kind: type) -> bool:
-    """Whether a value has a plain type; an int also counts as a float, a bool does not."""
-    return type(value) is kind or (kind, type(value)) == (float, int)
-
-
-def _dataclass(kind: type, node: Any, place: str) -> Any:
+def _dataclass(kind: Any, node: Any, place: str) -> Any:
     """A mapping as a dataclass; missing keys and unused keys are errors."""
-    names = [f.name for f in fields(kind) if f.init]
-    needed = [name for name in names if is_required(kind, name)]
-    given = set(map(str, node)) if isinstance(node, DictConfig) else None
-    if given is None or given - set(names) or set(needed) - given:
-        came = sorted(given) if given is not None else contents(node)
-        near = "".join(near_words(each, names) for each in sorted((given or set()) - set(names)))
-        if len(needed) == len(names):
-            how = f"must have {joined(needed)}"
-            if given is not None and given >= set(needed):  # nothing is lacking
-                how = f"may have {joined(needed)} alone"
-            raise ValueError(f"{place} {how}: {came} came{near}")
+    hints = hints_of(kind)
+    needed = [name for name in hints if is_required(kind, name)]
+    given = set(node) if isinstance(node, Mapping) else None
+    if given is None or given - set(hints) or set(needed) - given:
+        came = sorted(given) if given is not None else node
+        near = "".join(near_words(each, hints) for each in sorted((given or set()) - set(hints)))
         raise ValueError(
-            f"{place} may have {sorted(names)} and needs {joined(needed) or 'none'}: {came} came"
+            f"{place} may have {sorted(hints)} and needs {joined(needed) or 'none'}: {came} came"
             f"{near}"
         )
-    hints = hints_of(kind)
-    return kind(
-        **{
-            name: value_of(hints[name], child(node, name, at), at)
-            for name, at in ((name, f"{place}.{name}") for name in names)
-            if name in given
-        }
-    )
+    named = {name: node[name] for name in hints if name in node}
+    return kind(**{n: value_of(hints[n], each, f"{place}.{n}") for n, each in named.items()})
 
 
 def hints_of(kind: type) -> dict[str, Any]:
@@ -243,19 +229,7 @@ def is_required(kind: type, name: str) -> bool:
     return field.default is MISSING and field.default_factory is MISSING
 
 
-def child(parent: Any, key: Any, place: str) -> Any:
-    """A child of a node, with interpolations resolved."""
-    if OmegaConf.is_missing(parent, key):
-        raise ValueError(f"{place} must be set: it is still '???'")
-    return parent[key]
-
-
-def contents(node: Any) -> Any:
-    """The plain value of a node, with interpolations resolved."""
-    return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
-
-
-def instantiate(node: DictConfig, kind: type, place: str) -> Any:
+def _instance(node: Mapping[str, Any], kind: type, place: str) -> Any:
     """The object that a node names, checked to be of this type."""
     value = bind(node, place)()
     if not isinstance(value, kind):
@@ -265,29 +239,25 @@ def instantiate(node: DictConfig, kind: type, place: str) -> Any:
 
 def bind_step(node: Any, place: str) -> Step:
     """A step of `prepare`; unknown arguments are refused here."""
-    if not isinstance(node, DictConfig) or "_target_" not in node:
+    if not _names_target(node):
         raise ValueError(
             f"{place} must be like {{_target_: ep2sindy.prepare.crop, start_s: 0}}: {node!r} came"
         )
     return bind(node, place, None)
 
 
-def bind(node: DictConfig, place: str, *first: Any) -> partial[Any]:
+def bind(node: Mapping[str, Any], place: str, *first: Any) -> partial[Any]:
     """The node's `_target_`, with the remaining entries, built, as its arguments.
 
     place: the node's dotted path, for errors. first: leading arguments, given when it is called.
     Raises ValueError if the target cannot be called so, and errors that a nested target raises.
     """
-    settings = {name: child(node, name, f"{place}.{name}") for name in map(str, node)}
     target = target_of(node, place)
     kinds = _plain_arguments(target)
+    given = {name: each for name, each in node.items() if name != "_target_"}
     call = partial(
         target,
-        **{
-            name: _argument(kinds.get(name, ()), value, f"{place}.{name}")
-            for name, value in settings.items()
-            if name != "_target_"
-        },
+        **{n: _argument(kinds.get(n, ()), each, f"{place}.{n}") for n, each in given.items()},
     )
     try:
         takes = inspect.signature(target)
@@ -303,34 +273,28 @@ def bind(node: DictConfig, place: str, *first: Any) -> partial[Any]:
     return call
 
 
-def _plain_arguments(target: Any) -> dict[str, tuple[type, ...]]:
+def _plain_arguments(target: Any) -> dict[str, list[type]]:
     """Arguments of a target that can only be plain values or None, with their types."""
     try:
         hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
     except Exception:  # an annotation that does not exist at run time; no annotations
         return {}
-    alternatives = {name: _alternatives(hint) for name, hint in hints.items()}
-    return {name: kinds for name, kinds in alternatives.items() if set(kinds) <= set(PLAIN)}
-
-
-def _alternatives(hint: Any) -> tuple[Any, ...]:
-    """The types of a union without None; a single type by itself."""
-    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    return tuple(part for part in parts if part is not type(None))
+    unions = {n: get_origin(hint) in (Union, UnionType) for n, hint in hints.items()}
+    kinds = {n: get_args(hint) if unions[n] else (hint,) for n, hint in hints.items()}
+    without = {n: [kind for kind in each if kind is not NoneType] for n, each in kinds.items()}
+    return {n: each for n, each in without.items() if set(each) <= set(PLAIN)}
 
 
 def _argument(kinds: Collection[type], node: Any, place: str) -> Any:
     """An argument of a target, with nested targets built. kinds: its types, empty for any."""
     if kinds and node is not None:
         return check_plain(kinds, node, place)
-    if isinstance(node, ListConfig):
-        places = [f"{place}[{k}]" for k in range(len(node))]
-        return [_argument((), child(node, k, at), at) for k, at in enumerate(places)]
-    if not isinstance(node, DictConfig):
+    if isinstance(node, list):
+        return [_argument((), each, f"{place}[{k}]") for k, each in enumerate(node)]
+    if not isinstance(node, Mapping):
         return node
-    if "_target_" not in set(node):  # `in` on a DictConfig denies a key whose value is missing
-        named = {key: f"{place}.{key!s}" for key in node}
-        return {key: _argument((), child(node, key, at), at) for key, at in named.items()}
+    if "_target_" not in node:
+        return {key: _argument((), each, f"{place}.{key}") for key, each in node.items()}
     call = bind(node, place)
     try:
         return call()
@@ -338,67 +302,54 @@ def _argument(kinds: Collection[type], node: Any, place: str) -> Any:
         raise ValueError(f"{place} cannot be made: {error}") from error
 
 
-def check_set(node: DictConfig) -> None:
-    """Raise ValueError for a value, at any depth, that a config leaves for the user to set."""
-    if missing := sorted(OmegaConf.missing_keys(node)):
-        raise ValueError(f"{missing[0]} must be set: it is still '???'")
-
-
 @dataclass(frozen=True, eq=False)
 class Configured:
     """A node that names a `_target_`, built on request; see `Deferred`."""
 
-    node: Any
+    settings: Mapping[str, Any]
     place: str
 
     def __post_init__(self) -> None:
-        if not isinstance(self.node, DictConfig) or "_target_" not in self.node:
-            raise ValueError(f"{self.place} must name a _target_: {self.node!r} came")
-        check_set(self.node)
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        plain: Any = OmegaConf.to_container(self.node, resolve=True)
-        return {str(key): value for key, value in plain.items()}
+        if not _names_target(self.settings):
+            raise ValueError(f"{self.place} must name a _target_: {self.settings!r} came")
 
     def build(self) -> Any:
-        return bind(self.node, self.place)()
+        return bind(self.settings, self.place)()
 
     def changed(
         self, places: Mapping[str, Any], more: Mapping[str, Any] | None = None
     ) -> Configured:
-        node = deepcopy(self.node)
-        missing = object()
+        settings: Any = deepcopy(self.settings)
         for place, value in places.items():
-            write_defaults(node, place, root=self.place)
-            if OmegaConf.select(node, place, default=missing) is missing:
-                raise ValueError(f"{self.place}.{place} must be there to be changed: it is not")
-            OmegaConf.update(node, place, value)
-        OmegaConf.set_struct(node, False)  # unknown keys are refused when it is built
-        merged: Any = OmegaConf.merge(node, dict(more or {}))
-        return Configured(merged, self.place)
+            *outer, last = place.split(".")
+            node = settings
+            for name in (*outer, last):
+                parent, node = node, self._entry(node, name, place)
+            parent[last] = _merged(node, value)
+        return Configured(_merged(settings, more or {}), self.place)
+
+    def _entry(self, node: Any, name: str, place: str) -> Any:
+        """An entry of a node, which gets the default of its target if it has none.
+
+        For example, `thruster.transport.c_plume` in a thruster without a transport adds the whole
+        default transport.
+        """
+        if _names_target(node) and name not in node:
+            defaults = defaults_of(target_of(node, self.place))
+            node |= {name: as_node(defaults[name])} if name in defaults else {}
+        if not isinstance(node, Mapping) or name not in node:
+            raise ValueError(f"{self.place}.{place} must be there to be changed: it is not")
+        return node[name]
 
     def __str__(self) -> str:
-        return OmegaConf.to_yaml(self.node, resolve=True, sort_keys=True)
+        return OmegaConf.to_yaml(OmegaConf.create(dict(self.settings)), sort_keys=True)
 
 
-def write_defaults(node: DictConfig, place: str, *, root: str) -> None:
-    """Add the default value at a dotted place, if the targets on the way have one.
-
-    root: the place of the node itself, for errors. For example, `thruster.transport.c_plume` in a
-    thruster without a transport adds the whole default transport.
-    """
-    *outer, last = place.split(".")
-    for name in (*outer, last):
-        if not isinstance(node, DictConfig):
-            return
-        if name not in node and "_target_" in node:
-            values = defaults_of(target_of(node, root))
-            if name in values:
-                OmegaConf.update(node, name, as_node(values[name]), force_add=True)
-        if name not in node:
-            return
-        node = node[name]
+def _merged(value: Any, new: Any) -> Any:
+    """A setting with another merged in: entry by entry if both are mappings, else the new one."""
+    if not (isinstance(value, Mapping) and isinstance(new, Mapping)):
+        return new
+    return {**value, **{key: _merged(value.get(key), each) for key, each in new.items()}}
 
 
 def defaults_of(call: Any) -> dict[str, Any]:

@@ -6,11 +6,9 @@ that write to a given place, or run what they are given, are not.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from difflib import get_close_matches
 from typing import Any
-
-from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy._stubs import dotted_names
 from ep2sindy.trust.user_code import load_marked
@@ -19,7 +17,7 @@ from ep2sindy.trust.user_code import load_marked
 FOR_CONFIGS = frozenset(name for name, entry in dotted_names().items() if entry.for_configs)
 
 
-def target_of(node: DictConfig, place: str) -> Callable[..., Any]:
+def target_of(node: Mapping[str, Any], place: str) -> Callable[..., Any]:
     """The object that a node's `_target_` names.
 
     Raises ValueError for a name that configs may not use, before anything of it is imported.
@@ -28,7 +26,7 @@ def target_of(node: DictConfig, place: str) -> Callable[..., Any]:
     return dotted_names()[name].load() if name in FOR_CONFIGS else _own(name, place)
 
 
-def _known_name(node: DictConfig, place: str) -> str:
+def _known_name(node: Mapping[str, Any], place: str) -> str:
     """The name of a node's `_target_`: one of FOR_CONFIGS, or of a module of the user's."""
     name = str(node["_target_"])
     if name in FOR_CONFIGS:
@@ -66,22 +64,26 @@ def _own(name: str, place: str) -> Callable[..., Any]:
         raise ValueError(f"{place} must name a _target_: {error}") from error
 
 
-def check_targets(node: Any, place: str = "") -> None:
+def nodes_of(node: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    """A node of plain settings and all below it, each with its dotted place."""
+    yield place, node
+    if isinstance(node, list):
+        for k, each in enumerate(node):
+            yield from nodes_of(each, f"{place}[{k}]")
+    elif isinstance(node, Mapping):
+        for key, each in node.items():
+            yield from nodes_of(each, f"{place}.{key}" if place else str(key))
+
+
+def check_targets(settings: Any) -> None:
     """Raise ValueError for a `_target_`, at any depth, that configs may not name.
 
-    Interpolated values are checked where they are defined, and again when they are built. Targets
-    of this package are not imported yet: a definition that a run leaves out may need an extra.
+    Interpolated names are checked when they are built. Targets of this package are not imported
+    yet: a definition that a run leaves out may need an extra.
     """
-    if isinstance(node, DictConfig) and "_target_" in node and _is_there(node, "_target_"):
-        name = _known_name(node, place or "the config")
-        if name not in FOR_CONFIGS:
-            _own(name, place or "the config")
-    keys: Any = node if isinstance(node, DictConfig) else range(len(node))
-    for key in keys:
-        if _is_there(node, key) and OmegaConf.is_config(node[key]):
-            dotted = f"{place}.{key}" if place else str(key)
-            check_targets(node[key], dotted if isinstance(node, DictConfig) else f"{place}[{key}]")
-
-
-def _is_there(node: Any, key: Any) -> bool:
-    return not (OmegaConf.is_missing(node, key) or OmegaConf.is_interpolation(node, key))
+    for place, node in nodes_of(settings):
+        named = isinstance(node, Mapping) and "_target_" in node
+        if named and "${" not in str(node["_target_"]):
+            name = _known_name(node, place or "the config")
+            if name not in FOR_CONFIGS:
+                _own(name, place or "the config")

@@ -18,9 +18,9 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.blocks import read_whole
-from ep2sindy.data.conversion import COORDINATE_UNITS
-from ep2sindy.data.export import CLOCK
-from ep2sindy.data.trajectory import check_time
+from ep2sindy.data.quantities import COORDINATE_UNITS
+from ep2sindy.data.trajectory import CLOCK, check_increasing, check_time
+from ep2sindy.library.names import check_variable
 from ep2sindy.library.units import Clock
 from ep2sindy.runtime.files import read_json, write_bytes
 
@@ -46,29 +46,25 @@ def check_field(field: xr.Dataset) -> None:
     check_time(np.asarray(field["time"].values, dtype=np.float64))
     for axis in SPACE:
         if axis in field.dims:
-            _check_axis(axis, grid_points(field, axis))
+            check_increasing(axis, grid_points(field, axis), COORDINATE_UNITS[axis])
     for name, variable in field.data_vars.items():
-        if not str(name).isidentifier():
-            raise ValueError(f"a variable's name must be letters, digits and _: {name!r} came")
+        check_variable(str(name))
         if variable.dtype.kind not in "fiu":  # integers are accepted and read as real numbers
             raise ValueError(f"{name} must hold real numbers: its type is {variable.dtype}")
         if "units" not in variable.attrs:
             raise ValueError(f"{name} must name its unit in the attribute 'units' ('1' for none)")
 
 
+def check_new(field: xr.Dataset, name: str) -> None:
+    """Raise ValueError unless a variable of this name can be added to a field."""
+    check_variable(name)
+    if name in field:
+        raise ValueError(f"a new variable needs a new name: the field already has {name!r}")
+
+
 def clock_of(field: xr.Dataset) -> Clock:
     """Unit in which the field's times are displayed: the one that its file uses."""
     return Clock.of(str(field["time"].attrs.get(CLOCK, "s")))
-
-
-def _check_axis(axis: str, points: Float[np.ndarray, " points"]) -> None:
-    stalls = np.flatnonzero(~(np.diff(points) > 0))
-    if not np.isfinite(points).all() or stalls.size:
-        k = int(stalls[0]) if stalls.size else 0
-        raise ValueError(
-            f"{axis} must be finite and increase: {axis}[{k}:{k + 2}] = {points[k : k + 2]} m; "
-            "sort the grid first"
-        )
 
 
 def channel_length_m(attributes: Mapping[str, Any]) -> float | None:

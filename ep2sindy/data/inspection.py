@@ -4,75 +4,80 @@ from __future__ import annotations
 
 import html
 import textwrap
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
+from shlex import quote
 
-from ep2sindy.data.arrays import TEXT, ArrayInfo
-from ep2sindy.data.conversion import KNOWN_UNITS
-from ep2sindy.data.mapping import Variable
-from ep2sindy.data.quantities import MADE_FROM, is_counter_name
-from ep2sindy.data.readers.registry import reader_of
+from ep2sindy.data.mapping import TEXT, ArrayInfo, Variable
+from ep2sindy.data.quantities import KNOWN_UNITS, MADE_FROM, is_counter_name
 from ep2sindy.data.readers.source import FileSource
-from ep2sindy.data.recognition import Recognised, recognise
-from ep2sindy.data.steps import files_of, open_record
 from ep2sindy.runtime.screen import WIDTH, html_table, in_line, one_screen, text_table
 
 N_ROWS, N_NOTES = 60, 20  # largest numbers of arrays and notes that are listed
+
+STEP = "data.dt_s=STEP"  # what the user is asked for if there are no times
 
 HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
 
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Result of inspecting a file, with the mapping by which `open_field` opens it.
+    """Result of inspecting a file: a mapping by which `open_field` opens it, and what is open.
 
-    kind: kind of file. source: its arrays, and notes on how it was read. found: the recognised
-    mapping.
+    source: its arrays, and notes on how it was read. held: summaries of all its arrays. variables,
+    axes: our name -> location in the file. dt_s: time step in s if the file gives it outside its
+    time array. no_time: the question for the time if there is none. no_unit: our name of a quantity
+    that the file gives without a unit -> the question for it. questions: messages about other open
+    decisions. n_samples: number of samples in time, None if it cannot be determined. replaced: the
+    file's times that dt_s stands for, in each unit that they may be in.
     """
 
-    kind: str
     source: FileSource
-    found: Recognised
+    held: Sequence[ArrayInfo]
+    variables: Mapping[str, Variable]
+    axes: Mapping[str, Variable]
+    dt_s: float | None
+    no_time: str = ""
+    no_unit: Mapping[str, str] = field(default_factory=dict)
+    questions: Sequence[str] = ()
+    n_samples: int | None = None
+    replaced: Sequence[Variable] = ()
 
     @property
-    def path(self) -> Path:
-        """The file; of several that are joined, their pattern."""
-        return self.source.path
+    def asked(self) -> list[str]:
+        """Questions that the user must answer."""
+        return [*filter(None, [self.no_time]), *self.no_unit.values()]
 
-    @property
-    def words(self) -> str:
-        """Notes on how the file was read."""
-        return self.source.words
-
-    @property
-    def variables(self) -> dict[str, Variable]:
-        """Mapping of the recognised variables."""
-        return dict(self.found.variables)
+    def checked(self) -> Inspection:
+        """This mapping, if it gives a field without any doubt; else raises ValueError."""
+        none = [] if self.variables else ["no array of the file fits its axes"]
+        if doubts := [*self.asked, *none]:
+            raise ValueError(
+                f"{self.source.path} cannot be opened without a mapping: "
+                f"{'; '.join([*doubts, *self.questions])}; `ep2sindy inspect "
+                f"{quote(str(self.source.path))} --write` (in Python ep2sindy.inspect_file) shows "
+                "what it holds and writes a mapping"
+            )
+        return self
 
     @property
     def time(self) -> Variable | None:
-        return self.found.axes.get("time")
+        return self.axes.get("time")
 
     @property
     def z(self) -> Variable | None:
-        return self.found.axes.get("z")
+        return self.axes.get("z")
 
     @property
     def r(self) -> Variable | None:
-        return self.found.axes.get("r")
-
-    @property
-    def dt_s(self) -> float | None:
-        """Time step in s that the file gives outside its time array, or None."""
-        return self.found.dt_s
+        return self.axes.get("r")
 
     @cached_property
     def _quantities(self) -> set[str]:
         """Variables that are what their names say: `n_i` without a unit is a name like others."""
-        found = self.found.variables
-        return {name for name, v in found.items() if name not in KNOWN_UNITS or v.unit != "1"}
+        found = self.variables.items()
+        return {name for name, v in found if name not in KNOWN_UNITS or v.unit != "1"}
 
     @cached_property
     def prepare(self) -> dict[str, str]:
@@ -92,8 +97,8 @@ class Inspection:
     @cached_property
     def _arrays(self) -> dict[str, ArrayInfo]:
         """The array of the file that each variable is, or is a part of."""
-        held = {each.name: each for each in self.found.held}
-        names = {ours: str(variable.name) for ours, variable in self.found.variables.items()}
+        held = {each.name: each for each in self.held}
+        names = {ours: str(variable.name) for ours, variable in self.variables.items()}
         return {n: held.get(name) or held[name.rpartition("[")[0]] for n, name in names.items()}
 
     @cached_property
@@ -108,21 +113,21 @@ class Inspection:
     @property
     def traces(self) -> list[str]:
         """The signals that depend on time alone: vectors of its length, and columns of arrays."""
-        vectors = [n for n, one in self._arrays.items() if one.lengths == (self.found.n_samples,)]
-        parts = [n for n, one in self._arrays.items() if self.found.variables[n].name != one.name]
+        vectors = [n for n, one in self._arrays.items() if one.lengths == (self.n_samples,)]
+        parts = [n for n, one in self._arrays.items() if self.variables[n].name != one.name]
         return [name for name in self.signals if name in {*vectors, *parts}]
 
     def notes(self) -> list[str]:
         """Messages about what is asked, other open decisions, and missing information."""
-        texts = [*self.found.asked]
-        if self.found.dt_s is not None:
+        texts = [*self.asked]
+        if self.dt_s is not None:
             how = "is the number of a step times" if self.source.steps else "in steps of"
-            texts.append(f"time {how} {self.found.dt_s:.6g} s, as the file says beside its arrays")
-        texts += self.found.questions
+            texts.append(f"time {how} {self.dt_s:.6g} s, as the file says beside its arrays")
+        texts += self.questions
         texts += [
             f"{n} is made by {step} from {MADE_FROM[n][0]}" for n, step in self.prepare.items()
         ]
-        if "z" in self.found.axes and self.source.channel_m is None:
+        if "z" in self.axes and self.source.channel_m is None:
             texts.append(
                 "no length of the channel: give it, data.channel_m=LENGTH in m, or a zone, "
                 "'trajectory.zone.z=[FROM,TO]' in m, for experiments that average over one"
@@ -132,19 +137,15 @@ class Inspection:
     def lines(self, more_notes: Sequence[str] = ()) -> list[str]:
         """Summary of the file, its arrays and the notes on them, in lines of a screen's width."""
         words = f"; {self.source.words}" if self.source.words else ""
-        own, rows = self.notes(), self._rows
-        hidden = [f"... {len(own) - N_NOTES} more notes"] * (len(own) > N_NOTES)
-        texts = map(in_line, (*own[:N_NOTES], *hidden, *more_notes))
-        notes = [
-            line
-            for text in texts
-            for line in textwrap.wrap(text, WIDTH, initial_indent="- ", subsequent_indent="  ",
-                                      break_long_words=False, break_on_hyphens=False)
-        ]  # fmt: skip
-        head = f"{self.source.path}: {self.kind}{words}"
-        table = text_table(HEADER, rows[:N_ROWS])
-        more = [f"... {len(rows) - N_ROWS} more arrays"] * (len(rows) > N_ROWS)
-        return [in_line(head), *table, *more, *notes]
+        own = _first(self.notes(), N_NOTES, "notes")
+        wrapped = textwrap.TextWrapper(
+            WIDTH, initial_indent="- ", subsequent_indent="  ", break_long_words=False,
+            break_on_hyphens=False,
+        )  # fmt: skip
+        head = f"{self.source.path}: {self.source.kind}{words}"
+        table = text_table(HEADER, self._rows)
+        notes = [line for text in (*own, *more_notes) for line in wrapped.wrap(in_line(text))]
+        return [in_line(head), table[0], *_first(table[1:], N_ROWS, "arrays"), *notes]
 
     def differences(self, first: Inspection) -> list[str]:
         """In what this file differs from another of its kind: all but ranges and samples."""
@@ -152,18 +153,18 @@ class Inspection:
         lacks, more = [n for n in other if n not in own], [n for n in own if n not in other]
         changed = {n: [w for w in own[n] if w not in other[n]] for n in own if n in other}
         texts = [
-            self.kind * (self.kind != first.kind),
-            self.words * (self.words != first.words),
+            self.source.kind * (self.source.kind != first.source.kind),
+            self.source.words * (self.source.words != first.source.words),
             f"without {', '.join(lacks)}" * bool(lacks),
             f"also {', '.join(more)}" * bool(more),
             *(f"{name}: {', '.join(words)}" * bool(words) for name, words in changed.items()),
-            *(text for text in self.found.questions if text not in first.found.questions),
+            *(text for text in self.questions if text not in first.questions),
         ]
         return [text for text in texts if text]
 
     def _words_of_arrays(self) -> dict[str, list[str]]:
         """What is said of each array, but for its range."""
-        n = self.found.n_samples
+        n = self.n_samples
         return {
             one.name: [
                 one.problem or "numbers",
@@ -173,7 +174,7 @@ class Inspection:
                 f"{one.n_missing} missing",
                 f"{one.step:.3g} apart" if one.step else "",
             ]
-            for one in self.found.held
+            for one in self.held
         }
 
     def __repr__(self) -> str:
@@ -182,69 +183,52 @@ class Inspection:
     def _repr_html_(self) -> str:
         rows = [list(map(html.escape, row)) for row in self._rows]
         items = "".join(f"<li>{html.escape(text)}</li>" for text in self.notes())
-        head = html.escape(f"{self.path}: {self.kind}")
+        head = html.escape(f"{self.source.path}: {self.source.kind}")
         return f"<div>{head}</div>{html_table(HEADER, rows)}<ul>{items}</ul>"
 
     @cached_property
     def _rows(self) -> list[list[str]]:
         rows = []
-        for one in self.found.held:
+        for one in self.held:
             about = "" if one.even else "about "
             step = f", {about}{one.step:.4g} apart" if one.step else ""
             role = ", ".join(self._roles.get(one.name, ["-"])) + step
-            shape = f"({', '.join(map(str, one.shape))})"
-            unused = TEXT if one.problem == TEXT else "left out"
-            rows.append(
-                [one.name, *[""] * 5, unused] if one.problem else
-                [one.name, shape, one.unit, f"{one.low:.4g}", f"{one.high:.4g}",
-                 str(one.n_missing or ""), role]
-            )  # fmt: skip
+            span = [f"{one.low:.4g}", f"{one.high:.4g}", str(one.n_missing or "")]
+            said = [f"({', '.join(map(str, one.shape))})", one.unit, *span, role]
+            unused = [*[""] * 5, TEXT if one.problem == TEXT else "left out"]
+            rows.append([one.name, *(unused if one.problem else said)])
         return rows
 
     @cached_property
     def _roles(self) -> dict[str, list[str]]:
         """Our names and units for the arrays of the file and their parts: file name -> texts."""
         roles: dict[str, list[str]] = {}
-        for ours, variable in {**self.found.axes, **self.found.variables}.items():
+        for ours, variable in {**self.axes, **self.variables}.items():
             name = str(variable.name)
-            is_open = ours in self.found.no_unit
+            is_open = ours in self.no_unit
             text = f"{ours}, in what unit?" if is_open else f"{ours} in {variable.unit}"
             for each in {name, name.partition("[")[0]}:
                 roles.setdefault(each, []).append(text)
         return roles
 
 
-def inspect_file(path: str | Path | Sequence[str | Path], *, plasma: bool = False) -> Inspection:
-    """List the arrays of a file and recognise quantities by names, units and shapes.
-
-    path: a file, or a pattern or a list of the files of the steps of one run. plasma: names such as
-    Te mean quantities where the file states no unit, too, and what has no unit is in SI.
-    Reads every array once. The result prints as a table, followed by notes on what must be given
-    and on missing information. `ep2sindy.open_field(path, variables=found.variables,
-    time=found.time, z=found.z, r=found.r, dt_s=found.dt_s)` opens the recognised field.
-    Raises ValueError for a file that is missing, empty, damaged or of an unknown kind.
-
-    >>> found = ep.inspect_file("run.nc")
-    >>> found.variables["n_i"].unit
-    'm^-3'
-    """
-    source = open_record(path)
-    found = recognise(source, plasma=plasma)
-    kind = reader_of(Path(files_of(path)[0])).name
-    return Inspection(kind, source, found)
+def _first(lines: Sequence[str], n: int, what: str) -> list[str]:
+    """The first lines of many, and how many more there are."""
+    more = [f"... {len(lines) - n} more {what}"] if len(lines) > n else []
+    return [*lines[:n], *more]
 
 
 def compare_files(first: Inspection, others: Sequence[Inspection]) -> list[str]:
     """Lines on the files after the first: one for each that differs, and one for all the rest."""
-    differing = {each.path: texts for each in others if (texts := each.differences(first))}
-    same = [each for each in others if each.path not in differing]
-    lines = [in_line(f"{path}: {'; '.join(texts)}") for path, texts in differing.items()]
+    differing = {each.source.path: texts for each in others if (texts := each.differences(first))}
+    same = [each for each in others if each.source.path not in differing]
+    lines = [f"{path}: {'; '.join(texts)}" for path, texts in differing.items()]
     if same:
-        counts = sorted({each.found.n_samples or 0 for each in same})
+        counts = sorted({each.n_samples or 0 for each in same})
         span = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
-        which = f"the other {len(same)} files" if len(same) > 1 else str(same[0].path)
-        lines.append(in_line(f"{which}: the same arrays{f'; {span} samples' * bool(counts[0])}"))
-    return lines
+        which = f"the other {len(same)} files" if len(same) > 1 else str(same[0].source.path)
+        lines.append(f"{which}: the same arrays{f'; {span} samples' * bool(counts[0])}")
+    return [in_line(line) for line in lines]
 
 
 def unlike(found: Sequence[Inspection]) -> str:
@@ -253,7 +237,7 @@ def unlike(found: Sequence[Inspection]) -> str:
     for each, held in zip(found, names, strict=True):
         if held != names[0]:
             return (
-                f"files of one mapping must hold the same names: {each.path} differs from "
-                f"{found[0].path} in {sorted(map(str, held ^ names[0]))}; give each its own"
+                f"files of one mapping must hold the same names: {each.source.path} differs from "
+                f"{found[0].source.path} in {sorted(map(str, held ^ names[0]))}; give each its own"
             )
     return ""

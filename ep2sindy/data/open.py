@@ -14,20 +14,27 @@ from pathlib import Path
 
 import xarray as xr
 
-from ep2sindy.data.arrays import describe_array
 from ep2sindy.data.blocks import UNDECODED
-from ep2sindy.data.conversion import conversion, to_si
-from ep2sindy.data.dimensions import assign_dims, read_axes
-from ep2sindy.data.export import CLOCK
 from ep2sindy.data.fields import DIMS, check_field, mask_outside, write_netcdf
 from ep2sindy.data.gaps import usual_step
-from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
-from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit
+from ep2sindy.data.inspection import Inspection
+from ep2sindy.data.mapping import (
+    Keys,
+    Problems,
+    Variable,
+    assign_dims,
+    describe_array,
+    in_file,
+    read_array,
+    read_axes,
+)
+from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit, conversion, to_si
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import reader_of
 from ep2sindy.data.readers.source import FileSource, damage_named, file_named
 from ep2sindy.data.recognition import recognise
 from ep2sindy.data.steps import open_record
+from ep2sindy.data.trajectory import CLOCK
 
 
 def open_field(
@@ -67,19 +74,36 @@ def open_field(
     >>> field["n_i"].attrs["units"]
     'm^-3'
     """
-    source = open_record(path)
-    axes: Mapping[str, Variable | Keys | None] = {"time": time, "z": z, "r": r}
-    times: Sequence[Variable] = [*in_file({"time": time}, Problems()).values()]
+    source, problems = open_record(path), Problems()
+    axes: Mapping[str, Variable] = in_file({"time": time, "z": z, "r": r}, problems)
+    times: Sequence[Variable] = [axes["time"]] if "time" in axes else []
     if variables is None:
-        found = recognise(source, dt_s=dt_s, given=axes, units=units, plasma=plasma)
-        found.check(source)
+        problems.check(source)
+        found = recognise(source, dt_s=dt_s, given=axes, units=units, plasma=plasma).checked()
         variables, axes, dt_s, times = found.variables, found.axes, found.dt_s, found.replaced
     with file_named(source.path):
-        field = _field(source, variables, axes, dt_s, mask, chunks)
+        field = _field(source, variables, axes, dt_s, mask, chunks, problems)
     if doubt := _step_doubt(source, times, field, dt_s):
         warnings.warn(doubt, DoubtfulUnit, stacklevel=2)
     said = {"channel_m": channel_m or source.channel_m, "file": str(source.path), STEP_DOUBT: doubt}
     return field.assign_attrs({name: value for name, value in said.items() if value})
+
+
+def inspect_file(path: str | Path | Sequence[str | Path], *, plasma: bool = False) -> Inspection:
+    """List the arrays of a file and recognise quantities by names, units and shapes.
+
+    path: a file, or a pattern or a list of the files of the steps of one run. plasma: names such as
+    Te mean quantities where the file states no unit, too, and what has no unit is in SI.
+    Reads every array once. The result prints as a table, followed by notes on what must be given
+    and on missing information. `ep2sindy.open_field(path, variables=found.variables,
+    time=found.time, z=found.z, r=found.r, dt_s=found.dt_s)` opens the recognised field.
+    Raises ValueError for a file that is missing, empty, damaged or of an unknown kind.
+
+    >>> found = ep.inspect_file("run.nc")
+    >>> found.variables["n_i"].unit
+    'm^-3'
+    """
+    return recognise(open_record(path), plasma=plasma)
 
 
 def _step_doubt(
@@ -108,15 +132,16 @@ def _step_doubt(
 def _field(
     source: FileSource,
     variables: Mapping[str, Variable | Keys],
-    coordinates: Mapping[str, Variable | Keys | None],
+    axes: Mapping[str, Variable],
     dt_s: float | None,
     mask: Variable | Keys | None,
     chunks: Mapping[str, int] | None,
+    problems: Problems,
 ) -> xr.Dataset:
     """Build the field that a mapping describes; one error reports all faults of the mapping."""
     if chunks is not None and find_spec("dask") is None:
         raise ValueError("data.chunks needs dask: pip install 'ep2sindy[cluster]'")
-    problems, arrays = Problems(), {}
+    arrays: dict[str, xr.DataArray] = {}
     wanted = in_file(variables, problems)
     if not wanted and not problems.found:
         raise ValueError(f"a field needs a variable: none of {list(variables)} has a name")
@@ -124,12 +149,8 @@ def _field(
         with problems.noted():
             arrays[ours] = read_array(source, ours, str(variable.name))
         with problems.noted():
-            if ours in arrays:
-                none = arrays[ours].isel(dict.fromkeys(arrays[ours].dims, slice(0)))
-                to_si(none, ours, variable.unit, is_variable=True)
-            else:
-                conversion(ours, variable.unit, is_variable=True)
-    axes = in_file(coordinates, problems)
+            stated = arrays[ours].attrs if ours in arrays else {}
+            to_si(xr.DataArray(0.0, attrs=stated), ours, variable.unit, is_variable=True)
     points = read_axes(source, axes, dt_s, arrays, wanted, problems)
     if dt_s is None and "time" in points:
         points["time"].attrs[CLOCK] = axes["time"].unit

@@ -1,27 +1,30 @@
-"""Names in files: the quantities of a thruster, the axes, counters, and units at a name's end."""
+"""Names and units in files: conversion to SI, quantities of a thruster, axes, counters."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.conversion import (
-    COORDINATE_UNITS,
-    KNOWN_UNITS,
-    SUFFIX_UNITS,
-    conversion,
-    converts,
-)
 from ep2sindy.data.numbers import without_marks
 from ep2sindy.data.readers.table_layout import split_name
-from ep2sindy.library.units import is_count, time_unit_in
+from ep2sindy.library.units import (
+    PLAIN,
+    check_unit,
+    is_count,
+    netcdf_powers,
+    registry,
+    time_unit_in,
+    unit_errors,
+    unit_product,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray as xr
+
 
 STEP_DOUBT = "step_doubt"  # attribute of a field: how dt_s contradicts the file's own times
 
@@ -30,65 +33,41 @@ class DoubtfulUnit(UserWarning):
     """Warns that a step contradicts the file's own times."""
 
 
-@dataclass(frozen=True)
-class KnownQuantity:
-    """One quantity of a thruster.
-
-    full: names that say by themselves what they are. short: names that other things bear too, which
-    count only beside a unit that fits. Each is a sorted tuple of words as `words_of` returns it.
-    """
-
-    unit: str
-    full: frozenset[tuple[str, ...]]
-    short: frozenset[tuple[str, ...]]
+def _names(text: str) -> frozenset[tuple[str, ...]]:
+    """Names between commas, each a sorted tuple of words as `words_of` returns it."""
+    return frozenset(tuple(sorted(name.split())) for name in text.split(","))
 
 
-def _names(*texts: str) -> frozenset[tuple[str, ...]]:
-    return frozenset(tuple(sorted(text.split())) for text in texts)
+# Names that say by themselves what they are.
+FULL = {
+    "n_i": _names("ion density, plasma density"),
+    "n_n": _names("neutral density"),
+    "u_iz": _names("ion velocity z, ion axial velocity, ion velocity"),
+    "u_ir": _names("ion velocity r, ion radial velocity"),
+    "T_e_eV": _names("electron temperature"),
+    "R_ion": _names("ionization rate"),
+    "I_d": _names("discharge current"),
+    "V_d": _names("discharge voltage"),
+}
 
+# Names that other things bear too, which count only beside a unit that fits.
+SHORT = {
+    "n_i": _names("n i, ni, n ion, nion, n plasma, i density"),
+    "n_n": _names("n n, nn, n neutral, nneutral, na, n a, ng, n g"),
+    "u_iz": _names("u i z, uiz, u i, ui, v i z, viz, v i, vi, u z, uz, v z, vz"),
+    "u_ir": _names("u i r, uir, v i r, vir, u r, ur, v r, vr"),
+    "T_e_eV": _names("t e, te, tev, t e ev, t electron, e temperature"),
+    "R_ion": _names("r i, r ion, rion, k ion, kion, k i, rate, i rate, k iz, kiz, iz rate"),
+    "I_d": _names("i d, id, d current, current, idis, i discharge"),
+    "V_d": _names("v d, vd, u d, ud, d voltage, voltage, vdis, udis"),
+}
 
-QUANTITIES: dict[str, KnownQuantity] = {
-    "n_i": KnownQuantity(
-        KNOWN_UNITS["n_i"], _names("ion density", "plasma density"),
-        _names("n i", "ni", "n ion", "nion", "n plasma", "i density"),
-    ),
-    "n_n": KnownQuantity(
-        KNOWN_UNITS["n_n"], _names("neutral density"),
-        _names("n n", "nn", "n neutral", "nneutral", "na", "n a", "ng", "n g"),
-    ),
-    "u_iz": KnownQuantity(
-        KNOWN_UNITS["u_iz"], _names("ion velocity z", "ion axial velocity", "ion velocity"),
-        _names("u i z", "uiz", "u i", "ui", "v i z", "viz", "v i", "vi", "u z", "uz", "v z", "vz"),
-    ),
-    "u_ir": KnownQuantity(
-        KNOWN_UNITS["u_ir"], _names("ion velocity r", "ion radial velocity"),
-        _names("u i r", "uir", "v i r", "vir", "u r", "ur", "v r", "vr"),
-    ),
-    "T_e_eV": KnownQuantity(
-        "eV", _names("electron temperature"),
-        _names("t e", "te", "tev", "t e ev", "t electron", "e temperature"),
-    ),
-    "R_ion": KnownQuantity(
-        KNOWN_UNITS["R_ion"], _names("ionization rate"),
-        _names("r i", "r ion", "rion", "k ion", "kion", "k i", "rate", "i rate", "k iz", "kiz",
-               "iz rate"),
-    ),
-    "I_d": KnownQuantity(
-        KNOWN_UNITS["I_d"], _names("discharge current"),
-        _names("i d", "id", "d current", "current", "idis", "i discharge"),
-    ),
-    "V_d": KnownQuantity(
-        KNOWN_UNITS["V_d"], _names("discharge voltage"),
-        _names("v d", "vd", "u d", "ud", "d voltage", "voltage", "vdis", "udis"),
-    ),
-}  # fmt: skip
-
-ELECTRONS = _names("n e", "ne", "electron density")  # their density is n_i where no charge is left
+ELECTRONS = _names("n e, ne, electron density")  # their density is n_i where no charge is left
 
 AXIS_NAMES = {
-    "time": _names("t", "time", "times", "timestamp", "tvec", "seconds", "sec"),
-    "z": _names("z", "axial", "zz"),
-    "r": _names("r", "radial", "rr"),
+    "time": _names("t, time, times, timestamp, tvec, seconds, sec"),
+    "z": _names("z, axial, zz"),
+    "r": _names("r, radial, rr"),
 }
 
 # Names of what numbers or labels samples: no time without a step, and no signal.
@@ -100,23 +79,22 @@ COUNTERS = frozenset({
 # Variables that can be computed if a file lacks them: name -> (source variable, step of `prepare`).
 MADE_FROM = {"R_ion": ("T_e_eV", "ep2sindy.thruster.ionization_rate")}
 
-# Words found in names -> their meaning; "" marks a word without meaning.
-WORDS = {
-    **dict.fromkeys(("densities", "dens", "number"), "density"),
-    **dict.fromkeys(("ions",), "ion"),
-    **dict.fromkeys(("neutrals", "neut", "atom", "atoms"), "neutral"),
-    **dict.fromkeys(("vel", "speed"), "velocity"),
-    **dict.fromkeys(("radius", "rad"), "radial"),
-    **dict.fromkeys(("temp",), "temperature"),
-    **dict.fromkeys(("electrons", "elec"), "electron"),
-    **dict.fromkeys(("anode",), "discharge"),
-    **dict.fromkeys(("curr",), "current"),
-    **dict.fromkeys(("ionisation",), "ionization"),
-    **dict.fromkeys(("coefficient", "coeff", "coef"), ""),
-    **dict.fromkeys(("grid", "pos", "position", "coord", "coordinate", "coords", "points"), ""),
-    **dict.fromkeys(("cells", "centers", "centres", "axis", "vec", "vector", "cell"), ""),
-    **dict.fromkeys(("avg", "mean", "average", "averaged", "data", "field", "si"), ""),
-}  # fmt: skip
+# Meaning -> words that stand for it in names; "" for words without meaning.
+MEANINGS = {
+    "density": "densities dens number",
+    "ion": "ions",
+    "neutral": "neutrals neut atom atoms",
+    "velocity": "vel speed",
+    "radial": "radius rad",
+    "temperature": "temp",
+    "electron": "electrons elec",
+    "discharge": "anode",
+    "current": "curr",
+    "ionization": "ionisation",
+    "": "coefficient coeff coef grid pos position coord coordinate coords points cells centers "
+    "centres axis vec vector cell avg mean average averaged data field si",
+}
+WORDS = {word: meaning for meaning, words in MEANINGS.items() for word in words.split()}
 
 # HallThruster.jl's names, for the lowest charge state.
 HALLTHRUSTER = {
@@ -174,12 +152,16 @@ def is_counter_name(name: str) -> bool:
     return bool(words) and {*words} <= COUNTERS
 
 
+def _in_hallthruster(name: str) -> str | None:
+    """Our name for one of HallThruster.jl."""
+    return next((ours for text, ours in HALLTHRUSTER.items() if re.fullmatch(text, name)), None)
+
+
 def axis_of(name: str) -> str | None:
     """The axis that a name in a file says, with or without a unit at its end; None for none."""
     last = last_of(name)
-    for pattern, ours in HALLTHRUSTER.items():
-        if ours in AXIS_NAMES and re.fullmatch(pattern, name):
-            return ours
+    if (ours := _in_hallthruster(name)) in AXIS_NAMES:
+        return ours
     for axis, names in AXIS_NAMES.items():
         if {words_of(last), words_of(split_unit(last)[0])} & names:
             return axis
@@ -194,7 +176,7 @@ def axis_unit(axis: str, name: str, stated: str) -> str:
     return next((u for u in options if u and (u == unit or converts(axis, u))), "")
 
 
-def quantity_of(name: str, stated: str, *, plasma: bool) -> tuple[str, str] | None:
+def quantity_of(name: str, stated: str, *, plasma: bool = False) -> tuple[str, str] | None:
     """Our name for an array, and the unit it has, "" for none; None if it keeps its own name.
 
     A short name needs a unit that fits, stated or at its end; a full one stands for itself, unless
@@ -204,13 +186,12 @@ def quantity_of(name: str, stated: str, *, plasma: bool) -> tuple[str, str] | No
     base, ending = split_unit(last)
     unit = stated or ending
     spelled = {words_of(text) for text in (name, last, base)} if not last.isdigit() else set()
-    exact = next((ours for text, ours in HALLTHRUSTER.items() if re.fullmatch(text, name)), None)
-    for ours, quantity in QUANTITIES.items():
-        is_full = bool(spelled & quantity.full)
-        if not (is_full or ours in (exact, last, base) or spelled & quantity.short):
-            continue
-        fits = converts(ours, unit, is_variable=True) if unit else is_full or plasma
-        return (ours, unit) if fits else None
+    exact = (_in_hallthruster(name), last, base)
+    for ours, full in FULL.items():
+        if ours in exact or spelled & (full | SHORT[ours]):
+            is_said = plasma or bool(spelled & full)
+            fits = converts(ours, unit, is_variable=True) if unit else is_said
+            return (ours, unit) if fits else None
     return None
 
 
@@ -234,7 +215,7 @@ def columns_in_si(
     units: dict[str, str] = {}
     for k, label in enumerate(table.columns):
         name, stated = (label, "") if label.isidentifier() else split_name(label)
-        name, unit = quantity_of(name, stated, plasma=False) or (name, own_unit(name, stated))
+        name, unit = quantity_of(name, stated) or (name, own_unit(name, stated))
         units[name] = unit or "1"
         values[:, k] = without_marks(table[label].to_numpy(dtype=np.float64))
         if units[name] != "1" and not is_count(units[name]):
@@ -248,3 +229,115 @@ def time_unit(name: object) -> str | None:
     if not isinstance(name, str) or axis_of(name) != "time":
         return None
     return axis_unit("time", name, "" if name.isidentifier() else split_name(name)[1]) or "s"
+
+
+# Conversion from the unit used in a file to the unit that our name for the quantity implies.
+
+
+COORDINATE_UNITS = {"time": "s", "z": "m", "r": "m"}
+
+# Units of our usual names. A unit of another dimension is a mistake in the mapping.
+KNOWN_UNITS = {
+    "n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s",
+    "I_d": "A", "V_d": "V", "T_e_eV": "eV",
+}  # fmt: skip
+
+NAMED_UNITS = ("V", "A", "W", "N", "Pa", "J", "T")
+
+# Names with one of these suffixes keep this unit; all others are SI.
+SUFFIX_UNITS = {"eV": "eV", "kHz": "kHz", "MHz": "MHz", "mg_s": "mg/s", "mN": "mN", "us": "us"}
+
+
+def to_si(array: xr.DataArray, ours: str, unit: str, *, is_variable: bool = False) -> xr.DataArray:
+    """Convert an array to SI, or to the unit of its name's suffix.
+
+    No arithmetic is done if the unit is already right, nor for a count of named things that the
+    file itself states, such as `animals/ml`.
+    is_variable: `ours` names a variable; a variable called z is then not the coordinate.
+    Raises ValueError for an unknown unit, one that the suffix cannot hold, or one that
+    contradicts the file's own attribute.
+    """
+    stated = str(array.attrs.get("units", ""))
+    if is_variable and unit == stated and is_count(unit):
+        return array.drop_attrs().assign_attrs(units=unit)
+    factor, offset, target = conversion(ours, unit, is_variable=is_variable)
+    if stated not in ("", "1") and not same_unit(unit, stated):
+        raise ValueError(
+            f"the unit of {ours} must agree with the file: the mapping says {unit!r}, the file "
+            f"{stated!r}; set it to what the numbers count"
+        )
+    if (factor, offset) != (1.0, 0.0):
+        from ep2sindy.data.blocks import scale  # here, for it loads xarray
+
+        array = scale(array, factor=factor, offset=offset)
+    return array.drop_attrs().assign_attrs(units=target)
+
+
+def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[float, float, str]:
+    """Factor, offset and target unit that convert numbers in `unit` to the unit of our name.
+
+    A variable without a unit stays a pure number, whatever it is called.
+    """
+    if is_variable and unit == "1":
+        return 1.0, 0.0, unit
+    suffixes = (u for suffix, u in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}"))
+    known = KNOWN_UNITS if is_variable else COORDINATE_UNITS | KNOWN_UNITS
+    target = known.get(ours) or next(suffixes, None)
+    if unit == (target or "1") and unit in PLAIN | {"1"}:
+        return 1.0, 0.0, unit
+    try:
+        given = _ruler(unit)
+        given = given.to("kelvin") if target and given.check("[temperature]") else given
+        # A temperature in eV means k_B T.
+        ruler = given.to(target, "boltzmann") if target else given.to_base_units()
+    except unit_errors() as error:
+        raise ValueError(
+            f"the unit of {ours} must be one that converts to {target or 'SI'}: {unit!r} came "
+            f"({error or type(error).__name__}); write for example 'cm^-3', '1e19 m^-3', 'km/s'"
+        ) from None
+    zero, one, two = (float(value) for value in ruler.magnitude)
+    powers = ruler.dimensionality.values()
+    if not np.isclose(two - one, one - zero, atol=0.0) or any(power % 1 for power in powers):
+        raise ValueError(
+            f"the unit of {ours} must be a multiple of SI units: {unit!r} is not; write a gauss "
+            "as '1e-4 T', and no decibels"
+        )
+    factor = float(f"{one - zero:.15g}")  # cm^-3 is 1e6 m^-3, not 999999.9999999999
+    if target is None:
+        unchanged = np.array_equal(given.magnitude, ruler.magnitude)
+        plain = str(given.units if unchanged else ruler.units)
+        named = (u for u in NAMED_UNITS if registry().Quantity(1, u).check(ruler.dimensionality))
+        target = next(named, plain)
+    return factor, zero, unit_product([(target, 1)])
+
+
+def converts(ours: str, unit: str, *, is_variable: bool = False) -> bool:
+    """True for a unit, other than that of a pure number, which converts to that of our name."""
+    if unit in ("", "1"):
+        return False
+    try:
+        conversion(ours, unit, is_variable=is_variable)
+    except ValueError:
+        return False
+    return True
+
+
+def same_unit(unit: str, stated: str) -> bool:
+    """True if both texts mean the same unit, or if one of them is not a unit at all."""
+    try:
+        a, b = _ruler(unit).to_base_units(), _ruler(counted_in(stated)).to_base_units()
+    except unit_errors():
+        return True
+    return a.check(b.dimensionality) and np.allclose(a.magnitude, b.magnitude, rtol=1e-9, atol=0.0)
+
+
+def counted_in(stated: str) -> str:
+    """Unit of a NetCDF time attribute: `days` for `days since 1970-01-01`."""
+    return re.split(r"\s+since\s", stated, maxsplit=1)[0].strip()
+
+
+def _ruler(unit: str) -> Any:
+    """The values 0, 1 and 2 in a unit: they reveal its factor, its offset and any nonlinearity."""
+    check_unit(unit)
+    one: Any = registry().Quantity(netcdf_powers(unit))
+    return registry().Quantity(np.arange(3.0) * one.magnitude, one.units)

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.export import CLOCK
 from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
 from ep2sindy.data.numbers import count_dates, real_numbers, seconds
 from ep2sindy.data.quantities import axis_of, columns_in_si, time_unit
-from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.trajectory import CLOCK, Trajectory
 from ep2sindy.library.units import SECONDS, Clock, seconds_in
 from ep2sindy.runtime.values import check_list, check_positive
 
@@ -72,15 +71,15 @@ def trajectories_of(
     listed: list[Any] = [*cast("Sequence[Any]", runs)] if several else [runs]
     if not listed:
         raise ValueError("at least one run is needed: an empty list came")
-    if isinstance(t, list | tuple) and several:
-        if len(t) != len(listed):
-            raise ValueError(f"t must hold times for each run: {len(t)} came for {len(listed)}")
-        listed = [_timed(run, times) for run, times in zip(listed, t, strict=True)]
-    elif t is not None:
-        listed = [_timed(run, t) for run in listed]
-    which = [f" {k} of the list" if several else "" for k in range(len(listed))]
-    found = [_trajectory(run, word, partial) for run, word in zip(listed, which, strict=True)]
-    return [_with_inputs(run, inputs) for run in found]
+    times = t if isinstance(t, list | tuple) and several else [t] * len(listed)
+    if len(times) != len(listed):
+        raise ValueError(f"t must hold times for each run: {len(times)} came for {len(listed)}")
+    found = []
+    for k, (run, own) in enumerate(zip(listed, times, strict=True)):
+        timed = run if own is None else _timed(run, own)
+        which = f" {k} of the list" if several else ""
+        found.append(_with_inputs(_trajectory(timed, which, partial), inputs))
+    return found
 
 
 def _timed(run: object, t: object) -> object:
@@ -114,22 +113,20 @@ def _with_inputs(run: Trajectory, inputs: Sequence[str]) -> Trajectory:
     if unknown := [name for name in names if name not in run.state_names]:
         raise ValueError(f"unknown inputs {unknown}; the run has {list(run.names)}")
     own = np.isin(run.state_names, names)
-    missing = None
-    if run.missing is not None:
-        if (lacking := run.missing[:, own].any(axis=0)).any():
-            raise ValueError(
-                "an input needs a value at every sample: "
-                f"{np.array(run.state_names)[own][lacking].tolist()} lack some; fill them in, or "
-                "leave these samples out"
-            )
-        missing = run.missing[:, ~own]
+    missing = np.zeros(run.states.shape, dtype=bool) if run.missing is None else run.missing
+    if (lacking := missing[:, own].any(axis=0)).any():
+        raise ValueError(
+            "an input needs a value at every sample: "
+            f"{np.array(run.state_names)[own][lacking].tolist()} lack some; fill them in, or leave "
+            "these samples out"
+        )
     return replace(
         run,
         states=run.states[:, ~own],
         state_names=[name for name in run.state_names if name not in names],
         inputs=np.column_stack([run.inputs, run.columns(names)]),
         input_names=[*run.input_names, *names],
-        missing=missing if missing is not None and missing.any() else None,
+        missing=missing[:, ~own],
     )
 
 
@@ -249,7 +246,7 @@ def _present(
     else:
         kept = present_rows(dict(zip(states, values.T, strict=True)))
         words = describe_gaps(t[kept], len(t))
-    warnings.warn(words, MissingSamples, stacklevel=6)
+    warnings.warn(words, MissingSamples, stacklevel=5)
     return Trajectory(t[kept], values[kept], states, missing=missing, **kept_as_is)
 
 
@@ -275,10 +272,6 @@ def _from_arrays(t: object, x: object, partial: bool) -> Trajectory:
         raise ValueError(
             "arrays (t, x) must have shapes (samples,) and (samples,) or (samples, n_states): "
             f"{times.shape} and {states.shape} came"
-        )
-    if times.dtype.kind not in "iufmM" or states.dtype.kind not in "iuf":
-        raise ValueError(
-            f"arrays (t, x) must hold real numbers: {times.dtype} and {states.dtype} came"
         )
     columns = real_numbers(states[:, None] if states.ndim == 1 else states, "states")
     names = ["x"] if states.ndim == 1 else [f"x{k}" for k in range(states.shape[1])]

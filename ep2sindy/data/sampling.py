@@ -6,13 +6,14 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.fields import SPACE, cell_edges, cell_sizes, check_field, grid_points
+from ep2sindy.data.fields import SPACE, cell_edges, cell_sizes, grid_points
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone, describe_zone, resolve_zone, zone_average, zone_slices
 
@@ -39,24 +40,8 @@ def zone_averages(
     >>> ep.zone_averages(field, zones, states=["n_i", "n_n"]).state_names
     ('n_i@anode', 'n_n@anode', 'n_i@exit', 'n_n@exit')
     """
-    runs = {
-        name: zone_average(
-            field, zone, states=states, inputs=inputs, products=products,
-            axisymmetric=axisymmetric, label=label,
-        )
-        for name, zone in side_by_side(zones, field).items()
-    }  # fmt: skip
-    first = next(iter(runs.values()))
-    return Trajectory(
-        t=first.t,
-        states=np.column_stack([run.states for run in runs.values()]),
-        state_names=in_zones(runs, first.state_names),
-        inputs=np.column_stack([run.inputs for run in runs.values()]),
-        input_names=in_zones(runs, first.input_names),
-        units={f"{n}@{name}": unit for name, run in runs.items() for n, unit in run.units.items()},
-        label=label,
-        clock=first.clock,
-    )
+    average = ZoneAverage(states, None, products, axisymmetric, zones)
+    return average.trajectory(field, inputs=inputs, label=label)
 
 
 def in_zones(zones: Iterable[str], names: Sequence[str]) -> list[str]:
@@ -66,11 +51,6 @@ def in_zones(zones: Iterable[str], names: Sequence[str]) -> list[str]:
 
 def side_by_side(zones: Mapping[str, Zone | Sequence[float]], field: xr.Dataset) -> dict[str, Zone]:
     """Zones with ends in m that share no grid point; see `zone_averages`."""
-    if not isinstance(zones, Mapping) or not zones:
-        raise ValueError(
-            "zones must be given by name, with their ends in z in m, as in "
-            f"{{anode: [0, 0.0125], exit: [0.0125, 0.025]}}: {zones!r} came"
-        )
     found: dict[str, Zone] = {}
     taken, reached_m = 0, -math.inf
     for name, given in zones.items():
@@ -114,9 +94,8 @@ class ZoneAverage:
 
     def __post_init__(self) -> None:
         zones = self.zones
-        if zones is None or isinstance(zones, Mapping):
-            return
-        if isinstance(zones, bool) or not isinstance(zones, int) or zones < 1:
+        is_number = type(zones) is int and zones >= 1
+        if not (zones is None or is_number or (isinstance(zones, Mapping) and zones)):
             raise ValueError(
                 "zones must be a whole number of parts, one or more, or zones by name, such as "
                 f"{{anode: [0, 0.01], exit: [0.01, 0.025]}} in m: {zones!r} came"
@@ -142,16 +121,24 @@ class ZoneAverage:
         return list(self.zones or {})
 
     def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
-        settings: Any = {
-            "states": self.states,
-            "inputs": inputs,
-            "products": self.products,
-            "axisymmetric": self.axisymmetric,
-            "label": label,
-        }
+        average = partial(
+            zone_average, field, states=self.states, inputs=inputs, products=self.products,
+            axisymmetric=self.axisymmetric, label=label,
+        )  # fmt: skip
         if self.zones is None:
-            return zone_average(field, self.zone, **settings)
-        return zone_averages(field, self.parts(field), **settings)
+            return average(self.zone)
+        runs = {name: average(zone) for name, zone in self.parts(field).items()}
+        first = next(iter(runs.values()))
+        return replace(
+            first,
+            states=np.column_stack([run.states for run in runs.values()]),
+            state_names=in_zones(runs, first.state_names),
+            inputs=np.column_stack([run.inputs for run in runs.values()]),
+            input_names=in_zones(runs, first.input_names),
+            units={
+                f"{n}@{zone}": unit for zone, run in runs.items() for n, unit in run.units.items()
+            },
+        )
 
     def columns(self, names: Sequence[str]) -> list[str]:
         """What the averages of variables are called in the trajectory."""
@@ -223,7 +210,6 @@ def point_samples(
 
     Raises ValueError for a place outside the grid's cells or without plasma.
     """
-    check_field(field)
     nearest = _nearest(field, z=z, r=r)
     return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)
 

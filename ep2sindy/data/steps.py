@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
 from glob import glob
 from pathlib import Path
 
@@ -29,22 +30,6 @@ NUMBER = re.compile(r"(\d+)")
 LEAST_UNNAMED = 3  # numbers without such a word; two may be kinds of particles
 
 Place = tuple[FileSource, str]
-
-
-@dataclass(frozen=True)
-class StepGroups:
-    """Arrays of the groups of steps. arrays: joined name -> number of the step -> name in the file.
-    words: words before the numbers.
-    """
-
-    arrays: Mapping[str, Mapping[int, str]]
-    words: frozenset[str]
-
-    @property
-    def numbers(self) -> list[int]:
-        """Numbers of the steps: those that most arrays have."""
-        counts = Counter(tuple(sorted(places)) for places in self.arrays.values())
-        return list(counts.most_common(1)[0][0]) if counts else []
 
 
 def open_record(path: str | Path | Sequence[str | Path]) -> FileSource:
@@ -99,25 +84,29 @@ def join_groups(source: FileSource) -> FileSource:
     """Join the groups of steps of a file along time; a file without such groups stays as it is."""
     if source.is_table:
         return source
-    groups = step_groups(source.names)
-    least = 2 if groups.words - {""} else LEAST_UNNAMED
-    if len(groups.numbers) < least or _has_times(source, groups):
-        return source
-    inside = {name for places in groups.arrays.values() for name in places.values()}
+    arrays, words = step_groups(source.names)
+    numbers = _usual_numbers(arrays)
+    inside = {name for places in arrays.values() for name in places.values()}
     shared = {name: (source, name) for name in source.names if name not in inside}
+    firsts = [places[min(places)] for places in arrays.values()]
+    times = [name for name in (*shared, *firsts) if axis_of(name) == "time"]
+    if len(numbers) < (2 if words - {""} else LEAST_UNNAMED):
+        return source
+    with damage_named(source.path):
+        if any(source.read(name).size > 1 for name in times):  # the groups are no steps then
+            return source
     steps = {
-        number: {
-            name: (source, places[number])
-            for name, places in groups.arrays.items()
-            if number in places
-        }
-        for number in groups.numbers
+        number: {n: (source, places[number]) for n, places in arrays.items() if number in places}
+        for number in numbers
     }
     return _joined(source, steps, shared, "groups")
 
 
-def step_groups(names: Sequence[str]) -> StepGroups:
-    """Find the arrays of numbered groups: `data/100/n_i` is `data/n_i` at step 100."""
+def step_groups(names: Sequence[str]) -> tuple[dict[str, dict[int, str]], set[str]]:
+    """Find the arrays of numbered groups: `data/100/n_i` is `data/n_i` at step 100.
+
+    Returns joined name -> number of the step -> name in the file, and the words before the numbers.
+    """
     arrays: dict[str, dict[int, str]] = defaultdict(dict)
     words = set()
     for name in names:
@@ -129,20 +118,13 @@ def step_groups(names: Sequence[str]) -> StepGroups:
                 arrays[joined][int(found["number"])] = name
                 words.add(found["word"].lower())
                 break
-    return StepGroups(dict(arrays), frozenset(words))
+    return dict(arrays), words
 
 
-def _has_times(source: FileSource, groups: StepGroups) -> bool:
-    """True if an array of the file holds times; its numbered groups are then no steps."""
-    first = {places[number] for places in groups.arrays.values() for number in [min(places)]}
-    inside = {name for places in groups.arrays.values() for name in places.values()}
-    looked_at = [name for name in source.names if name in first or name not in inside]
-    return any(_size(source, name) > 1 for name in looked_at if axis_of(name) == "time")
-
-
-def _size(source: FileSource, name: str) -> int:
-    with damage_named(source.path):
-        return source.read(name).size
+def _usual_numbers(arrays: Mapping[str, Mapping[int, str]]) -> tuple[int, ...]:
+    """Numbers of the steps: those that most arrays have."""
+    counts = Counter(tuple(sorted(places)) for places in arrays.values())
+    return counts.most_common(1)[0][0] if counts else ()
 
 
 # Files of one run.
@@ -156,7 +138,8 @@ def are_steps(files: Sequence[str]) -> bool:
     if len(files) < 2 or len(_numbers(files)) < len(files):
         return False
     source = open_source(Path(files[0]))
-    if source.is_table or source.step_s is not None or len(step_groups(source.names).numbers) > 1:
+    groups, _ = step_groups(source.names)
+    if source.is_table or source.step_s is not None or len(_usual_numbers(groups)) > 1:
         return False
     with damage_named(source.path):
         arrays = {name: source.read(name) for name in source.names}
@@ -185,11 +168,8 @@ def join_files(files: Sequence[str]) -> FileSource:
     sources = {number: open_source(Path(file)) for number, file in _numbers(files).items()}
     steps = {}
     for number, source in sources.items():
-        inside = {
-            place: name
-            for name, places in step_groups(source.names).arrays.items()
-            for place in places.values()
-        }
+        groups, _ = step_groups(source.names)
+        inside = {place: name for name, places in groups.items() for place in places.values()}
         steps[number] = {inside.get(name, name): (source, name) for name in source.names}
     first, *_, last = sources.values()
     parts = zip(*(NUMBER.split(source.path.name) for source in (first, last)), strict=True)
@@ -208,11 +188,14 @@ def _joined(
 ) -> FileSource:
     """Source of arrays joined over steps. first: gives all else. shared: arrays beside the steps.
 
+    Each array is read once, for it may take thousands of files.
     Arrays that some steps lack, and lists of particles, whose lengths change, are left out.
     """
     numbers = sorted(steps)
     everywhere = [n for n in steps[numbers[0]] if all(n in step for step in steps.values())]
-    kept = [n for n in everywhere if _has_one_shape(steps[numbers[0]][n], steps[numbers[-1]][n])]
+    shapes = [{n: source.read(inside).shape for n, (source, inside) in steps[k].items()
+               if n in everywhere} for k in (numbers[0], numbers[-1])]  # fmt: skip
+    kept = [name for name in everywhere if shapes[0][name] == shapes[1][name]]
     left = sorted({name for step in steps.values() for name in step} - set(kept))
     places = {name if name not in shared else f"step/{name}": name for name in kept}
 
@@ -225,14 +208,9 @@ def _joined(
     words = f"{len(numbers)} {kind} joined along time, steps {numbers[0]} to {numbers[-1]}"
     words += f"; left out, not in every step or of changing size: {', '.join(left)}" * bool(left)
     return replace(
-        first, names=[*places, *shared], read=_remember(read), aliases=(), words=words,
+        first, names=[*places, *shared], read=cache(read), aliases=(), words=words,
         steps=tuple(numbers),
     )  # fmt: skip
-
-
-def _has_one_shape(first: Place, last: Place) -> bool:
-    (source, name), (other, other_name) = first, last
-    return source.read(name).shape == other.read(other_name).shape
 
 
 def _stack(places: Sequence[Place], name: str, numbers: Sequence[int], named: bool) -> xr.DataArray:
@@ -251,15 +229,3 @@ def _stack(places: Sequence[Place], name: str, numbers: Sequence[int], named: bo
         return first
     dims = ["steps", *map(str, first.dims)] if named else None
     return xr.DataArray(values, dims=dims, attrs=first.attrs)
-
-
-def _remember(read: Callable[[str], xr.DataArray]) -> Callable[[str], xr.DataArray]:
-    """The same function, which reads each array once: it may take thousands of files."""
-    kept: dict[str, xr.DataArray] = {}
-
-    def remembered(name: str) -> xr.DataArray:
-        if name not in kept:
-            kept[name] = read(name)
-        return kept[name]
-
-    return remembered

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.export import as_dataframe, as_dataset
 from ep2sindy.data.gaps import LONGEST_STEP, MIN_STRETCH, between_gaps, mean_step, usual_step
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.names import check_state
@@ -92,7 +91,7 @@ class Trajectory:
             check_state(name)
         self._check_shapes()
         check_time(self.t)
-        check_finite(self.t, self.values, self.names)
+        self._check_finite()
         check_magnitude(self.values, self.names)
         self._check_variation()
 
@@ -107,10 +106,8 @@ class Trajectory:
                 f"{missing.dtype} of shape {missing.shape} came with states of shape "
                 f"{states.shape}; write missing=np.isnan(states)"
             )
-        empty = [
-            name for name, lacks in zip(self.state_names, missing.T, strict=False) if lacks.all()
-        ]
-        if empty:
+        lacking = np.atleast_1d(missing.all(axis=0))
+        if empty := [n for n, lacks in zip(self.state_names, lacking, strict=False) if lacks]:
             raise ValueError(
                 f"every state needs samples: all of {empty} are missing; leave them out, or name "
                 "them in hidden=..."
@@ -118,10 +115,8 @@ class Trajectory:
         t, filled = seconds(self.t), np.array(states, dtype=np.float64)
         for column, lacks in zip(filled.T, missing.T, strict=True):
             column[lacks] = np.interp(t[lacks], t[~lacks], column[~lacks])
-        missing = missing.copy()
-        missing.flags.writeable = False
-        object.__setattr__(self, "missing", missing if missing.any() else None)
-        return read_only(filled)
+        object.__setattr__(self, "missing", locked(missing.copy()) if missing.any() else None)
+        return locked(filled)
 
     def complete(self) -> Trajectory:
         """The samples at which every state was measured, for methods that need all of them.
@@ -189,16 +184,13 @@ class Trajectory:
                 f"a window must lie inside the trajectory: [{start}, {stop}) was asked of "
                 f"{self.n_samples} samples"
             )
-        return Trajectory(
-            t=self.t[start:stop],
-            states=self.states[start:stop],
-            state_names=self.state_names,
-            inputs=self.inputs[start:stop],
-            input_names=self.input_names,
-            units=self.units,
-            label=self.label,
-            clock=self.clock,
-            missing=None if self.missing is None else self.missing[start:stop],
+        part = slice(start, stop)
+        return replace(
+            self,
+            t=self.t[part],
+            states=self.states[part],
+            inputs=self.inputs[part],
+            missing=None if self.missing is None else self.missing[part],
         )
 
     def stretches(self, min_samples: int = MIN_STRETCH) -> list[Trajectory]:
@@ -291,6 +283,16 @@ class Trajectory:
         if not self.state_names:
             raise ValueError("a trajectory needs at least one state; name one in state_names")
 
+    def _check_finite(self) -> None:
+        rows, columns = np.nonzero(~np.isfinite(self.values))
+        if rows.size:
+            k, name = rows[0], self.names[columns[0]]
+            raise ValueError(
+                f"samples must be finite: {name}[{k}] = {self.values[k, columns[0]]} at t = "
+                f"{self.t[k]:.6g} s ({rows.size} such values); crop, mask or interpolate them "
+                "first, or say that they were not measured (missing=np.isnan(states))"
+            )
+
     def _check_variation(self) -> None:
         columns = np.ascontiguousarray(self.states.T)  # reductions over few columns are slow
         for name, width, level in zip(
@@ -308,34 +310,23 @@ def check_time(t: Float[np.ndarray, " samples"]) -> None:
     """Raise ValueError unless t has two samples or more, is finite and increases."""
     if t.ndim != 1 or len(t) < 2:
         raise ValueError(f"a trajectory needs at least two samples: t has shape {t.shape}")
-    bad = np.flatnonzero(~np.isfinite(t))
+    check_increasing("t", t, "s")
+
+
+def check_increasing(name: str, points: Float[np.ndarray, " points"], unit: str) -> None:
+    """Raise ValueError unless points are finite and increase."""
+    bad = np.flatnonzero(~np.isfinite(points))
     if bad.size:
         raise ValueError(
-            f"t must be finite: t[{bad[0]}] = {t[bad[0]]} ({bad.size} such samples); "
-            "cut or fill them first"
+            f"{name} must be finite: {name}[{bad[0]}] = {points[bad[0]]} ({bad.size} such "
+            "samples); cut or fill them first"
         )
-    stalls = np.flatnonzero(np.diff(t) <= 0)
+    stalls = np.flatnonzero(np.diff(points) <= 0)
     if stalls.size:
         k = int(stalls[0])
         raise ValueError(
-            f"t must increase: t[{k + 1}] = {t[k + 1]:.9g} s follows {t[k]:.9g} s; "
-            "drop repeated samples or sort by time first"
-        )
-
-
-def check_finite(
-    t: Float[np.ndarray, " samples"],
-    values: Float[np.ndarray, "samples variables"],
-    names: Sequence[str],
-) -> None:
-    """Raise ValueError naming the first sample that is NaN or infinite."""
-    rows, columns = np.nonzero(~np.isfinite(values))
-    if rows.size:
-        k, j = rows[0], columns[0]
-        raise ValueError(
-            f"samples must be finite: {names[j]}[{k}] = {values[k, j]} at t = {t[k]:.6g} s "
-            f"({rows.size} such values); crop, mask or interpolate them first, or say that they "
-            "were not measured (missing=np.isnan(states))"
+            f"{name} must increase: {name}[{k + 1}] = {points[k + 1]:.9g} {unit} follows "
+            f"{points[k]:.9g} {unit}; drop what repeats, or sort by {name} first"
         )
 
 
@@ -395,3 +386,37 @@ def spread_blocks(runs: Sequence[Trajectory], *, most: int, block: int) -> list[
         with suppress(ValueError):  # a state may rest, or be missing, for as long as a block
             found.append(run.window(first, last))
     return found or list(runs)
+
+
+# Samples as a pandas table or an xarray Dataset, to go on with in other tools.
+
+
+CLOCK = "read_in"  # attribute of the time coordinate: the unit in which times are displayed
+
+
+def as_dataframe(
+    t: Float[np.ndarray, " samples"],
+    values: Float[np.ndarray, "samples variables"],
+    names: Sequence[str],
+) -> pd.DataFrame:
+    """A column per variable, in SI, over an index `time_s`; `ep.discover` takes it as a run."""
+    import pandas as pd  # takes time to import, and few ask for it
+
+    return pd.DataFrame(values, index=pd.Index(t, name="time_s"), columns=list(names))
+
+
+def as_dataset(
+    t: Float[np.ndarray, " samples"],
+    values: Float[np.ndarray, "samples variables"],
+    names: Sequence[str],
+    units: Mapping[str, str],
+    clock: Clock,
+) -> xr.Dataset:
+    """A variable for each name over `time` in s, with units and the clock's as attributes."""
+    import xarray as xr
+
+    columns = zip(names, values.T, strict=True)
+    return xr.Dataset(
+        {name: ("time", column, {"units": units[name]}) for name, column in columns},
+        coords={"time": ("time", t, {"units": "s", CLOCK: clock.unit})},
+    )

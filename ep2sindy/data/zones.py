@@ -102,13 +102,11 @@ def average_of(field: xr.Dataset, factors: Factors, *, faces: bool = False) -> F
 
 
 def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str]) -> None:
-    unknown = [name for name in used if name not in field.data_vars]
-    if unknown:
-        made = [(n, *MADE_FROM[n]) for n in unknown if n in MADE_FROM]
+    if unknown := [name for name in used if name not in field.data_vars]:
         hints = [
             f"; {name} is made from {source}: 'prepare=[{{_target_:{step}}}]'"
-            for name, source, step in made
-            if source in field
+            for name, (source, step) in MADE_FROM.items()
+            if name in unknown and source in field
         ]
         hints = hints or [near_words(unknown[0], map(str, field.data_vars))]
         raise ValueError(
@@ -148,7 +146,7 @@ def _means(
     part: xr.Dataset,
     masks: Mapping[str, Bool[np.ndarray, "1 _ _"]],
     weights: Float[np.ndarray, "z r"],
-    columns: Sequence[Sequence[tuple[str, int]]],
+    columns: Sequence[Factors],
 ) -> Float[np.ndarray, "samples columns"]:
     """Weighted means of products of variables over the cells at all times, block by block."""
     means = np.zeros((part.sizes["time"], len(columns)))
@@ -234,9 +232,7 @@ def _at_peak(field: xr.Dataset) -> str:
     for name, variable in field.data_vars.items():
         if variable.attrs.get("units") == "T" and "z" in variable.dims:
             others = [axis for axis in variable.dims if axis != "z"]
-            strength = np.abs(variable.values.astype(float)).mean(
-                axis=tuple(variable.dims.index(axis) for axis in others)
-            )
+            strength = abs(variable.astype(float)).mean(others).values
             peak_m = grid_points(field, "z")[int(np.nanargmax(strength))]
             return f" ({name} is strongest at {peak_m:.4g} m, where most thrusters have their exit)"
     return ""

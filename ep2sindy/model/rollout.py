@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ep2sindy.data.export import as_dataframe, as_dataset
 from ep2sindy.data.numbers import band_of, zero_to_one
-from ep2sindy.data.trajectory import Trajectory, check_time
+from ep2sindy.data.trajectory import Trajectory, as_dataframe, as_dataset, check_time
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.inputs import Curve, curve_through, driven

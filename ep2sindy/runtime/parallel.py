@@ -15,7 +15,7 @@ from pathlib import Path
 from threading import RLock
 from time import perf_counter
 from types import ModuleType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import cloudpickle
 from joblib import Memory, Parallel, delayed, effective_n_jobs
@@ -30,6 +30,10 @@ START_S = 4.5
 # Pieces submitted to a cluster per thread, including the running one; they queue with their data.
 AHEAD = 2
 
+Function: TypeAlias = Callable[[Any], Any]  # of a piece
+Numbered: TypeAlias = tuple[int, Any]  # the number of a piece, and the piece or its result
+Results: TypeAlias = Iterator[Numbered]
+
 
 @runtime_checkable
 class Workers(Protocol):
@@ -40,12 +44,10 @@ class Workers(Protocol):
     results must be picklable.
     """
 
-    def run(
-        self, function: Callable[[Any], Any], pieces: Iterable[Any]
-    ) -> Iterator[tuple[int, Any]]: ...
+    def run(self, function: Function, pieces: Iterable[Any]) -> Results: ...
 
 
-def _on_one_thread(function: Callable[[Any], Any], numbered: tuple[int, Any]) -> tuple[int, Any]:
+def _on_one_thread(function: Function, numbered: Numbered) -> Numbered:
     number, piece = numbered
     with one_thread():
         return number, function(piece)
@@ -53,7 +55,7 @@ def _on_one_thread(function: Callable[[Any], Any], numbered: tuple[int, Any]) ->
 
 def collect(
     workers: Workers,
-    function: Callable[[Any], Any],
+    function: Function,
     pieces: Sequence[Any],
     stage: AbstractContextManager[Callable[[int], None]],
     *,
@@ -94,7 +96,7 @@ def rows_in_order(
     return [row for rows in found for row in rows]
 
 
-def _in_worker(code: bytes, parent: int, numbered: tuple[int, Any]) -> tuple[int, Any]:
+def _in_worker(code: bytes, parent: int, numbered: Numbered) -> Numbered:
     from tqdm import tqdm
 
     if os.getpid() != parent:  # inside a worker, joblib runs nested work in the same process
@@ -103,11 +105,11 @@ def _in_worker(code: bytes, parent: int, numbered: tuple[int, Any]) -> tuple[int
     return _sent_on_one_thread(code, numbered)
 
 
-def _sent_on_one_thread(code: bytes, numbered: tuple[int, Any]) -> tuple[int, Any]:
+def _sent_on_one_thread(code: bytes, numbered: Numbered) -> Numbered:
     return _on_one_thread(pickle.loads(code), numbered)
 
 
-def _with_its_code(function: Callable[[Any], Any], *packages: ModuleType) -> bytes:
+def _with_its_code(function: Function, *packages: ModuleType) -> bytes:
     """Pickle a function with the code of packages that workers cannot import by name.
 
     These are the given packages, and the modules in the folder of the run that configs have named.
@@ -121,9 +123,7 @@ def _with_its_code(function: Callable[[Any], Any], *packages: ModuleType) -> byt
 class Serial:
     """Workers that compute one piece after the other, in this process."""
 
-    def run(
-        self, function: Callable[[Any], Any], pieces: Iterable[Any]
-    ) -> Iterator[tuple[int, Any]]:
+    def run(self, function: Function, pieces: Iterable[Any]) -> Results:
         for numbered in enumerate(pieces):
             yield _on_one_thread(function, numbered)
 
@@ -147,9 +147,7 @@ class Loky:
                 "came"
             )
 
-    def run(
-        self, function: Callable[[Any], Any], pieces: Iterable[Any]
-    ) -> Iterator[tuple[int, Any]]:
+    def run(self, function: Function, pieces: Iterable[Any]) -> Results:
         if effective_n_jobs(self.n_jobs) == 1:
             yield from ONE_BY_ONE.run(function, pieces)
             return
@@ -184,28 +182,24 @@ class KeptWorkers:
     folder: Path | None
     _calls: Iterator[int] = field(default_factory=count)
 
-    def run(
-        self, function: Callable[[Any], Any], pieces: Iterable[Any]
-    ) -> Iterator[tuple[int, Any]]:
+    def run(self, function: Function, pieces: Iterable[Any]) -> Results:
         return self.workers.run(self.keeping(function), enumerate(pieces))
 
     def once(self, function: Callable[[], Any]) -> Any:
         """The result of one piece of work that is done in this process."""
         return self.keeping(lambda _: function())((0, None))
 
-    def keeping(self, function: Callable[[Any], Any]) -> Callable[[tuple[int, Any]], Any]:
+    def keeping(self, function: Function) -> Callable[[Numbered], Any]:
         """The function of numbered pieces that does each, or reads its result back."""
         return partial(_kept_piece, self.folder, next(self._calls), function)
 
 
-def _kept_piece(
-    folder: Path | None, call: int, function: Callable[[Any], Any], numbered: tuple[int, Any]
-) -> Any:
+def _kept_piece(folder: Path | None, call: int, function: Function, numbered: Numbered) -> Any:
     number, piece = numbered
     return kept(folder, (call, number), function, piece) if folder else function(piece)
 
 
-def kept(folder: Path, piece: tuple[int, int], function: Callable[[Any], Any], value: Any) -> Any:
+def kept(folder: Path, piece: tuple[int, int], function: Function, value: Any) -> Any:
     """`function(value)`, or what it returned when this piece was done before.
 
     piece: numbers of the piece's call and of the piece in it.
@@ -215,22 +209,21 @@ def kept(folder: Path, piece: tuple[int, int], function: Callable[[Any], Any], v
     )
 
 
-def _done(piece: tuple[int, int], function: Callable[[Any], Any], value: Any) -> Any:
+def _done(piece: tuple[int, int], function: Function, value: Any) -> Any:
     return function(value)
 
 
 def run_alike(
-    workers: Workers, function: Callable[[Any], Any], pieces: Iterable[Any], n_pieces: int
-) -> Iterator[tuple[int, Any]]:
+    workers: Workers, function: Function, pieces: Iterable[Any], n_pieces: int
+) -> Results:
     """Run pieces of which each takes about as long; processes start only if they save time.
 
     The first piece is then done in this process, and the others too if they would take less time
     than the start of the processes.
     """
     if isinstance(workers, KeptWorkers):
-        yield from run_alike(
-            workers.workers, workers.keeping(function), enumerate(pieces), n_pieces
-        )
+        kept = workers.keeping(function)
+        yield from run_alike(workers.workers, kept, enumerate(pieces), n_pieces)
         return
     waiting = iter(pieces)
     n_first = 1 if isinstance(workers, Loky) else 0
@@ -257,9 +250,7 @@ class Dask:
     address: str
     timeout_s: float = 10.0
 
-    def run(
-        self, function: Callable[[Any], Any], pieces: Iterable[Any]
-    ) -> Iterator[tuple[int, Any]]:
+    def run(self, function: Function, pieces: Iterable[Any]) -> Results:
         distributed = _distributed()
         with self._client(distributed) as client:
             yield from self._run(client, distributed.as_completed, function, pieces)
@@ -283,12 +274,8 @@ class Dask:
             yield client
 
     def _run(
-        self,
-        client: Any,
-        as_completed: Callable,
-        function: Callable[[Any], Any],
-        pieces: Iterable[Any],
-    ) -> Iterator[tuple[int, Any]]:
+        self, client: Any, as_completed: Callable, function: Function, pieces: Iterable[Any]
+    ) -> Results:
         waiting, n_running = enumerate(pieces), 0
         code = _with_its_code(function, *_package_of(function))
 
@@ -314,7 +301,7 @@ class Dask:
             yield result
 
 
-def _package_of(function: Callable[[Any], Any]) -> list[ModuleType]:
+def _package_of(function: Function) -> list[ModuleType]:
     """Package of a function as a list; empty for this package or the main program.
 
     Those two need not be sent with their code.

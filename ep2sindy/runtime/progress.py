@@ -35,19 +35,6 @@ class Progress(Protocol):
 
 
 @dataclass(frozen=True)
-class Silent:
-    """Progress that is not displayed."""
-
-    def stage(
-        self, total: int | None, unit: str, label: str = ""
-    ) -> AbstractContextManager[Advance]:
-        return nullcontext(nothing)
-
-
-SILENT = Silent()
-
-
-@dataclass(frozen=True)
 class Bars:
     """Progress bars on standard error, one per stage, in a terminal or a notebook.
 
@@ -104,6 +91,9 @@ class Told:
         self, total: int | None, unit: str, label: str = ""
     ) -> AbstractContextManager[Advance]:
         return nullcontext(self.advance)
+
+
+SILENT = Told(nothing)
 
 
 def is_watched() -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from ep2sindy.data.quantities import QUANTITIES
+from ep2sindy.data.quantities import KNOWN_UNITS
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.method import AnyMethod, Regression
@@ -205,7 +205,7 @@ class Study:
         A name that is no known quantity stays, to be refused.
         """
         lacking = {
-            name: [each for each in case.variables if each in QUANTITIES and each not in field]
+            name: [each for each in case.variables if each in KNOWN_UNITS and each not in field]
             for name, case in self.libraries.items()
         }
         if all(lacking.values()):

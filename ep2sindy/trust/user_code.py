@@ -13,8 +13,8 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, chdir, contextmanager, nullcontext
-from importlib.machinery import ModuleSpec, SourceFileLoader
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from importlib.machinery import FileFinder, ModuleSpec, SourceFileLoader
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any, TypeVar
@@ -51,15 +51,13 @@ def away_from(settings: str) -> AbstractContextManager[None]:
 @contextmanager
 def isolate_children() -> Iterator[None]:
     """Let Python processes started in this context import nothing from the current folder."""
-    before = os.environ.get(SAFE)
+    before = {SAFE: os.environ[SAFE]} if SAFE in os.environ else {}
     os.environ[SAFE] = "1"
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[SAFE]
-        else:
-            os.environ[SAFE] = before
+        del os.environ[SAFE]
+        os.environ.update(before)
 
 
 def for_configs(call: Called) -> Called:
@@ -121,7 +119,8 @@ def load_user_module(name: str) -> ModuleType:
     """
     parts = name.split(".")
     here = Path.cwd()
-    if not all(part.isidentifier() for part in parts) or _file(here.joinpath(*parts)) is None:
+    place = here.joinpath(*parts)
+    if not all(part.isidentifier() for part in parts) or _file(place) is None:
         raise ModuleNotFoundError(f"{here} has no {'/'.join(parts)}.py", name=name)
     for k in range(1, len(parts) + 1):
         _load(".".join(parts[:k]), here.joinpath(*parts[:k]))
@@ -155,7 +154,9 @@ def _load(name: str, place: Path) -> None:
         )
     if name in sys.modules:
         return
-    spec = _spec(name, place)
+    # A module, a package, or a folder with modules.
+    spec = FileFinder(str(place.parent), (_Source, [".py"])).find_spec(name)
+    assert spec is not None
     module = sys.modules[name] = module_from_spec(spec)
     try:
         if spec.loader is not None:
@@ -173,21 +174,6 @@ def _load(name: str, place: Path) -> None:
 def _lies_at(spec: ModuleSpec, place: Path) -> bool:
     files = [spec.origin or "", *(spec.submodule_search_locations or ())]
     return any(Path(file).with_suffix("") in (place, place / "__init__") for file in files)
-
-
-def _spec(name: str, place: Path) -> ModuleSpec:
-    """Import specification of a module, a package, or a folder with modules."""
-    file = _file(place)
-    if file is None:
-        spec = ModuleSpec(name, None, is_package=True)
-        spec.submodule_search_locations = [str(place)]
-        return spec
-    inside = [str(place)] if file.name == "__init__.py" else None
-    found = spec_from_file_location(
-        name, file, loader=_Source(name, str(file)), submodule_search_locations=inside
-    )
-    assert found is not None
-    return found
 
 
 class _Source(SourceFileLoader):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -36,16 +35,15 @@ def read_hallthruster(path: Path) -> FileSource:
     columns = {name: v for name, v in leaves(beside).items() if _is_column(v)}
     if not frames and not columns:
         raise ValueError("it holds no output.frames; run the simulation with save_time_resolved")
-    inside = list(leaves(frames[0])) if frames else []
-    grid = [name for name in ("z",) if name in inside]  # the fixed grid is repeated in every frame
+    flat = [leaves(frame) for frame in frames]
+    inside = [*flat[0]] if flat else []
 
     def read(name: str) -> xr.DataArray:
-        if name in grid:
-            return xr.DataArray(np.array(frames[0][name], dtype=np.float64))
         if name not in inside:
-            return xr.DataArray(np.array(columns[name], dtype=np.float64))
-        rows = [reduce(_step_into, name.split("."), frame) for frame in frames]
-        return xr.DataArray(np.array(rows, dtype=np.float64))
+            values = columns[name]
+        else:  # the fixed grid is repeated in every frame
+            values = flat[0][name] if name == "z" else [frame[name] for frame in flat]
+        return xr.DataArray(np.array(values, dtype=np.float64))
 
     names = [*inside, *(name for name in columns if name not in inside)]
     channel_m = _channel_m(content) if isinstance(content, dict) else None
@@ -86,15 +84,11 @@ def _units(names: Sequence[str]) -> dict[str, str]:
 
 def _channel_m(content: Mapping[str, Any]) -> float | None:
     """Length of the channel in m, from the input that newer versions store with the output."""
-    places = ("input", "config", "thruster", "geometry", "channel_length")
-    node: Any = content
-    for place in places:
-        node = node.get(place) if isinstance(node, dict) else None
+    try:
+        node = content["input"]["config"]["thruster"]["geometry"]["channel_length"]
+    except (KeyError, TypeError):
+        return None
     return float(node) if isinstance(node, int | float) else None
-
-
-def _step_into(node: Any, key: str) -> Any:
-    return node[int(key)] if isinstance(node, list) else node[key]
 
 
 HALLTHRUSTER = Reader("HallThruster.jl", read_hallthruster, form="other", endings=(".json",))

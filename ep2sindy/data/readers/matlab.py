@@ -17,11 +17,11 @@ V73 = b"MATLAB 7.3"
 def read_matlab(path: Path) -> FileSource:
     """Read a MATLAB file of either format; a struct's field is named "data.n_i"."""
     with path.open("rb") as file:
-        return read_matlab73(path) if file.read(len(V73)) == V73 else read_matlab5(path)
+        return _read_hdf5(path) if file.read(len(V73)) == V73 else _read_old(path)
 
 
-def read_matlab73(path: Path) -> FileSource:
-    """Read MATLAB v7.3, which is HDF5 with reversed axes; a struct's field is named "data.n_i"."""
+def _read_hdf5(path: Path) -> FileSource:
+    """Read MATLAB v7.3, which is HDF5 with reversed axes."""
     import h5py
 
     def read(name: str) -> xr.DataArray:
@@ -35,21 +35,15 @@ def read_matlab73(path: Path) -> FileSource:
                 )
             return stored_array(path, found).T
 
-    names = [
-        name.replace("/", ".") for name in names_in_hdf5(path) if not name.startswith("#refs#")
-    ]
-    return FileSource(path, names, read)
+    names = [name for name in names_in_hdf5(path) if not name.startswith("#refs#")]
+    return FileSource(path, [name.replace("/", ".") for name in names], read)
 
 
-def read_matlab5(path: Path) -> FileSource:
-    """Read MATLAB up to v7; a struct's field is named "data.n_i"."""
+def _read_old(path: Path) -> FileSource:
+    """Read MATLAB up to v7."""
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
-    try:
-        content = loadmat(path, simplify_cells=True)
-    except MatReadError as error:
-        raise ValueError(str(error)) from error
+    content = loadmat(path, simplify_cells=True)
     arrays = leaves({name: value for name, value in content.items() if not name.startswith("__")})
     return FileSource(path, list(arrays), lambda name: xr.DataArray(np.asarray(arrays[name])))
 

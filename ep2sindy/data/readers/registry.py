@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
-from ep2sindy.data.readers.csv import CSV
 from ep2sindy.data.readers.hallthruster import HALLTHRUSTER
 from ep2sindy.data.readers.hdf5 import HDF5
 from ep2sindy.data.readers.matlab import MATLAB, NPZ
 from ep2sindy.data.readers.netcdf import NETCDF, ZARR
 from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_at
-from ep2sindy.data.readers.tables import EXCEL, NPY, PARQUET
-from ep2sindy.data.readers.tdms import TDMS
+from ep2sindy.data.readers.tables import CSV, EXCEL, NPY, PARQUET, TDMS
 from ep2sindy.runtime.screen import joined
 
-# The order does not matter, since no two readers claim a file equally strongly.
-READERS = (NETCDF, HDF5, MATLAB, NPZ, NPY, EXCEL, PARQUET, TDMS, CSV, HALLTHRUSTER, ZARR)
+# The first that takes a file reads it: those by their first bytes, then those by form and ending.
+READERS = (MATLAB, NPY, PARQUET, TDMS, EXCEL, NETCDF, HDF5, NPZ, CSV, HALLTHRUSTER, ZARR)
 
 
 def open_source(path: Path) -> FileSource:
@@ -30,10 +28,10 @@ def open_source(path: Path) -> FileSource:
             "'ep2sindy[files]', or save it as CSV"
         )
     with damage_named(path):
-        return reader.open(path)
+        return replace(reader.open(path), kind=reader.name)
 
 
-def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
+def reader_of(path: Path) -> Reader:
     """Choose the reader of a file by its first bytes, or else by its ending.
 
     Raises ValueError for a file that is missing, empty or of no known kind; the last error lists
@@ -45,24 +43,23 @@ def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
         raise ValueError(f"a file or a folder must come: {path} is a pipe, a socket or a device")
     if path.is_file() and path.stat().st_size == 0:
         raise ValueError(f"{path} is empty: it holds no bytes; was it written to the end?")
-    look = look_at(path)
-    claims = [reader.claim(look) for reader in readers]
-    if any(claims):
-        return readers[claims.index(max(claims))]
-    if look.form == "folder":
-        folders = joined([e for r in readers if r.form == "folder" for e in r.endings], "or")
+    form, head, ending = look_at(path)
+    if takers := [reader for reader in READERS if reader.takes(form, head, ending)]:
+        return takers[0]
+    if form == "folder":
+        folders = joined([e for r in READERS if r.form == "folder" for e in r.endings], "or")
         counts = Counter(each.suffix for each in path.iterdir() if each.is_file() and each.suffix)
         way_out = ", with no files in it"
         if counts:
-            (ending, n), *_ = counts.most_common(1)
-            way_out = f"; take its {n} files that end in {ending}, '{path}/*{ending}'"
+            (most, n), *_ = counts.most_common(1)
+            way_out = f"; take its {n} files that end in {most}, '{path}/*{most}'"
         raise ValueError(
             f"a file must come, or a folder that ends in {folders}: {path} is a folder{way_out}"
         )
-    by_ending = [r for r in readers if r.form in ("other", "folder")]
-    kinds = joined([r.name for r in readers if r not in by_ending], "or")
-    endings = joined([ending for r in by_ending for ending in r.endings], "or")
+    by_ending = [r for r in READERS if r.form in ("other", "folder")]
+    kinds = joined([r.name for r in READERS if r not in by_ending], "or")
+    endings = joined([each for r in by_ending for each in r.endings], "or")
     raise ValueError(
         f"a file must be {kinds}, or end in {endings}: "
-        f"{path} begins with {look.head!r}; its ending may be wrong, or its content damaged"
+        f"{path} begins with {head!r}; its ending may be wrong, or its content damaged"
     )

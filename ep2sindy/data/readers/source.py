@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -23,9 +23,6 @@ from ep2sindy.runtime.screen import words_of
 
 PACKED_BY = ("scale_factor", "add_offset")
 
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-
-
 Form: TypeAlias = Literal["folder", "hdf5", "workbook", "zip", "other"]
 
 
@@ -39,7 +36,7 @@ class FileSource:
     file gives it outside its arrays. channel_m: length of the thruster's channel in m, if the file
     gives it. words: notes on how the file was read, shown on inspection. is_table: True if the
     arrays are columns of a table. attributes: texts and numbers that describe the whole file.
-    steps: numbers of the steps of a run that was written step by step.
+    steps: numbers of the steps of a run that was written step by step. kind: kind of file.
     """
 
     path: Path
@@ -54,6 +51,7 @@ class FileSource:
     is_table: bool = False
     attributes: Mapping[str, str | float] = field(default_factory=dict)
     steps: Sequence[int] = ()
+    kind: str = ""
 
     def __post_init__(self) -> None:
         if len(set(self.names)) < len(self.names):
@@ -70,22 +68,12 @@ class FileSource:
 
 
 @dataclass(frozen=True)
-class Look:
-    """Features that identify a file's kind. head: its first 16 bytes; empty for a folder."""
-
-    form: Form
-    head: bytes
-    ending: str
-
-
-@dataclass(frozen=True)
 class Reader:
     """One kind of file: how it is recognised, and how it is opened.
 
     first_bytes: beginnings that no other kind of file has. form, endings: files without such a
-    beginning are recognised by their form together with one of the endings. A reader without
-    endings takes all files of its form that no other reader claims by their ending. form None:
-    recognised by first bytes alone. package: the module of the extra `files` that it needs.
+    beginning are recognised by their form, together with one of the endings if there are any.
+    package: the module of the extra `files` that it needs.
     """
 
     name: str
@@ -95,25 +83,27 @@ class Reader:
     endings: tuple[str, ...] = ()
     package: str = ""
 
-    def claim(self, look: Look) -> int:
-        """Strength of the claim: 3 by first bytes, 2 by ending, 1 by form alone, 0 for none."""
-        if look.head.startswith(self.first_bytes):
-            return 3
-        if look.form != self.form:
-            return 0
-        return 2 * (look.ending in self.endings) if self.endings else 1
+    def takes(self, form: Form, head: bytes, ending: str) -> bool:
+        """True for a file with such a beginning, or of the form and with one of the endings."""
+        fits = form == self.form and (not self.endings or ending in self.endings)
+        return head.startswith(self.first_bytes) or fits
 
 
-def look_at(path: Path) -> Look:
-    """Read the features that identify a file's kind; raises OSError if it cannot be read."""
+def look_at(path: Path) -> tuple[Form, bytes, str]:
+    """What identifies a file's kind: its form, its first bytes (none of a folder), its ending.
+
+    Raises OSError if it cannot be read.
+    """
+    import h5py
+
     ending = path.suffix.lower()
     if path.is_dir():
-        return Look("folder", b"", ending)
+        return "folder", b"", ending
     with path.open("rb") as file:
         head = file.read(16)
     if head.startswith(b"PK"):
-        return Look("workbook" if _is_workbook(path) else "zip", head, ending)
-    return Look("hdf5" if _is_hdf5(path) else "other", head, ending)
+        return "workbook" if _is_workbook(path) else "zip", head, ending
+    return "hdf5" if h5py.is_hdf5(path) else "other", head, ending
 
 
 def _is_workbook(path: Path) -> bool:
@@ -123,21 +113,6 @@ def _is_workbook(path: Path) -> bool:
             return any(name.startswith("xl/") for name in archive.namelist())
     except BadZipFile:  # damaged: the list of its members stands at its end
         return path.suffix.lower() in (".xlsx", ".xlsm")
-
-
-def _is_hdf5(path: Path) -> bool:
-    """True if the HDF5 signature stands at byte 0, 512, 1024, 2048 and so on.
-
-    A user block may precede it. Source: HDF5 file format specification 3.0, II.A.
-    """
-    size, place = path.stat().st_size, 0
-    with path.open("rb") as file:
-        while place + len(HDF5_SIGNATURE) <= size:
-            file.seek(place)
-            if file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE:
-                return True
-            place = max(512, 2 * place)
-    return False
 
 
 @contextmanager
@@ -201,12 +176,12 @@ def counted_dates(dates: pd.Series) -> xr.DataArray:
     return xr.DataArray(elapsed_s / seconds_in(unit), attrs={"units": unit})
 
 
-def leaves(node: Any, path: str = "") -> dict[str, Any]:
+def leaves(node: Any) -> dict[str, Any]:
     """Flatten nested dicts and lists to {"a.b.0": value}; a list of numbers is one value.
 
     Raises ValueError if two values get the same name, as in {"a.b": 1, "a": {"b": 2}}.
     """
-    pairs = list(_leaves(node, path))
+    pairs = list(_leaves(node))
     found = dict(pairs)
     if len(found) < len(pairs):
         ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
@@ -214,14 +189,11 @@ def leaves(node: Any, path: str = "") -> dict[str, Any]:
     return found
 
 
-def _leaves(node: Any, path: str) -> Iterator[tuple[str, Any]]:
-    items: Iterable[tuple[Any, Any]]
-    if isinstance(node, dict):
-        items = node.items()
-    elif isinstance(node, list) and any(isinstance(item, dict | list) for item in node):
-        items = enumerate(node)
-    else:
+def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    is_nested = isinstance(node, list) and any(isinstance(item, dict | list) for item in node)
+    inner = node if isinstance(node, dict) else dict(enumerate(node)) if is_nested else None
+    if inner is None:
         yield path, node
-        return
-    for key, item in items:
-        yield from _leaves(item, f"{path}.{key}" if path else str(key))
+    else:
+        for key, item in inner.items():
+            yield from _leaves(item, f"{path}.{key}" if path else str(key))
