@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.studies.constrained import Study
+from ep2sindy.studies.views import frequency_words
 from tests import programs
 
 JUDGED = {
@@ -57,9 +58,9 @@ def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_pat
         assert words in found.page
         assert words in found.log
     assert "status" not in found.page  # least squares has none
-    fit = found.outcome.judged["predator_prey_base"]
-    run = replace(fit.from_sample, frequency_Hz={"n_i": 2e4, "n_n": 3e4}, f_error=0.5)
-    assert found.outcome._frequency.value(replace(fit, from_sample=run)) == "20 kHz (+50.0 %)"
+    run = found.outcome.runs["predator_prey_base"]
+    other = replace(run, frequency_Hz={"n_i": 2e4, "n_n": 3e4}, f_error=0.5)
+    assert frequency_words(other) == "20 kHz (+50.0 %)"
 
 
 def test_held_out_times_count_from_the_start_of_the_held_out_part(

@@ -56,12 +56,12 @@ from ep2sindy.studies.library_result import (
 from ep2sindy.studies.living import WAVEFORM
 from ep2sindy.studies.source import data_summary
 from ep2sindy.studies.views import (
+    MODEL,
     coefficients,
     display_equation,
     found_model,
     interval_table,
     intervals,
-    model_summary,
     rollout_tables,
 )
 
@@ -290,7 +290,7 @@ class Outcome:
                 "noise_std": self.chosen.embedded.noise_std,
                 "period_s": self.tested.signal.period_s,
             },
-            "model": model_summary(self.model) | {"intervals": intervals(self.model)},
+            "model": facts(self.model, MODEL) | {"intervals": intervals(self.model)},
             "states": {
                 str(each.n_states): {"error": each.error, "unexplained": each.share}
                 for each in self.tested.attempts

@@ -12,6 +12,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
+from ep2sindy.library.equations import equation_text
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.units import SECONDS, Clock, unit_product
 from ep2sindy.model.comparison import Verdict
@@ -19,6 +20,7 @@ from ep2sindy.model.display import grouped
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Result, Section, Table, Text
+from ep2sindy.report.results import Metric, Metrics, View
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.studies.study import PositiveOrAll
 
@@ -130,11 +132,17 @@ def intervals(model: SparseModel) -> dict[str, dict[str, tuple[float, float]]] |
     return {state: model.intervals(state) for state in model.states}
 
 
-def model_summary(model: SparseModel) -> dict[str, Any]:
-    return {
-        "text": model.text(),
-        "equations": {state: model.terms(state) for state in model.states},
-    }
+MODEL: Metrics[SparseModel] = [
+    Metric("text", lambda model: model.text(), View.JSON),
+    Metric(
+        "text",
+        lambda model: {state: equation_text(state, model.terms(state)) for state in model.states},
+        View.CSV,
+    ),
+    Metric(
+        "equations", lambda model: {state: model.terms(state) for state in model.states}, View.JSON
+    ),
+]
 
 
 def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataFrame:
@@ -274,13 +282,23 @@ def _fate(run: FreeRun, *, seen: bool, misfit: str) -> str:
     return words.get(run.verdict, run.words(seen=seen, misfit=misfit))
 
 
+def frequency_words(run: FreeRun, form: str = "+.1f") -> str:
+    """`20 kHz (+1.2 %)`: the first state's frequency and its error; a dash if it has none.
+
+    form: of the error in percent.
+    """
+    frequency_Hz = run.frequency_Hz[run.model.states[0]]
+    if not np.isfinite(frequency_Hz):
+        return "-"
+    error = f" ({100 * run.f_error:{form}} %)" if np.isfinite(run.f_error) else ""
+    return f"{run.rollout.clock.frequency_text(frequency_Hz)}{error}"
+
+
 def run_words(run: FreeRun) -> str:
     """Frequency, amplitude and waveform of a run beside the data's, as far as they are known."""
     found = []
-    frequency_Hz = run.frequency_Hz[run.model.states[0]]
-    if np.isfinite(frequency_Hz):
-        error = f" ({100 * run.f_error:+.2g} %)" if np.isfinite(run.f_error) else ""
-        found.append(f"frequency {run.rollout.clock.frequency_text(frequency_Hz)}{error}")
+    if (frequency := frequency_words(run, "+.2g")) != "-":
+        found.append(f"frequency {frequency}")
     ratios = [value for value in run.amplitude_ratio.values() if np.isfinite(value)]
     if ratios:
         ends = dict.fromkeys(f"{value:.3g}" for value in (min(ratios), max(ratios)))
