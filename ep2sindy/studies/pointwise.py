@@ -16,10 +16,7 @@ import xarray as xr
 from ep2sindy.data.fields import SPACE, write_netcdf
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.point_search import PointSearch
-from ep2sindy.discovery.pointwise import (
-    STATUSES,
-    pointwise,
-)
+from ep2sindy.discovery.pointwise import STATUSES, pointwise
 from ep2sindy.discovery.recipe import regression_of
 from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes, spread
 from ep2sindy.figures.maps import coefficient_maps, quality_maps, regime_map

@@ -14,25 +14,12 @@ from ep2sindy.figures.operating import cycle_figure, laws_figure, left_out_figur
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.choice import (
-    Branch,
-    BranchSettings,
-    find_branch,
-    group_by_cycle,
-)
+from ep2sindy.operating.choice import Branch, BranchSettings, find_branch, group_by_cycle
 from ep2sindy.operating.fit import SETTINGS, error_statistics
 from ep2sindy.operating.law import law_basis
 from ep2sindy.operating.map import Fate
 from ep2sindy.operating.records import OperatingRecord, most_central, point_label
-from ep2sindy.report.document import (
-    Block,
-    Captioned,
-    Picture,
-    Result,
-    Section,
-    Table,
-    Text,
-)  # fmt: skip
+from ep2sindy.report.document import Block, Captioned, Picture, Result, Section, Table, Text
 from ep2sindy.report.results import ResultTable
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers

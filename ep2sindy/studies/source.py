@@ -20,10 +20,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.screen import in_line
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.simulated import (
-    check_recorded,
-    say_simulation,
-)
+from ep2sindy.studies.simulated import check_recorded, say_simulation
 from ep2sindy.studies.study import Deferred
 from ep2sindy.thruster.balance import zone_balance
 

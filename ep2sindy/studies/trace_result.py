@@ -39,14 +39,8 @@ from ep2sindy.report.document import (
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
-from ep2sindy.signals.embedding import (
-    Chosen,
-)
-from ep2sindy.studies.forecasts import (
-    forecast_errors,
-    forecast_picture,
-    forecast_section,
-)
+from ep2sindy.signals.embedding import Chosen
+from ep2sindy.studies.forecasts import forecast_errors, forecast_picture, forecast_section
 from ep2sindy.studies.library_result import (
     CandidateRow,
     candidate_rows,
