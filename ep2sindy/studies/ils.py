@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
@@ -46,8 +45,9 @@ from ep2sindy.studies.fits import (
     terms_of,
 )
 from ep2sindy.studies.living import LivingSearch, two_periods
-from ep2sindy.studies.source import Source, balances_of
+from ep2sindy.studies.source import Source, zones_of
 from ep2sindy.studies.study import Count, Counts, Share
+from ep2sindy.studies.told import Zones
 from ep2sindy.studies.views import PlotRange
 
 if TYPE_CHECKING:
@@ -115,8 +115,8 @@ class Study:
             name: fit_and_evaluate(train, held, library, each, form, rng=next(streams))
             for name, each, form in count_pieces(run.watch, fits, "fit")
         }
-        balances = balances_of(self.source, field, run)
-        lives, own = self._living(train, balances, rng=next(streams), progress=run.watch)
+        zones = zones_of(self.source, field, run)
+        lives, own = self._living(train, zones, rng=next(streams), progress=run.watch)
         starts = {
             "ils": (judged["base"].model, free),
             "ils_constrained": (judged["constrained"].model, tied),
@@ -146,19 +146,12 @@ class Study:
         return self._outcome(train, held, judged, by_window, draws)
 
     def _living(
-        self,
-        train: Trajectory,
-        balances: Mapping[str, xr.Dataset],
-        *,
-        rng: np.random.Generator,
-        progress: Progress,
+        self, train: Trajectory, zones: Zones, *, rng: np.random.Generator, progress: Progress
     ) -> tuple[SparseModel, Constraint]:
         """The model that oscillates on its own, and what its coefficients obey."""
         rows = Regression(self.formulation)
         library = polynomial(train.state_names, degree=2)
-        found = self.living.found(
-            train, library, rows, balances=balances, rng=rng, progress=progress
-        )
+        found = self.living.found(train, library, rows, zones, rng=rng, progress=progress)
         model = found.model
         support = {state: list(model.terms(state)) for state in model.states}
         return model, found.constraint or constraint(model.library, support)

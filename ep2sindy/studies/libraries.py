@@ -14,7 +14,7 @@ import xarray as xr
 
 from ep2sindy.data.quantities import QUANTITIES
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.forecasting.skill import ForecastSkill
@@ -50,8 +50,9 @@ from ep2sindy.studies.library_result import (
     run_refitted,
 )  # fmt: skip
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
-from ep2sindy.studies.source import Sampling, Source, Zones, data_summary
+from ep2sindy.studies.source import Sampling, Source, data_summary, zones_of
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
+from ep2sindy.studies.told import NO_ZONES, Zones
 from ep2sindy.studies.views import (
     FROM_DERIVATIVES,
     INTEGRATED,
@@ -108,7 +109,7 @@ class LibraryCase:
             names,
             degree=self.degree,
             products=list(self.products),
-            functions=register_named(self.functions),
+            functions=[registered(str(name)) for name in self.functions],
             function_degree=self.function_degree,
         )
 
@@ -187,7 +188,7 @@ class Study:
         # Each case has its own random stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         pairs = list(zip(libraries.items(), streams, strict=True))
-        zones = Zones.of(self.source, opened[0], run) if self.living is not None else Zones()
+        zones = NO_ZONES if self.living is None else zones_of(self.source, opened[0], run)
         watch = run.watch
         results = {
             name: self._result(runs, name, library, methods[name], zones, rng=rng, progress=watch)
@@ -232,7 +233,11 @@ class Study:
         lives is searched for in the first one.
         """
         s, measured = self.rollout_s, runs[0]
-        found = self._ask(list(runs), library, method, seed=rng, progress=progress)
+        barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
+        found = discover(
+            list(runs), library, method, hidden=self.hidden, relations=self.relations,
+            exclude=barred, roles=self.roles, seed=rng, progress=progress,
+        )  # fmt: skip
         runs = runs if found.estimate is None else found.estimate.runs
         first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
         data, n_samples = first
@@ -262,17 +267,6 @@ class Study:
                 skill=skill,
             )
 
-    @property
-    def _ask(self) -> partial[Discovery]:
-        barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
-        return partial(
-            discover,
-            hidden=self.hidden,
-            relations=self.relations,
-            exclude=barred,
-            roles=self.roles,
-        )
-
     def _lives(
         self,
         data: Trajectory,
@@ -288,12 +282,10 @@ class Study:
         assert self.living is not None
         parts = split_in_time(data, self.held_out or HELD_OUT)
         lives = living_model(
-            *parts, library, rows, self.living, selected, balances=zones.balances,
-            sizes=zones.sizes, rng=rng, progress=progress,
-        )  # fmt: skip
+            *parts, library, rows, self.living, selected, zones, rng=rng, progress=progress
+        )
         beside = model_balance(
-            lives.model, lives.discovery.constraint, data, *parts, zones.balances,
-            self.living.bounds, sizes=zones.sizes,
+            lives.model, lives.discovery.constraint, data, *parts, zones, self.living.bounds,
             period_s=None if lives.cycle is None else lives.cycle.period_s, progress=progress,
         )  # fmt: skip
         return lives, beside
@@ -311,16 +303,12 @@ def alone(data: Trajectory) -> str | None:
     )
 
 
-def register_named(names: Sequence[str]) -> list[str]:
-    """Names in the form that a library takes.
+def registered(text: str) -> str:
+    """A function's name in the form that a library takes.
 
     `my_module.tanh(2*x)` imports my_module and becomes `tanh(2*x)`.
     Raises ValueError for a module that cannot be imported or does not register the name.
     """
-    return [_register_one(str(name)) for name in names]
-
-
-def _register_one(text: str) -> str:
     found = _FROM_MODULE.fullmatch(text.strip())
     if found is None:
         return text

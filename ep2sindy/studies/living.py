@@ -9,12 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
@@ -41,7 +39,7 @@ from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.spectrum import samples_in_periods
 from ep2sindy.studies.study import Count, Positive
-from ep2sindy.studies.told import TELLING, told_roles
+from ep2sindy.studies.told import NO_ZONES, TELLING, Zones, told_roles
 from ep2sindy.studies.views import (
     coefficients,
     display_equation,
@@ -69,7 +67,6 @@ OTHERS_NOTE = (
     "largest of the three in units of the bounds of a model that lives. All stay within them: what "
     "these models have in common is what the record tells."
 )
-NO_SIZES: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -95,20 +92,19 @@ class LivingSearch:
         train: Trajectory,
         library: Library,
         rows: Regression,
+        zones: Zones = NO_ZONES,
         *,
-        balances: Mapping[str, xr.Dataset],
-        sizes: Mapping[str, float] = NO_SIZES,
         rng: np.random.Generator,
         progress: Progress = SILENT,
     ) -> Discovery:
         """The discovery in a record, with the formulation and bootstraps of `rows`.
 
-        balances: of the zones, which tell what the roles take as known. sizes: length of each of
-        several zones, in which the roles then hold.
+        zones: their balances tell what the roles take as known, and of several, the roles hold in
+        each.
         """
         own = replace(rows, search=self.search, depth=self.depth, selection=self.selection)
         library = polynomial(train.state_names, degree=self.degree) if self.degree else library
-        roles, told = self._told(train, balances, sizes)
+        roles, told = self._told(train, zones)
         seen, words = self._quiet(train)
         found = discover(seen, library, own, roles=roles, seed=rng, progress=progress)
         found = replace(found, note=f"{found.note}{told}")
@@ -118,14 +114,12 @@ class LivingSearch:
         model = replace(found.model, covariance=None)
         return replace(found, model=model, note=f"{words}{found.note}")
 
-    def _told(
-        self, train: Trajectory, balances: Mapping[str, xr.Dataset], sizes: Mapping[str, float]
-    ) -> tuple[Roles | None, str]:
+    def _told(self, train: Trajectory, zones: Zones) -> tuple[Roles | None, str]:
         """The roles with what the record tells, and how well it tells what is fitted to it."""
         if self.roles is None:
             return None, ""
-        roles = self.roles.in_zones(sizes) if sizes else self.roles
-        told = told_roles(balances, train)
+        roles = self.roles.in_zones(zones.sizes) if zones.sizes else self.roles
+        told = told_roles(zones.balances, train)
         fitted = [role for role in roles.open if role in told and role in TELLING]
         known = {name: role.terms for name, role in told.items()}
         words = (
@@ -397,20 +391,16 @@ def living_model(
     rows: Regression,
     settings: LivingSearch,
     selected: SparseModel,
+    zones: Zones,
     *,
-    balances: Mapping[str, xr.Dataset],
-    sizes: Mapping[str, float],
     rng: np.random.Generator,
     progress: Progress = SILENT,
 ) -> Living:
     """Find a living model in one part of a record, and run it over the other.
 
-    selected: the model selected by derivatives, which is refined for comparison. balances: of
-    the zones, as far as the record gives them. sizes: length of each of several zones.
+    selected: the model selected by derivatives, which is refined for comparison.
     """
-    found = settings.found(
-        train, library, rows, balances=balances, sizes=sizes, rng=rng, progress=progress
-    )
+    found = settings.found(train, library, rows, zones, rng=rng, progress=progress)
     with progress.stage(None, "", "free run and limit cycle"):
         start = start_of(held, found.model)
         run = free_run(found.model, held, initial=start, bounds=settings.bounds)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import xarray as xr
@@ -22,6 +22,7 @@ from ep2sindy.runtime.screen import in_line
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.simulated import check_recorded, say_simulation
 from ep2sindy.studies.study import Deferred
+from ep2sindy.studies.told import Zones
 from ep2sindy.thruster.balance import zone_balance
 
 Step = Callable[[xr.Dataset], xr.Dataset]
@@ -122,19 +123,19 @@ def zone_of(source: Source) -> Zone | None:
     return source.trajectory.zone if isinstance(source.trajectory, ZoneAverage) else None
 
 
-def zone_sizes_of(source: Source, field: xr.Dataset) -> dict[str, float]:
-    """Length in m of each of several zones that the trajectory is averaged over; else empty."""
-    sampling = source.trajectory
-    return sampling.sizes(field) if isinstance(sampling, ZoneAverage) else {}
-
-
-def balances_of(source: Source, field: xr.Dataset, run: Run) -> dict[str, xr.Dataset]:
-    """Balance of ions and neutrals in every zone that is averaged over; a single one is called "".
+def zones_of(source: Source, field: xr.Dataset, run: Run) -> Zones:
+    """The zones that the trajectory is averaged over; none if it is that of a point.
 
     Balances that cannot be made, as of a zone that reaches into the plume, are reported.
     """
     sampling = source.trajectory
-    if not isinstance(sampling, ZoneAverage) or not {"n_i", "n_n"} <= set(field.data_vars):
+    if not isinstance(sampling, ZoneAverage):
+        return Zones()
+    return Zones(_balances(sampling, field, run), sampling.sizes(field))
+
+
+def _balances(sampling: ZoneAverage, field: xr.Dataset, run: Run) -> dict[str, xr.Dataset]:
+    if not {"n_i", "n_n"} <= set(field.data_vars):
         return {}
     zones = sampling.parts(field)
     if any(zone.r is not None for zone in zones.values()):
@@ -199,18 +200,3 @@ def data_summary(data: Trajectory) -> dict[str, Any]:
         "variables": list(data.names),
         "units": dict(data.units),
     }
-
-
-@dataclass(frozen=True)
-class Zones:
-    """The zones of a record: balances of ions and neutrals, and lengths in m if there are several.
-
-    balances: by name, see `balances_of`.
-    """
-
-    balances: Mapping[str, xr.Dataset] = field(default_factory=dict)
-    sizes: Mapping[str, float] = field(default_factory=dict)
-
-    @staticmethod
-    def of(source: Source, data: xr.Dataset, run: Run) -> Zones:
-        return Zones(balances_of(source, data, run), zone_sizes_of(source, data))

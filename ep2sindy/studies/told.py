@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import xarray as xr
@@ -21,6 +21,20 @@ TELLING: Mapping[str, tuple[str, Sequence[str]]] = {
     f"{NEUTRALS} out": ("exit_n", [NEUTRALS, f"{IONS}*{NEUTRALS}"]),
     f"{IONS} to {NEUTRALS}": ("returned", [IONS]),
 }
+
+
+@dataclass(frozen=True)
+class Zones:
+    """The zones of a record: balances of ions and neutrals, and lengths in m if there are several.
+
+    balances: by name, from `ep.thruster.zone_balance`; a single one is called "".
+    """
+
+    balances: Mapping[str, xr.Dataset] = field(default_factory=dict)
+    sizes: Mapping[str, float] = field(default_factory=dict)
+
+
+NO_ZONES = Zones()
 
 
 @dataclass(frozen=True)
