@@ -129,7 +129,7 @@ class ResultTable(Generic[Record]):
     metrics: Metrics[Record]
 
     def csv(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
-        """A row per record. heading: of the column of names, left out if empty.
+        """A row per record, or the columns alone. heading: of that of names, left out if empty.
 
         by_state: a row per record and state instead, in which a metric without states is repeated.
         """
@@ -144,7 +144,8 @@ class ResultTable(Generic[Record]):
             else:
                 columns = [metric.columns(value) for metric, value in values]
                 rows.append(reduce(or_, columns, first))
-        return pd.DataFrame(rows)
+        known = None if rows else [*filter(None, [heading]), *(m.key for m in self._in(View.CSV))]
+        return pd.DataFrame(rows, columns=known)
 
     def screen(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
         """A row of formatted cells per record.
