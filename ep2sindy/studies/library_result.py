@@ -282,7 +282,7 @@ def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Secti
 
 
 # Nobody measured a simulation: what its samples show beside their smooth course is numerical.
-NOISE = "the noise of the samples (of a simulation: its numerical noise)"
+THE_NOISE = "the noise of the samples (of a simulation: its numerical noise)"
 
 
 def left_over_of_all(tests: Sequence[NoiseTest]) -> list[Text]:
@@ -291,7 +291,7 @@ def left_over_of_all(tests: Sequence[NoiseTest]) -> list[Text]:
         return []
     left = [each for test in tests for each in test.left.values() if not each.leaves_noise]
     ratios = sorted(each.chi_squared for each in left)
-    size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {NOISE}" if left else "more than noise"
+    size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {THE_NOISE}" if left else "more than noise"
     text = (
         f"The equations fitted to derivatives leave {size}: a state or a term is missing there, so "
         "they have no intervals; the free run above is what judges."
@@ -304,7 +304,7 @@ def left_over(state: str, test: NoiseTest) -> list[str]:
     if (left := test.left.get(state)) is None:
         return []
     return [
-        f"left over of {state}': {left.chi_squared:.3g} times {NOISE}, "
+        f"left over of {state}': {left.chi_squared:.3g} times {THE_NOISE}, "
         f"autocorrelation {left.autocorrelation:.2f} (1 and 0 where noise alone is left)"
     ]
 

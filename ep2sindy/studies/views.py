@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
+NO_ENDS = (np.nan, np.nan)  # of an interval that is not known
 FROM_DERIVATIVES = (
     "These are the equations that fits of the derivatives select; the models that live, which are "
     "selected by free runs, stand above."
@@ -150,15 +151,13 @@ def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataF
 
     heading: heading of the column with the models' names.
     """
-    rows = []
-    for name, model in models.items():
-        known = intervals(model) or {}
-        for state in model.states:
-            for term, value in model.terms(state).items():
-                lower, upper = known.get(state, {}).get(term, (np.nan, np.nan))
-                row: dict[str, Any] = {heading: name, "state": state, "term": term}
-                rows.append(row | {"coef": value, "lower": lower, "upper": upper})
-    return pd.DataFrame(rows)
+    rows = [
+        (name, state, term, value, *(intervals(model) or {}).get(state, {}).get(term, NO_ENDS))
+        for name, model in models.items()
+        for state in model.states
+        for term, value in model.terms(state).items()
+    ]
+    return pd.DataFrame(rows, columns=[heading, "state", "term", "coef", "lower", "upper"])
 
 
 def display_equation(
