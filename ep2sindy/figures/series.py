@@ -272,21 +272,19 @@ def phase_figure(
     run: Trajectory,
     rollouts: Mapping[str, Rollout],
     *,
-    plane: Sequence[str],
     duration_s: float,
     verdicts: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
-    """A panel per model in the plane of two states: its run (colour) over the data (grey).
+    """A panel per model in the plane of the first two states: its run (colour) over data (grey).
 
     The dot marks the start; other marks and verdicts are as in `trajectory_figure`.
     """
-    pair = [run.state_names.index(name) for name in plane]
-    data = first_part(run.t, run.states[:, pair], duration_s, run.clock)
+    data = first_part(run.t, run.states[:, :2], duration_s, run.clock)
     models = {
-        n: first_part(r.t, r.states[:, pair], duration_s, run.clock) for n, r in rollouts.items()
+        n: first_part(r.t, r.states[:, :2], duration_s, run.clock) for n, r in rollouts.items()
     }
     diverged, labels = find_diverged(rollouts, duration_s), run_labels(rollouts, verdicts)
-    x_label, y_label = (axis_label(name, run.units[name]) for name in plane)
+    x_label, y_label = (axis_label(name, run.units[name]) for name in run.state_names[:2])
     figure, axes = make_grid(
         len(models), width=2.75, height=2.75, extra=0.7, sharex=True, sharey=True, x_label=x_label
     )

@@ -227,9 +227,8 @@ class Living:
                 figures.free_run_figure, held, run.rollout, period_s=period_s
             )
             if len(self.model.states) > 1:
-                plane, paths = held.state_names[:2], figures.paths_off(self.cycle)
-                drawn["cycle"] = partial(figures.cycle_figure, held, self.cycle, paths, plane=plane)
-            if figures.has_waveform(held, run.rollout):
+                drawn["cycle"] = partial(figures.cycle_figure, held, self.cycle)
+            if figures.find_waveforms(held, run.rollout):
                 drawn["waveform"] = partial(figures.waveform_figure, held, run.rollout)
         return {f"{key}_{name}": Captioned(draw, CAPTIONS[key]) for key, draw in drawn.items()}
 

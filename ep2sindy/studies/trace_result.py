@@ -16,9 +16,8 @@ from ep2sindy.discovery.signal_unknowns import HiddenStates
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.figures.living import (
     cycle_figure,
+    find_waveforms,
     free_run_figure,
-    has_waveform,
-    paths_off,
     waveform_figure,
 )
 from ep2sindy.library.equations import equation_text
@@ -162,11 +161,8 @@ class Outcome:
             "free_run": partial(free_run_figure, held, rollout, period_s=period_s)
         }
         if self.cycle is not None:
-            plane, paths = held.state_names[:2], paths_off(self.cycle)
-            drawn["plane"] = partial(
-                cycle_figure, self.tested.states, self.cycle, paths, plane=plane
-            )
-        if has_waveform(held, rollout) and self.tested.signal.cycle is not None:
+            drawn["plane"] = partial(cycle_figure, self.tested.states, self.cycle)
+        if find_waveforms(held, rollout) and self.tested.signal.cycle is not None:
             drawn["waveform"] = partial(waveform_figure, held, rollout)
         fronts = {state: self.found.fronts[state] for state in self.searched}
         drawn["front"] = partial(front_figure, fronts, label=self.label)

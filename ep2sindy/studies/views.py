@@ -106,9 +106,9 @@ def run_figures(
         drawn["derivatives"] = partial(
             series.derivative_figure, data, sides, smoother=smoother, duration_s=span
         )
-    if len(plane := data.state_names[:2]) > 1:
+    if len(data.state_names) > 1:
         drawn["phase"] = partial(
-            series.phase_figure, data, rollouts, plane=plane, duration_s=span, verdicts=verdicts
+            series.phase_figure, data, rollouts, duration_s=span, verdicts=verdicts
         )
     return {name: Captioned(drawn[name], CAPTIONS[name]) for name in names if name in drawn}
 
