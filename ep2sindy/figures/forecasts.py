@@ -22,7 +22,8 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
     run: the record that was forecast; its variables of the model's states are drawn.
     """
     ahead = skill.example
-    names = [name for name in ahead.state_names if name in run.names and _is_measured(skill, name)]
+    noise = dict(zip(ahead.state_names, ahead.noise_std, strict=True))  # NaN if not measured
+    names = [name for name in ahead.state_names if name in run.names and np.isfinite(noise[name])]
     width = 4.5 if len(names) == 1 else 3.0
     figure, axes = make_grid(len(names) + 1, width=width, height=2.8, extra=0.4)
     low, high = ahead.band(LEVEL)
@@ -64,10 +65,6 @@ def _draw_errors(ax: Axes, skill: ForecastSkill) -> None:
     ax.set_yscale("log")
     ax.set_xlabel(f"horizon ({'periods' if in_periods else 'samples'})")
     ax.set_ylabel("error (standard deviations)")
-
-
-def _is_measured(skill: ForecastSkill, name: str) -> bool:
-    return bool(np.isfinite(skill.example.noise_std[skill.example.state_names.index(name)]))
 
 
 def _limits(values: Float[np.ndarray, " samples"]) -> tuple[float, float]:

@@ -226,7 +226,8 @@ def cycle_figure(
     points: branch (empty for points that do not oscillate), f_kHz and relative_amplitude of the
     records. fitted: parameters of the law's points.
     """
-    records = _split_records(points, branch)
+    own, quiet = points["branch"] == branch, points["branch"] == ""
+    records = points[own], points[quiet], points[~own & ~quiet]
     draw = _draw_cycle_map if len(parameters) == 2 else _draw_cycle_line
     return draw(rows, records, fitted, list(parameters), labels)
 
@@ -284,12 +285,6 @@ def _draw_cycle_line(
     law = Line2D([], [], color=COLOURS[0], lw=1.8, label="the model's cycle")
     legend_above(figure, [law, *entries, Patch(color=GREY, alpha=0.2, label="points fitted")])
     return figure
-
-
-def _split_records(points: pd.DataFrame, branch: str) -> Records:
-    """Records of this cycle, points that do not oscillate, and records of another cycle."""
-    own, quiet = points["branch"] == branch, points["branch"] == ""
-    return points[own], points[quiet], points[~own & ~quiet]
 
 
 def _list_entries(quiet: pd.DataFrame, other: pd.DataFrame, *, face: str) -> list[Artist]:

@@ -205,6 +205,11 @@ def facts(record: Record, metrics: Metrics[Record]) -> dict[str, Any]:
     return {key: dict(v) if isinstance(v, Mapping) else v for key, v in found.items()}
 
 
+def json_rows(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Rows of a table for `summary.json`; a missing value becomes None."""
+    return table.astype(object).where(table.notna(), None).to_dict("records")
+
+
 def percent(digits: int, *, sign: bool = False) -> Callable[[float], str]:
     """A format of shares such as `12.3 %`, with a dash for a missing number."""
 

@@ -107,7 +107,8 @@ def compared_processes(
     known = {zone: recorded_rates(balance, data) for zone, balance in zones.balances.items()}
     gone = _through_ends(known, zones.sizes or dict.fromkeys(known, 1.0))
     compared = []
-    for ends, terms in sorted(found.items(), key=lambda each: _order(*each[0])):
+    # What enters comes first, what leaves last.
+    for ends, terms in sorted(found.items(), key=lambda each: (bool(each[0][0]), not each[0][1])):
         columns = theta[:, [model.library.index(term) for term in terms]]
         gross = ends[::-1] in found
         rate = _zone_rate(*ends, known, gone, gross=gross)
@@ -118,11 +119,6 @@ def compared_processes(
             ComparedProcess(words, ends, rate, modelled, terms, beside.terms, beside.r2)
         )
     return compared
-
-
-def _order(giver: str, taker: str) -> int:
-    """What enters first, what leaves last."""
-    return 0 if not giver else 2 if not taker else 1
 
 
 def ends_of(process: Process) -> tuple[str, str]:

@@ -26,7 +26,7 @@ from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.forecasts import skill_of
-from ep2sindy.studies.views import with_error
+from ep2sindy.studies.views import terms_text, with_error
 
 Parameters = Mapping[str, float]
 Laws = Mapping[str, Mapping[str, ControlLaw]]  # fit -> quantity -> law
@@ -233,13 +233,13 @@ def structure_metrics(name: str, branch: Branch) -> list[Metric[StructureTrial]]
         return trial is branch.choice
 
     def marked(trial: StructureTrial) -> str:
-        text = trial.case.name or _terms_text(trial)
+        text = trial.case.name or terms_text(trial.fit.structure)
         return text + ("  <- chosen" if is_chosen(trial) else "")
 
     return [
         Metric("branch", lambda trial: name),
         Metric("model", lambda trial: trial.case.name),
-        Metric("terms", _terms_text),
+        Metric("terms", lambda trial: terms_text(trial.fit.structure)),
         Metric("model" if branch.choice.case.name else "terms", marked, View.SCREEN),
         Metric("degree", lambda trial: trial.degree, View.SHOWN),
         Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
@@ -252,10 +252,6 @@ def structure_metrics(name: str, branch: Branch) -> list[Metric[StructureTrial]]
         ),
         Metric("chosen", is_chosen),
     ]
-
-
-def _terms_text(trial: StructureTrial) -> str:
-    return "; ".join(f"{s}: {', '.join(terms)}" for s, terms in trial.fit.structure.items())
 
 
 def _median_f_error(trial: StructureTrial) -> float:

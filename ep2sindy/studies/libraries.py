@@ -255,7 +255,6 @@ class Study:
         )  # fmt: skip
         with progress.stage(None, "", "free runs"):
             return LibraryResult(
-                method=method,
                 discovery=found,
                 selected=free_run(found.model, data, n_samples=n_samples),
                 given=published,

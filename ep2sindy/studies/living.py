@@ -24,7 +24,7 @@ from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.model.comparison import FreeRunBounds
+from ep2sindy.model.comparison import FreeRunBounds, Verdict
 from ep2sindy.model.display import grouped
 from ep2sindy.model.free_run import FreeCycle, FreeRun, free_run
 from ep2sindy.model.mass_action import consequences
@@ -46,6 +46,7 @@ from ep2sindy.studies.views import (
     interval_table,
     intervals,
     rollout_tables,
+    terms_text,
 )
 
 WAVEFORM = "One period by phase, shown twice: samples, their waveform, and the model's."
@@ -205,7 +206,9 @@ class Living:
             *pictures(self.figures(name)),
             *self._others(),
         ]
-        return Section(f"{name}: a model that {_ending(self)}", blocks)
+        lives = self.run.verdict is Verdict.LIVES
+        ending = "lives" if lives else f"does not live ({self.run.text})"
+        return Section(f"{name}: a model that {ending}", blocks)
 
     def _others(self) -> list[Block]:
         """The other systems of this size that live: whether the found one is the law."""
@@ -276,7 +279,7 @@ LIVING: Metrics[Living] = [
     Metric("by_derivatives", lambda found: facts(found.by_derivatives, REFINED), View.JSON),
 ]
 OTHERS: Metrics[OtherSystem] = [
-    Metric("terms", lambda each: _structure(each), View.SHOWN),
+    Metric("terms", lambda each: terms_text(each.terms), View.SHOWN),
     Metric("f_error", lambda each: each.f_error, View.SHOWN, "frequency", percent(2)),
     Metric("amplitude_error", lambda each: each.amplitude, View.SHOWN, "amplitude", percent(1)),
     Metric("waveform_error", lambda each: each.waveform, View.SHOWN, "waveform", "{:.3f}"),
@@ -307,11 +310,6 @@ def _text(living: Living) -> str:
     return "\n".join(equation_text(state, terms) for state, terms in sums.items())
 
 
-def _structure(system: OtherSystem) -> str:
-    """Terms of every role or equation."""
-    return "; ".join(f"{part}: {', '.join(terms)}" for part, terms in system.terms.items())
-
-
 def _terms(model: SparseModel) -> dict[str, list[str]]:
     return {state: list(model.terms(state)) for state in model.states}
 
@@ -340,10 +338,6 @@ def _with_intervals(model: SparseModel) -> dict[str, dict[str, Any]]:
         }
         for state in model.states
     }
-
-
-def _ending(living: Living) -> str:
-    return "lives" if living.run.verdict == "lives" else f"does not live ({living.run.text})"
 
 
 def run_title(run: FreeRun) -> str:

@@ -64,6 +64,7 @@ SCORED = (
 )
 
 
+RUN_SCORE = "largest deviation of a free run, in units of its bound; one lives."
 CAPTIONS = {
     "free_run": "The model run freely from one sample (colour) over the record that it never saw "
     "(grey): the first periods, and the last.",
@@ -114,6 +115,11 @@ class Outcome:
     @property
     def is_held_out(self) -> bool:
         return self.tested.skill is not None
+
+    @property
+    def where(self) -> str:
+        """What the model was run over, in words."""
+        return "held-out record" if self.is_held_out else "whole record, too short to hold out"
 
     @property
     def words(self) -> str:
@@ -173,7 +179,6 @@ class Outcome:
         return pictures_of
 
     def in_short(self) -> Result:
-        where = "held-out record" if self.is_held_out else "whole record, too short to hold out"
         caution = self.tested.free.caution
         return found_model(
             f"Found from {self.tested.signal.name}",
@@ -181,7 +186,7 @@ class Outcome:
             file="trace",
             picture="free_run",
             more=[Text(caution, warning=True)] if caution else [],
-            where=f"the {where}",
+            where=f"the {self.where}",
             seen=not self.is_held_out,
             misfit=self.found.misfit,
         )
@@ -223,25 +228,21 @@ class Outcome:
 
     def _search_section(self) -> Section:
         blocks: list[Block] = []
+        score = RUN_SCORE if self.by_runs else column_note(self.label)
         for state in self.searched:
             front = self._front(state)
             table = front.csv()
-            shown = _best_of_sizes(table)
+            order = table.sort_values(["terms", "score"], kind="stable")
+            shown = sorted(order.groupby("terms").head(3).index.tolist())  # the best of every size
             blocks.append(
                 Table(
                     front.screen().iloc[shown].reset_index(drop=True),
                     title=f"candidates for {state}'",
                     bold=np.flatnonzero(table["selected"].to_numpy()[shown]).tolist(),
-                    note=f"Of every size the best three. Score: {self._score_words}",
+                    note=f"Of every size the best three. Score: {score}",
                 )
             )
         return Section("Search", [*blocks, *pictures(["front"])])
-
-    @property
-    def _score_words(self) -> str:
-        if self.by_runs:
-            return "largest deviation of a free run, in units of its bound; one lives."
-        return column_note(self.label)
 
     def _living_section(self) -> Section:
         model, clock = self.model, self.tested.states.clock
@@ -250,9 +251,8 @@ class Outcome:
             exact = "known" if state not in self.searched else ""
             blocks.append(display_equation(model, state, clock, lead=exact))
         blocks += interval_table(model, self.searched, clock)
-        where = "held-out record" if self.is_held_out else "whole record, too short to hold out"
         rows = ResultTable({"model": self}, FREE_RUN).upright("")
-        blocks.append(Table(rows, title=f"run freely from one sample over the {where}"))
+        blocks.append(Table(rows, title=f"run freely from one sample over the {self.where}"))
         blocks += [Text(text, warning=warn) for text, warn in self._stability()]
         return Section("Living model", [*blocks, *pictures(["free_run", "plane", "waveform"])])
 
@@ -337,9 +337,3 @@ CANDIDATES: Metrics[CandidateRow] = [
 def _marked(row: CandidateRow) -> Equation:
     mark = "  <- selected" if row.is_selected else ""
     return Equation(row.candidate.equation, row.terms, mark=mark)
-
-
-def _best_of_sizes(table: pd.DataFrame, most: int = 3) -> list[int]:
-    """The best rows of every size, ordered by score and then by position."""
-    order = table.sort_values(["terms", "score"], kind="stable")
-    return sorted(order.groupby("terms").head(most).index.tolist())

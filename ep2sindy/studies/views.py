@@ -126,6 +126,11 @@ def trajectories(
     return replace(figure, caption=caption)
 
 
+def terms_text(terms: Mapping[str, Sequence[str]]) -> str:
+    """`x: x, x*y; y: y`: the terms of every equation or role."""
+    return "; ".join(f"{part}: {', '.join(names)}" for part, names in terms.items())
+
+
 def intervals(model: SparseModel) -> dict[str, dict[str, tuple[float, float]]] | None:
     """95 % intervals by state and term; None if they are not known."""
     if model.covariance is None:
