@@ -205,7 +205,7 @@ def facts(record: Record, metrics: Metrics[Record]) -> dict[str, Any]:
     return {key: dict(v) if isinstance(v, Mapping) else v for key, v in found.items()}
 
 
-def json_rows(table: pd.DataFrame) -> list[dict[str, Any]]:
+def json_rows(table: pd.DataFrame) -> list[dict[Any, Any]]:
     """Rows of a table for `summary.json`; a missing value becomes None."""
     return table.astype(object).where(table.notna(), None).to_dict("records")
 

@@ -15,8 +15,7 @@ from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.oscillation import Oscillation
-from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation, quiet
-from ep2sindy.studies.source import Source
+from ep2sindy.studies.source import DivergedError, Source, amiss, is_simulation, quiet
 from ep2sindy.studies.study import Check, Deferred
 
 QUIET = (

@@ -37,8 +37,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.runtime.progress import Advance
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.simulated import say_simulation
-from ep2sindy.studies.source import Step, open_prepared, say_field
+from ep2sindy.studies.source import Step, open_prepared, say_field, say_simulation
 from ep2sindy.studies.study import A_LIST, Count, Deferred, Names
 from ep2sindy.thruster.parameters import Thruster
 

@@ -54,8 +54,7 @@ from ep2sindy.studies.points import (
     oscillating_records,
 )
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.simulated import compile_kernels
-from ep2sindy.studies.source import Source
+from ep2sindy.studies.source import Source, compile_kernels
 from ep2sindy.studies.study import Count, Counts, Positive
 from ep2sindy.studies.views import display_equation
 
