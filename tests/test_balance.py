@@ -10,7 +10,7 @@ import ep2sindy as ep
 from ep2sindy.library.roles import constraint_of, summed
 from ep2sindy.studies.balance import compared_processes, model_balance
 from ep2sindy.studies.fits import split_in_time
-from ep2sindy.studies.told import Zones, told_roles
+from ep2sindy.studies.source import Zones, told_roles
 
 STATES = ["n_i", "n_n"]
 CHANNEL = ep.Zone(z="channel")

@@ -13,7 +13,7 @@ from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.library.roles import constraint_of, shares_of
 from ep2sindy.studies.balance import compared_processes
-from ep2sindy.studies.told import Zones, told_roles
+from ep2sindy.studies.source import Zones, told_roles
 from tests.programs import composed, computed
 
 STATES = ["n_i", "n_n"]

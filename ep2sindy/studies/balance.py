@@ -22,7 +22,7 @@ from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pic
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
-from ep2sindy.studies.told import (
+from ep2sindy.studies.source import (
     IONS,
     NEUTRALS,
     FittedRate,

@@ -45,9 +45,8 @@ from ep2sindy.studies.fits import (
     terms_of,
 )
 from ep2sindy.studies.living import LivingSearch, two_periods
-from ep2sindy.studies.source import Source, zones_of
+from ep2sindy.studies.source import Source, Zones, zones_of
 from ep2sindy.studies.study import Count, Counts, Share
-from ep2sindy.studies.told import Zones
 from ep2sindy.studies.views import PlotRange
 
 if TYPE_CHECKING:

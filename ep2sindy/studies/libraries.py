@@ -50,9 +50,8 @@ from ep2sindy.studies.library_result import (
     run_refitted,
 )  # fmt: skip
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
-from ep2sindy.studies.source import Sampling, Source, data_summary, zones_of
+from ep2sindy.studies.source import NO_ZONES, Sampling, Source, Zones, data_summary, zones_of
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
-from ep2sindy.studies.told import NO_ZONES, Zones
 from ep2sindy.studies.views import (
     FROM_DERIVATIVES,
     INTEGRATED,

@@ -38,8 +38,8 @@ from ep2sindy.selection.rule import OtherSystem, SystemSelection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.spectrum import samples_in_periods
+from ep2sindy.studies.source import NO_ZONES, TELLING, Zones, told_roles
 from ep2sindy.studies.study import Count, Positive
-from ep2sindy.studies.told import NO_ZONES, TELLING, Zones, told_roles
 from ep2sindy.studies.views import (
     coefficients,
     display_equation,
