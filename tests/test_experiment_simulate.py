@@ -196,7 +196,6 @@ def test_a_scan_where_nothing_can_be_run_is_an_error(tmp_path: Path) -> None:
         ("scan={}", "scan must be like"),
         ("scan={n_cells:[30,30]}", "each value once"),
         ("figures.periods=0", "figures.periods must be a positive number"),
-        ("+scans=1", "unknown keys ['scans']"),
     ],
 )
 def test_settings_that_cannot_be_are_refused_before_a_run(

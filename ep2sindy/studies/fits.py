@@ -112,8 +112,8 @@ class Evaluation:
     from_sample: FreeRun
     from_fit: FreeRun
     cpu_s: float
-    status: str | None
-    loss: float
+    status: str | None = None
+    loss: float = float("nan")
 
 
 def n_before(run: Trajectory, held_out: float) -> int:
@@ -156,26 +156,14 @@ def fit_and_evaluate(
         units=train.units,
         provenance={"formulation": repr(formulation), "trajectories": train.label},
     )
-    return evaluate(replace(model, covariance=None), held, cpu_s=process_time() - begun)
+    cpu_s = process_time() - begun
+    model = replace(model, covariance=None)
+    return Evaluation(model, *runs_of(model, held), cpu_s)
 
 
-def evaluate(
-    model: SparseModel,
-    held: Trajectory,
-    *,
-    cpu_s: float = float("nan"),
-    status: str | None = None,
-    loss: float = float("nan"),
-) -> Evaluation:
-    """Integrate a model over the held-out part, from its first sample and from a fitted start."""
-    return Evaluation(
-        model=model,
-        from_sample=free_run(model, held),
-        from_fit=free_run(model, held, initial=_fitted_start(model, held)),
-        cpu_s=cpu_s,
-        status=status,
-        loss=loss,
-    )
+def runs_of(model: SparseModel, held: Trajectory) -> tuple[FreeRun, FreeRun]:
+    """Free runs over the held-out part, from its first sample and from a fitted start."""
+    return free_run(model, held), free_run(model, held, initial=_fitted_start(model, held))
 
 
 def _fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_states"]:

@@ -38,9 +38,9 @@ from ep2sindy.studies.fits import (
     Outcome,
     Relations,
     Terms,
-    evaluate,
     fit_and_evaluate,
     held_out_outcome,
+    runs_of,
     split_in_time,
     terms_of,
 )
@@ -209,7 +209,8 @@ def refine_and_judge(
     begun = process_time()
     found = refinement(seed=seed)
     cpu_s = process_time() - begun
-    return evaluate(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
+    runs = runs_of(found.model, held)
+    return Evaluation(found.model, *runs, cpu_s, found.status, found.loss)
 
 
 def window_table(
