@@ -66,9 +66,7 @@ class Study:
     def compute(self, run: Run) -> Outcome:
         models = {n: case.constraints(n, self.source.states) for n, case in self.models.items()}
         libraries = [library for library, _ in models.values()]
-        with run.progress(None, "", "data"):
-            field = self.source.field()
-        data = self.source.sampled(field, libraries, run)
+        _, data = self.source.opened(libraries, run)
         train, held = split_in_time(data, self.held_out)
         judged, labels, findings = {}, {}, {}
         streams = np.random.default_rng(run.seed).spawn(len(models))

@@ -97,9 +97,7 @@ class Study:
     def compute(self, run: Run) -> Outcome:
         library, terms = terms_of(self.model, states=self.source.states)
         free, tied = constraint(library, terms), constraint(library, terms, self.relations)
-        with run.progress(None, "", "data"):
-            field = self.source.field()
-        data = self.source.sampled(field, [library], run)
+        field, data = self.source.opened([library], run)
         train, held = split_in_time(data, self.held_out)
         self._check_windows(train)
         window = two_periods(train) if self.window is None else self.window

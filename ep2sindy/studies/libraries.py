@@ -51,7 +51,7 @@ from ep2sindy.studies.library_result import (
 )  # fmt: skip
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import NO_ZONES, Sampling, Source, Zones, data_summary, zones_of
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts
 from ep2sindy.studies.views import (
     FROM_DERIVATIVES,
     INTEGRATED,
@@ -146,7 +146,7 @@ class Study:
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: ShareOrNone = None
-    forecasts: int = 0
+    forecasts: Starts = 0
     hidden: Sequence[str] = ()
     relations: Sequence[str] = ()
     exclude: Terms | None = None
@@ -163,8 +163,6 @@ class Study:
                 "exclude goes without living, whose roles say which terms there are: "
                 f"exclude={dict(self.exclude)} came; take +exp=discover"
             )
-        if self.forecasts < 0:
-            raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
 
     def compute(self, run: Run) -> Outcome:
         with run.progress(None, "", "data"):

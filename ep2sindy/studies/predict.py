@@ -55,7 +55,7 @@ from ep2sindy.studies.points import (
 )
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import Source, compile_kernels
-from ep2sindy.studies.study import Count, Counts, Positive
+from ep2sindy.studies.study import Count, Counts, Positive, Starts
 from ep2sindy.studies.views import display_equation
 
 INTERVALS = (
@@ -139,12 +139,10 @@ class Study:
     windows: Followed
     map_points: Count
     labels: Mapping[str, str]
-    forecasts: int = 0
+    forecasts: Starts = 0
     keep: bool = True
 
     def __post_init__(self) -> None:
-        if self.forecasts < 0:
-            raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
         self._how(0)
         given = self._given
         sources, names = given.sources(self.source), given.names

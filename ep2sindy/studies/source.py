@@ -113,6 +113,12 @@ class Source:
         variables = dict.fromkeys(v for library in libraries for v in library.variables)
         return list(dict.fromkeys(v.partition("@")[0] for v in variables if v not in known))
 
+    def opened(self, libraries: Iterable[Library], run: Run) -> tuple[xr.Dataset, Trajectory]:
+        """The single record, and its trajectory as `sampled` makes it."""
+        with run.progress(None, "", "data"):
+            field = self.field()
+        return field, self.sampled(field, libraries, run)
+
     def sampled(self, field: xr.Dataset, libraries: Iterable[Library], run: Run) -> Trajectory:
         """The trajectory that the libraries need; also reports the data on screen and page."""
         say_simulation(run, field.attrs)  # first, as it may explain later errors

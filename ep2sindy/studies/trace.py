@@ -168,9 +168,7 @@ class Study:
         if self.unit is not None and data.settings.get("variables") is None:
             step = partial(in_unit, signal=self.signal, unit=self.unit)
             source = replace(source, prepare=[step, *source.prepare])
-        with run.progress(None, "", "data"):
-            field = source.field()
-        sampled = source.sampled(field, [], run)
+        _, sampled = source.opened([], run)
         known = 0.0 if isinstance(self.offset, str) else self.offset
         return replace(sampled, states=sampled.states + known)
 

@@ -74,9 +74,7 @@ class Study:
             n_points=self.n_points,
         )
         library, terms = terms_of(self.model, states=self.source.states)
-        with run.progress(None, "", "data"):
-            record = self.source.field()
-        data = self.source.sampled(record, [library], run)
+        _, data = self.source.opened([library], run)
         fitted = fit_settings(
             data,
             library,
