@@ -239,10 +239,11 @@ class Outcome:
 
     def sections(self) -> list[Section]:
         models = {self.labels[name]: model for name, model in self.models().items()}
+        shown = [self.shown, *pictures(self.drawn)]
         return [
             Section("Equations", self.about),
             *equation_sections(models, self.data.clock, page_only=not self.seen),
-            Section("Integrated", [self.shown, *pictures(self.drawn)]),
+            Section("Integrated" if self.seen else "Held-out time", shown),
             *self.more_sections,
         ]
 
