@@ -19,14 +19,8 @@ JUDGED = {
 
 def on_file(path: Path, output: Path) -> list[str]:
     """Overrides that run `+exp=constrained` on a file."""
-    return [
-        "+exp=constrained",
-        "data=file",
-        f"data.path={path}",
-        "data.variables.R_ion.name=R_ion",
-        "data.variables.u_iz.name=u_iz",
-        f"output={output}",
-    ]
+    rates = ("data.variables.R_ion.name=R_ion", "data.variables.u_iz.name=u_iz")
+    return programs.on_file("constrained", path, output, *rates)
 
 
 def constrained(path: Path, output: Path, *overrides: str) -> DictConfig:

@@ -24,10 +24,7 @@ EXACT = {
 def toy(path: Path, output: Path) -> list[str]:
     """Overrides that run `+exp=ils` on a file, at toy size."""
     return [
-        "+exp=ils",
-        "data=file",
-        f"data.path={path}",
-        f"output={output}",
+        *programs.on_file("ils", path, output),
         "n_windows=6",
         "windows=[60]",
         "living=free",  # predator and prey conserve nothing

@@ -4,19 +4,12 @@ from pathlib import Path
 import pytest
 
 from ep2sindy.app.runner import run_config
-from tests.programs import composed, computed
+from tests.programs import composed, computed, on_file
 
 
 def weak_on(path: Path, output: Path) -> list[str]:
     """Overrides that run `+exp=weak` on a file."""
-    return [
-        "+exp=weak",
-        "data=file",
-        f"data.path={path}",
-        f"output={output}",
-        "n_windows=500",
-        "n_points=[10,50]",
-    ]
+    return on_file("weak", path, output, "n_windows=500", "n_points=[10,50]")
 
 
 def test_weak_forms_find_predator_and_prey(predator_prey: Path, tmp_path: Path) -> None:
