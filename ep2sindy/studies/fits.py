@@ -239,7 +239,7 @@ class Outcome:
 
     def sections(self) -> list[Section]:
         models = {self.labels[name]: model for name, model in self.models().items()}
-        shown = [self.shown, *pictures(self.drawn)]
+        shown: list[Block] = [self.shown, *pictures(self.drawn)]
         return [
             Section("Equations", self.about),
             *equation_sections(models, self.data.clock, page_only=not self.seen),
