@@ -32,7 +32,7 @@ from ep2sindy.model.free_run import cycle_of
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.studies.balance import ComparedProcess, compared_processes, ends_of
 from ep2sindy.studies.living import start_of
-from ep2sindy.studies.told import fitted_rate, recorded_rates, told_roles
+from ep2sindy.studies.source import Zones, fitted_rate, recorded_rates, told_roles
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 CHANNEL, DOWNSTREAM = "channel", "downstream"
@@ -92,7 +92,7 @@ class Record:
         """What zones exchange, in the record and by a model; nothing if its terms are free."""
         if held is None or not held.processes:
             return []
-        return compared_processes(model, held, self.run, self.balances, self.sizes)
+        return compared_processes(model, held, self.run, Zones(self.balances, self.sizes))
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,11 @@ def composed(*overrides: str) -> DictConfig:
     return config
 
 
+def on_file(exp: str, path: Path, output: Path, *more: str) -> list[str]:
+    """Overrides that run an experiment on a file."""
+    return [f"+exp={exp}", "data=file", f"data.path={path}", f"output={output}", *more]
+
+
 @cache
 def composed_of(groups: tuple[str, ...]) -> DictConfig:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):

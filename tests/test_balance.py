@@ -10,7 +10,7 @@ import ep2sindy as ep
 from ep2sindy.library.roles import constraint_of, summed
 from ep2sindy.studies.balance import compared_processes, model_balance
 from ep2sindy.studies.fits import split_in_time
-from ep2sindy.studies.told import told_roles
+from ep2sindy.studies.source import Zones, told_roles
 
 STATES = ["n_i", "n_n"]
 CHANNEL = ep.Zone(z="channel")
@@ -136,7 +136,7 @@ VALUES = {
 def test_processes_of_a_conserving_model(data: ep.Trajectory, exact: xr.Dataset) -> None:
     model, held_to = under(ROLES, VALUES)
     n_i, n_n = data.states.T
-    compared = compared_processes(model, held_to, data, {"": exact})
+    compared = compared_processes(model, held_to, data, Zones({"": exact}))
     found = {each.name.split(",")[0]: each for each in compared}
     exchanged = found["neutrals that become ions"]
     np.testing.assert_allclose(exchanged.modelled, 4e-14 * n_i * n_n + 200.0 * n_n)
@@ -156,7 +156,7 @@ def test_what_ions_give_back_by_a_process_of_their_own_is_compared(data, exact) 
     told = replace(ROLES, exchange=[("n_n", "n_i"), ("n_i", "n_n", {"n_i": 1e5})])
     free = VALUES | {("n_i to n_n", "n_i"): 1e5}
     for roles, values in ((told, VALUES), (ROLES, free)):
-        compared = compared_processes(*under(roles, values), data, {"": exact})
+        compared = compared_processes(*under(roles, values), data, Zones({"": exact}))
         found = {each.name: each for each in compared}
         np.testing.assert_allclose(found["neutrals that become ions"].recorded, exact["ionization"])
         back = found["ions that become neutrals, back from walls and anode"]
@@ -172,7 +172,7 @@ def test_counterparts_are_those_of_the_record(data: ep.Trajectory, exact: xr.Dat
         exit_i=("time", 3e5 * n_i),
     )
     model, held_to = under(ROLES, VALUES)
-    compared = compared_processes(model, held_to, data, {"": made})
+    compared = compared_processes(model, held_to, data, Zones({"": made}))
     found = {each.name.split(",")[0]: each for each in compared}
     exchanged = found["neutrals that become ions"]
     assert exchanged.counterpart == pytest.approx({"n_n": 250.0, "n_i*n_n": 5e-14}, rel=1e-6)
@@ -189,7 +189,7 @@ def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exac
     model, held_to = under(ROLES, values)
     parts = split_in_time(data, 0.25)
     beside = model_balance(
-        model, held_to, data, *parts, {"": exact}, ep.FreeRunBounds(), period_s=5e-5
+        model, held_to, data, *parts, Zones({"": exact}), ep.FreeRunBounds(), period_s=5e-5
     )
     roles = {(each.part.split(",")[0], each.term): each for each in beside.terms}
     assert [each.term for each in beside.terms] == ["1", "n_i*n_n", "n_i", "n_n"]
@@ -216,7 +216,7 @@ def test_a_process_left_out_leaves_those_that_share_its_coefficient(data, exact,
     model, held_to = under(roles, values) if told else under(ROLES, values | {back: 1e5})
     parts = split_in_time(data, 0.25)
     beside = model_balance(
-        model, held_to, data, *parts, {"": exact}, ep.FreeRunBounds(), period_s=None
+        model, held_to, data, *parts, Zones({"": exact}), ep.FreeRunBounds(), period_s=None
     )
     found = {(each.part.split(",")[0], each.term): each for each in beside.terms}
     returned = found["ions that become neutrals", "n_i"]
@@ -240,7 +240,7 @@ def test_a_model_with_functions_has_no_processes(data: ep.Trajectory, exact: xr.
     model = ep.SparseModel(library, STATES, coef, dict.fromkeys(STATES, "m^-3"))
     parts = split_in_time(data, 0.25)
     beside = model_balance(
-        model, None, data, *parts, {"": exact}, ep.FreeRunBounds(), period_s=None
+        model, None, data, *parts, Zones({"": exact}), ep.FreeRunBounds(), period_s=None
     )
     assert not beside.processes
     assert {each.part for each in beside.terms} == {*STATES}

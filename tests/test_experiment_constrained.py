@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.studies.constrained import Study
+from ep2sindy.studies.views import frequency_words
 from tests import programs
 
 JUDGED = {
@@ -18,14 +19,8 @@ JUDGED = {
 
 def on_file(path: Path, output: Path) -> list[str]:
     """Overrides that run `+exp=constrained` on a file."""
-    return [
-        "+exp=constrained",
-        "data=file",
-        f"data.path={path}",
-        "data.variables.R_ion.name=R_ion",
-        "data.variables.u_iz.name=u_iz",
-        f"output={output}",
-    ]
+    rates = ("data.variables.R_ion.name=R_ion", "data.variables.u_iz.name=u_iz")
+    return programs.on_file("constrained", path, output, *rates)
 
 
 def constrained(path: Path, output: Path, *overrides: str) -> DictConfig:
@@ -57,9 +52,9 @@ def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_pat
         assert words in found.page
         assert words in found.log
     assert "status" not in found.page  # least squares has none
-    fit = found.outcome.judged["predator_prey_base"]
-    run = replace(fit.from_sample, frequency_Hz={"n_i": 2e4, "n_n": 3e4}, f_error=0.5)
-    assert found.outcome._frequency.value(replace(fit, from_sample=run)) == "20 kHz (+50.0 %)"
+    run = found.outcome.runs["predator_prey_base"]
+    other = replace(run, frequency_Hz={"n_i": 2e4, "n_n": 3e4}, f_error=0.5)
+    assert frequency_words(other) == "20 kHz (+50.0 %)"
 
 
 def test_held_out_times_count_from_the_start_of_the_held_out_part(

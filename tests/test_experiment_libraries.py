@@ -23,7 +23,7 @@ from ep2sindy.studies.library_result import REPLACED
 from ep2sindy.studies.living import run_title
 from ep2sindy.systems.systems import lotka_volterra
 from tests.browser import seen
-from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed
+from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed, on_file
 
 NO_LIVING = ("living=none", "held_out=null")
 
@@ -31,12 +31,9 @@ NO_LIVING = ("living=none", "held_out=null")
 def breathing(path: Path, output: Path) -> list[str]:
     """Overrides that run `+exp=breathing` on a file."""
     return [
-        "+exp=breathing",
-        "data=file",
-        f"data.path={path}",
+        *on_file("breathing", path, output),
         "data.variables.R_ion.name=R_ion",
         "data.variables.u_iz.name=u_iz",
-        f"output={output}",
         "bootstraps.n=4",
         "living=free",  # predator and prey conserve nothing
         "living.search.max_terms=2",  # as many as the truth has
@@ -209,9 +206,7 @@ def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     np.savetxt(path, table, delimiter=",", header="time,x,v", comments="")
     config = composed(
-        "+exp=discover",
-        "data=file",
-        f"data.path={path}",
+        *on_file("discover", path, tmp_path),
         "data.z.name=null",
         "data.variables.n_i.name=null",
         "data.variables.n_n.name=null",
@@ -221,7 +216,6 @@ def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
         "+data.variables.v.unit=1",
         "trajectory.states=[x,v]",
         "search=best_subset",
-        f"output={tmp_path}",
     )
     found = computed(config).summary["models"]["model"]["equations"]
     assert found["x"]["terms"] == pytest.approx({"v": 1.0}, rel=0.01)
@@ -309,14 +303,8 @@ def test_a_report_says_if_the_samples_speak_of_another_model(years: Computed) ->
 
 @pytest.mark.parametrize("search", ["adaptive_lasso", "stlsq", "best_subset"])
 def test_every_search_runs(search: str, predator_prey: Path, tmp_path: Path) -> None:
-    config = composed(
-        "+exp=discover",
-        "data=file",
-        f"data.path={predator_prey}",
-        "trajectory.states=[n_i,n_n]",
-        f"search={search}",
-        f"output={tmp_path}",
-    )
+    more = ("trajectory.states=[n_i,n_n]", f"search={search}")
+    config = composed(*on_file("discover", predator_prey, tmp_path, *more))
     equations = computed(config).summary["models"]["model"]["equations"]
     assert set(equations["n_i"]["terms"]) == {"n_i", "n_i*n_n"}
 

@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ep2sindy.app.runner import run_config, start_run
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
-from ep2sindy.figures.trends import PUBLISHED, trends_figure
+from ep2sindy.figures.operating import PUBLISHED, trends_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.quantity_law import control_law

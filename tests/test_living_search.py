@@ -23,7 +23,7 @@ def record(noise: float) -> ep.Trajectory:
 
 def searched(run: ep.Trajectory, settings: LivingSearch) -> ep.Discovery:
     library = ep.polynomial(run.state_names, degree=3)
-    return settings.found(run, library, ROWS, balances={}, rng=np.random.default_rng(0))
+    return settings.found(run, library, ROWS, rng=np.random.default_rng(0))
 
 
 def test_in_noise_the_mean_cycle_is_searched_and_said() -> None:

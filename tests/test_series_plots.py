@@ -59,7 +59,7 @@ def test_phase_portraits_leave_no_empty_panel(
     oscillation: Trajectory, n_models: int, n_columns: int
 ) -> None:
     models = rollouts(oscillation, n_models)
-    figure = phase_figure(oscillation, models, plane=("x", "v"), duration_s=20.0)
+    figure = phase_figure(oscillation, models, duration_s=20.0)
     assert [ax.get_title().partition("\n")[0] for ax in figure.axes] == list(models)
     labelled = [ax for ax in figure.axes if ax.get_xlabel()]
     assert len(labelled) == n_columns  # the lowest of every column
@@ -136,7 +136,7 @@ def test_runs_off_scale_are_marked_and_named_by_what_becomes_of_them(
     runs = rollouts(oscillation, 2)
     words = {"model 0": "follows the data", "model 1": "which ended badly"}
     rows = trajectory_figure(oscillation, runs, duration_s=20.0, verdicts=words)
-    plane = phase_figure(oscillation, runs, plane=("x", "v"), duration_s=20.0, verdicts=words)
+    plane = phase_figure(oscillation, runs, duration_s=20.0, verdicts=words)
     names = ["model 0\n(follows the data)", "model 1\n(diverges at 12.5 s)"]
     assert [ax.get_ylabel() for ax in rows.axes[::2]] == names
     assert [ax.get_title() for ax in plane.axes] == names

@@ -13,7 +13,7 @@ from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.library.roles import constraint_of, shares_of
 from ep2sindy.studies.balance import compared_processes
-from ep2sindy.studies.told import told_roles
+from ep2sindy.studies.source import Zones, told_roles
 from tests.programs import composed, computed
 
 STATES = ["n_i", "n_n"]
@@ -245,7 +245,7 @@ def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones,
     for (state, term), value in zip(held.coefficients, values, strict=True):
         coef[library.index(term), run.state_names.index(state)] = value
     model = ep.SparseModel(library, run.state_names, coef, run.units)
-    found = {p.name: p for p in compared_processes(model, held, run, balances, sizes)}
+    found = {p.name: p for p in compared_processes(model, held, run, Zones(balances, sizes))}
     assert [p.modelled.mean() for p in found.values()][1:] == pytest.approx(rates)
     whole = ep.thruster.zone_balance(field, ep.Zone(z="channel"))
     share = sum(sizes.values()) / sizes["exit"]
@@ -260,7 +260,7 @@ def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones,
     name = "exit: neutrals that become ions, less those given back"
     assert np.array_equal(found[name].recorded, made)
     beside = model_record(found, balances, sizes)
-    for process in compared_processes(model, held, run, beside, sizes):
+    for process in compared_processes(model, held, run, Zones(beside, sizes)):
         assert process.counterpart == pytest.approx(dict(process.coef), rel=1e-6)
 
 

@@ -12,7 +12,7 @@ from ep2sindy._stubs import dotted_names
 from ep2sindy.app.runner import run_config, study_class
 from ep2sindy.app.schema import as_node, bind, defaults_of
 from ep2sindy.app.targets import FOR_CONFIGS, check_targets
-from ep2sindy.studies.libraries import register_named
+from ep2sindy.studies.libraries import registered
 from tests.programs import ended
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,7 +25,7 @@ REFUSED = [
     "ep2sindy.write_field", "ep2sindy.SparseModel.load", "ep2sindy.SparseModel",
     "ep2sindy.discover", "ep2sindy.register_function", "ep2sindy.for_configs",
     "ep2sindy.runtime.files.write_text", "ep2sindy.app.schema.bind",
-    "ep2sindy.studies.libraries._register_one", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
+    "ep2sindy.studies.libraries.registered", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
     "ep2sindy._stubs.dotted_names", "ep2sindy.warnings", "ep2sindy.thruster.zone_balance",
     "ep2sindy.thruster.parameters.Thruster", "ep2sindy.prepare.import_module", "crop",
     "ep2sindy.ep2sindy.crop", "ep2sindy.thruster.crop", "ep2sindy.model.r2", "prepare.crop",
@@ -99,7 +99,7 @@ def test_studies_and_functions_are_the_packages_or_lie_in_the_folder(name: str, 
         study_class(name)
     if "/" not in name and not name.startswith("."):
         with pytest.raises(ValueError, match="must lie below the folder that you start in"):
-            register_named([f"{name}.tanh(x)"])
+            registered(f"{name}.tanh(x)")
     assert not {"idlelib", "this"} & (set(sys.modules) - before)
 
 

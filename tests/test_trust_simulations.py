@@ -8,8 +8,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation
-from ep2sindy.studies.source import Step, open_prepared
+from ep2sindy.studies.source import DivergedError, Step, amiss, is_simulation, open_prepared
 
 
 def simulation(status: str, n_samples: int = 2000) -> xr.Dataset:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from ep2sindy.figures.style import COLOURS, GREY, SMALL, TITLE, hover_spot, legend_above, make_grid
@@ -46,7 +45,7 @@ def front_figure(
             _draw_scores(ax, front, chosen, label)
         _add_hovers(ax, front, label)
         ax.set_title(_title(front, label, chosen=chosen is not None), fontsize=TITLE)
-    entries = {line.get_label(): line for ax in axes for line in ax.lines if _has_label(line)}
+    entries = {line.get_label(): line for ax in axes for line in ax.lines}
     shown = [entries[name] for name in _LAYERS if name in entries]
     legend_above(figure, shown)
     return figure
@@ -151,10 +150,6 @@ def _write_terms(candidate: Candidate) -> str:
     names = [f"${latex_term_name(name)}$" for name in candidate.terms]
     lines = [names[k : k + TERMS_A_LINE] for k in range(0, len(names), TERMS_A_LINE)]
     return ",\n".join(", ".join(line) for line in lines) or "0"
-
-
-def _has_label(line: Line2D) -> bool:
-    return not str(line.get_label()).startswith("_")
 
 
 def _score_label(label: str) -> str:

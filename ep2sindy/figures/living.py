@@ -68,14 +68,13 @@ def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Fi
     return figure
 
 
-def cycle_figure(
-    run: Trajectory | None, cycle: LimitCycle, paths: Sequence[Rollout], *, plane: Sequence[str]
-) -> Figure:
-    """A model's limit cycle over data in the plane of two states; runs from other starts.
+def cycle_figure(run: Trajectory | None, cycle: LimitCycle) -> Figure:
+    """A model's limit cycle over data in the plane of its first two states, and other runs.
 
-    run: the data; None leaves them out. Dots mark the starts. A run that leaves the panel is not
-    drawn again.
+    run: the data; None leaves them out. Other runs start off the cycle, at the dots. A run that
+    leaves the panel is not drawn again.
     """
+    plane, paths = cycle.model.states[:2], paths_off(cycle)
     figure, (ax,) = make_grid(1, width=4.4, height=3.8, extra=0.5)
     handles = [
         Line2D([], [], color=COLOURS[1], lw=2.0, label="the model's cycle"),
@@ -122,14 +121,9 @@ def paths_off(cycle: LimitCycle) -> list[Rollout]:
     return [simulate(cycle.model, t, start, None, blow_up=30.0, reach=reach) for start in starts]
 
 
-def has_waveform(run: Trajectory, rollout: Rollout) -> bool:
-    """Whether both the data and the model's run are periodic."""
-    return _waveforms(run, rollout) is not None
-
-
 def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
     """A panel per state: samples by phase, their waveform, and the model's, over two periods."""
-    found = _waveforms(run, rollout)
+    found = find_waveforms(run, rollout)
     assert found is not None
     data, model = found
     figure, axes = make_grid(len(run.state_names), width=4.2, height=3.0, extra=0.5)
@@ -148,8 +142,11 @@ def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
     return figure
 
 
-def _waveforms(run: Trajectory, rollout: Rollout) -> tuple[Cycle, Cycle] | None:
-    """Waveforms of the data and of the model's run; transients of a long run are left out."""
+def find_waveforms(run: Trajectory, rollout: Rollout) -> tuple[Cycle, Cycle] | None:
+    """Waveforms of the data and of the model's run; None if one of them is not periodic.
+
+    Transients of a long run are left out.
+    """
     data = find_cycle(run.t, run.states)
     if data is None:
         return None

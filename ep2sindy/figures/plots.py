@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.figures.fronts import front_figure
-from ep2sindy.figures.living import cycle_figure, free_run_figure, paths_off
+from ep2sindy.figures.living import cycle_figure, free_run_figure
 from ep2sindy.figures.operating import cycle_figure as law_cycle_figure
 from ep2sindy.figures.series import data_figure
 from ep2sindy.model.free_run import FreeRun
@@ -105,7 +105,7 @@ def _(run: FreeRun) -> Figure:
 
 @plot.register
 def _(cycle: LimitCycle, run: Trajectory | None = None) -> Figure:
-    return cycle_figure(run, cycle, paths_off(cycle), plane=cycle.model.states[:2])
+    return cycle_figure(run, cycle)
 
 
 @plot.register

@@ -1,4 +1,4 @@
-"""Figures of time series: data, and models beside them, each in its own row or panel.
+"""Figures of time series: data, models beside them, each in its own row or panel, and forecasts.
 
 The module also holds phase portraits of models and data in the plane of two states, and the
 preparation of curves: the part of a run to show, its limits and its labels.
@@ -13,6 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
@@ -27,6 +28,7 @@ from ep2sindy.figures.style import (
     Limits,
     axis_label,
     frame_limits,
+    legend_above,
     legend_curves,
     make_grid,
     make_panels,
@@ -34,6 +36,8 @@ from ep2sindy.figures.style import (
     slope_label,
     unit_text,
 )
+from ep2sindy.forecasting.bands import LEVEL
+from ep2sindy.forecasting.skill import MODEL, ForecastSkill
 from ep2sindy.library.units import Clock, unit_product
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
@@ -272,21 +276,19 @@ def phase_figure(
     run: Trajectory,
     rollouts: Mapping[str, Rollout],
     *,
-    plane: Sequence[str],
     duration_s: float,
     verdicts: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
-    """A panel per model in the plane of two states: its run (colour) over the data (grey).
+    """A panel per model in the plane of the first two states: its run (colour) over data (grey).
 
     The dot marks the start; other marks and verdicts are as in `trajectory_figure`.
     """
-    pair = [run.state_names.index(name) for name in plane]
-    data = first_part(run.t, run.states[:, pair], duration_s, run.clock)
+    data = first_part(run.t, run.states[:, :2], duration_s, run.clock)
     models = {
-        n: first_part(r.t, r.states[:, pair], duration_s, run.clock) for n, r in rollouts.items()
+        n: first_part(r.t, r.states[:, :2], duration_s, run.clock) for n, r in rollouts.items()
     }
     diverged, labels = find_diverged(rollouts, duration_s), run_labels(rollouts, verdicts)
-    x_label, y_label = (axis_label(name, run.units[name]) for name in plane)
+    x_label, y_label = (axis_label(name, run.units[name]) for name in run.state_names[:2])
     figure, axes = make_grid(
         len(models), width=2.75, height=2.75, extra=0.7, sharex=True, sharey=True, x_label=x_label
     )
@@ -309,3 +311,63 @@ def phase_figure(
             ax.yaxis.get_offset_text().set_visible(place.is_first_row())
     legend_curves(figure, axes)
     return figure
+
+
+HISTORY = 0.5  # of the horizon, shown before the start
+FLOOR = 1e-3  # lowest error drawn, in standard deviations
+
+
+def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
+    """The first forecast with its band over the samples, and the errors of all, by horizon.
+
+    run: the record that was forecast; its variables of the model's states are drawn.
+    """
+    ahead = skill.example
+    noise = dict(zip(ahead.state_names, ahead.noise_std, strict=True))  # NaN if not measured
+    names = [name for name in ahead.state_names if name in run.names and np.isfinite(noise[name])]
+    width = 4.5 if len(names) == 1 else 3.0
+    figure, axes = make_grid(len(names) + 1, width=width, height=2.8, extra=0.4)
+    low, high = ahead.band(LEVEL)
+    begin = run.t[max(0, int(np.searchsorted(run.t, ahead.t[0] - 1e-9 * run.dt_s)) - 1)]
+    factor, unit = run.clock.scale(float(ahead.t[-1] - begin))
+    shown = (run.t >= begin - HISTORY * (ahead.t[-1] - begin)) & (run.t <= ahead.t[-1])
+    for ax, name in zip(axes, names, strict=False):
+        k = ahead.state_names.index(name)
+        since = factor * (run.t[shown] - begin)
+        values = run.columns([name])[shown, 0]
+        ax.plot(since, values, ".", ms=3, color=DATA, label="samples")
+        later = factor * (ahead.t - begin)
+        ax.fill_between(
+            later, low[:, k], high[:, k], color=COLOURS[0], alpha=0.25, lw=0,
+            label=f"band of {100.0 * LEVEL:.0f} %",
+        )  # fmt: skip
+        ax.plot(later, ahead.states[:, k], color=COLOURS[0], lw=1.2, label="forecast")
+        ax.axvline(0.0, color=GREY, lw=0.8, ls="--")
+        ax.set_xlabel(f"time since the start ({unit})")
+        ax.set_ylabel(axis_label(name, run.units[name]))
+        ax.set_ylim(_limits(values))
+    _draw_errors(axes[-1], skill)
+    baselines = axes[-1].lines[1 : len(skill.nrmse)]  # the first line is the model's
+    handles = [*axes[0].get_legend_handles_labels()[0], *baselines]
+    legend_above(figure, handles)
+    return figure
+
+
+def _draw_errors(ax: Axes, skill: ForecastSkill) -> None:
+    in_periods = np.isfinite(skill.period_s)
+    unit_s = skill.period_s if in_periods else float(skill.horizons_s[0])
+    colours = dict(zip(("persistence", "harmonics", "autoregression"), COLOURS[1:], strict=False))
+    for name, values in skill.nrmse.items():
+        ax.plot(
+            skill.horizons_s / unit_s, np.maximum(values, FLOOR), label=name,
+            color=COLOURS[0] if name == MODEL else colours[name], lw=1.8 if name == MODEL else 1.0,
+        )  # fmt: skip
+    ax.axhline(1.0, color=GREY, lw=0.8, ls="--")
+    ax.set_yscale("log")
+    ax.set_xlabel(f"horizon ({'periods' if in_periods else 'samples'})")
+    ax.set_ylabel("error (standard deviations)")
+
+
+def _limits(values: Float[np.ndarray, " samples"]) -> tuple[float, float]:
+    room = 0.25 * float(np.ptp(values))
+    return float(values.min()) - room, float(values.max()) + room

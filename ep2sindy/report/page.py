@@ -16,16 +16,7 @@ from xml.etree import ElementTree
 
 from ep2sindy.library.equations import latex_name, terms_latex
 from ep2sindy.report.about import About
-from ep2sindy.report.document import (
-    Block,
-    Equation,
-    Link,
-    Result,
-    Section,
-    Table,
-    Text,
-    cell_text,
-)
+from ep2sindy.report.document import Block, Equation, Link, Result, Section, Table, Text, cell_text
 from ep2sindy.report.picture import Drawn
 
 if TYPE_CHECKING:

@@ -129,7 +129,7 @@ class ResultTable(Generic[Record]):
     metrics: Metrics[Record]
 
     def csv(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
-        """A row per record. heading: of the column of names, left out if empty.
+        """A row per record, or the columns alone. heading: of that of names, left out if empty.
 
         by_state: a row per record and state instead, in which a metric without states is repeated.
         """
@@ -144,7 +144,8 @@ class ResultTable(Generic[Record]):
             else:
                 columns = [metric.columns(value) for metric, value in values]
                 rows.append(reduce(or_, columns, first))
-        return pd.DataFrame(rows)
+        known = None if rows else [*filter(None, [heading]), *(m.key for m in self._in(View.CSV))]
+        return pd.DataFrame(rows, columns=known)
 
     def screen(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
         """A row of formatted cells per record.
@@ -202,6 +203,11 @@ def facts(record: Record, metrics: Metrics[Record]) -> dict[str, Any]:
     """Metrics of one record for `summary.json`, by key."""
     found = {m.key: m.value(record) for m in metrics if View.JSON in m.view}
     return {key: dict(v) if isinstance(v, Mapping) else v for key, v in found.items()}
+
+
+def json_rows(table: pd.DataFrame) -> list[dict[Any, Any]]:
+    """Rows of a table for `summary.json`; a missing value becomes None."""
+    return table.astype(object).where(table.notna(), None).to_dict("records")
 
 
 def percent(digits: int, *, sign: bool = False) -> Callable[[float], str]:

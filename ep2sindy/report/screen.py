@@ -63,7 +63,8 @@ class Screen:
         with writing(self._path):
             for console in self._consoles[1:]:
                 _print(console, *renderables)
-            self._flush()
+            if self._log is not None:
+                self._log.flush()
 
     def log(self, text: str) -> None:
         """Write text to run.log only."""
@@ -92,11 +93,6 @@ class Screen:
         if self._log is not None:
             with writing(self._path):
                 self._log.close()
-
-    def _flush(self) -> None:
-        """Write buffered output to run.log."""
-        if self._log is not None:
-            self._log.flush()
 
 
 def renderables(block: Block) -> Iterator[RenderableType]:

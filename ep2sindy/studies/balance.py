@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
@@ -24,16 +22,16 @@ from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pic
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
-from ep2sindy.studies.told import (
+from ep2sindy.studies.source import (
     IONS,
     NEUTRALS,
     FittedRate,
+    Zones,
     fitted_rate,
     rate_r2,
     recorded_rates,
 )
 
-NO_SIZES: Mapping[str, float] = MappingProxyType({})
 CAPTION = (
     "What zones gain or lose by each process, over two periods: in the record (grey), and by "
     "the model's terms at the record's densities (colour)."
@@ -94,24 +92,23 @@ def compared_processes(
     model: SparseModel,
     held_to: Constraint,
     data: Trajectory,
-    balances: Mapping[str, xr.Dataset],
-    sizes: Mapping[str, float] = NO_SIZES,
+    zones: Zones,
 ) -> list[ComparedProcess]:
     """The processes of ions and neutrals, in zones and between them, in record and model.
 
-    held_to: the model's constraint, from a search under `Roles`. balances: by zone; a single one is
-    called "". sizes: zone -> its length, of several. Rates are those of the zone that gives, or
-    takes from outside. Where ions give back by a process of their own, ionization is the whole of
-    it; else what is given back is subtracted, as the model's terms are net of it.
+    held_to: the model's constraint, from a search under `Roles`. Rates are those of the zone that
+    gives, or takes from outside. Where ions give back by a process of their own, ionization is the
+    whole of it; else what is given back is subtracted, as the model's terms are net of it.
     """
     theta = model.library.evaluate(data.columns(model.library.variables))
     found: dict[tuple[str, str], dict[str, float]] = {}
     for process, amount in process_amounts(held_to, {s: model.terms(s) for s in model.states}):
         found.setdefault(ends_of(process), {})[process.term] = amount
-    known = {zone: recorded_rates(balance, data) for zone, balance in balances.items()}
-    gone = _through_ends(known, sizes or dict.fromkeys(balances, 1.0))
+    known = {zone: recorded_rates(balance, data) for zone, balance in zones.balances.items()}
+    gone = _through_ends(known, zones.sizes or dict.fromkeys(known, 1.0))
     compared = []
-    for ends, terms in sorted(found.items(), key=lambda each: _order(*each[0])):
+    # What enters comes first, what leaves last.
+    for ends, terms in sorted(found.items(), key=lambda each: (bool(each[0][0]), not each[0][1])):
         columns = theta[:, [model.library.index(term) for term in terms]]
         gross = ends[::-1] in found
         rate = _zone_rate(*ends, known, gone, gross=gross)
@@ -122,11 +119,6 @@ def compared_processes(
             ComparedProcess(words, ends, rate, modelled, terms, beside.terms, beside.r2)
         )
     return compared
-
-
-def _order(giver: str, taker: str) -> int:
-    """What enters first, what leaves last."""
-    return 0 if not giver else 2 if not taker else 1
 
 
 def ends_of(process: Process) -> tuple[str, str]:
@@ -186,12 +178,10 @@ def _zone_rate(
         return gone.get((state, zone))
     if gross:
         return known[zone].get("ionization" if state == NEUTRALS else "returned")
-    exchanged = _difference(known[zone], "ionization", "returned")
-    return exchanged if state == NEUTRALS or exchanged is None else -exchanged
-
-
-def _difference(known: Mapping[str, np.ndarray], first: str, second: str) -> np.ndarray | None:
-    return known[first] - known[second] if {first, second} <= set(known) else None
+    if not {"ionization", "returned"} <= set(known[zone]):
+        return None
+    exchanged = known[zone]["ionization"] - known[zone]["returned"]
+    return exchanged if state == NEUTRALS else -exchanged
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,19 +219,15 @@ COEFFICIENT: Metrics[TermRole] = [
     Metric("term", lambda role: role.term, View.SHOWN),
     Metric("coefficient", lambda role: role.coef, View.SHOWN),
 ]
-# Metrics of a refined model without one term; None if there is none.
-WITHOUT: Metrics[FreeRun | None] = [
-    Metric("f_error", lambda run: run.f_error if run else np.nan),
+LEFT_OUT: Metrics[TermRole] = [
+    Metric("without_verdict", lambda role: role.verdict, View.SHOWN, "without it"),
+    Metric("without_f_error", lambda role: role.without.f_error if role.without else np.nan),
     Metric(
-        "waveform_error",
-        lambda run: max(run.waveform_error.values()) if run else np.nan,
+        "without_waveform_error",
+        lambda role: max(role.without.waveform_error.values()) if role.without else np.nan,
         View.SHOWN, "waveform", "{:.3f}",
     ),
 ]  # fmt: skip
-LEFT_OUT: Metrics[TermRole] = [
-    Metric("without_verdict", lambda role: role.verdict, View.SHOWN, "without it"),
-    *(metric.of(lambda role: role.without, "without_{}") for metric in WITHOUT),
-]
 BY_PROCESS: Metrics[TermRole] = [
     Metric("process", lambda role: role.part, View.SHOWN),
     *COEFFICIENT,
@@ -321,26 +307,23 @@ def model_balance(
     data: Trajectory,
     train: Trajectory,
     held: Trajectory,
-    balances: Mapping[str, xr.Dataset],
+    zones: Zones,
     bounds: FreeRunBounds,
     *,
-    sizes: Mapping[str, float] = NO_SIZES,
     period_s: float | None,
     progress: Progress = SILENT,
 ) -> ModelBalance:
     """Compare a model with the balance of its zone, and leave out each of its terms in turn.
 
     held_to: what the model's coefficients obey; None if they are free. Models without a term are
-    refined on `train` and run over `held`. balances: of the zones, by `zone_balance`; a single one
-    is called "". sizes: length of each of several zones. period_s: of the model's cycle, for the
-    figure.
+    refined on `train` and run over `held`. period_s: of the model's cycle, for the figure.
     """
     support = {state: list(model.terms(state)) for state in model.states}
     held_to = held_to or constraint(model.library, support)
     processes: list[ComparedProcess] = []
     named = {state.partition("@")[0] for state in model.states}
-    if balances and held_to.processes and named == {IONS, NEUTRALS}:
-        processes = compared_processes(model, held_to, data, balances, sizes)
+    if zones.balances and held_to.processes and named == {IONS, NEUTRALS}:
+        processes = compared_processes(model, held_to, data, zones)
     lesser = _each_left_out(model, held_to, by_process=bool(processes))
     window = two_periods(train)
     left_out = [

@@ -42,6 +42,7 @@ from ep2sindy.report.document import (
     pictures,
     places,
 )
+from ep2sindy.report.results import json_rows
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
@@ -380,13 +381,7 @@ class Outcome:
 
     def summary(self) -> dict[str, Any]:
         """The counts as whole numbers; `selected` is null for a variant that selects nothing."""
-        rows = self.cells.astype({"on_front": int}).to_dict("records")
-        return {
-            "cells": [
-                row | {"selected": None if np.isnan(row["selected"]) else int(row["selected"])}
-                for row in rows
-            ]
-        }
+        return {"cells": json_rows(self.cells.astype(dict.fromkeys(COUNTS, "Int64")))}
 
     def headline(self) -> dict[str, float]:
         """Means over systems and noises; a variant that selects nothing has 0 %, and NaN terms."""

@@ -11,14 +11,16 @@ import numpy as np
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, constraint
 from ep2sindy.regression.rows import Formulation
+from ep2sindy.report.results import facts
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import count_pieces
 from ep2sindy.studies.fits import (
+    METHOD,
     Outcome,
     Relations,
     Terms,
-    evaluation_summary,
     fit_and_evaluate,
+    held_out_outcome,
     split_in_time,
     terms_of,
 )
@@ -64,9 +66,7 @@ class Study:
     def compute(self, run: Run) -> Outcome:
         models = {n: case.constraints(n, self.source.states) for n, case in self.models.items()}
         libraries = [library for library, _ in models.values()]
-        with run.progress(None, "", "data"):
-            field = self.source.field()
-        data = self.source.sampled(field, libraries, run)
+        _, data = self.source.opened(libraries, run)
         train, held = split_in_time(data, self.held_out)
         judged, labels, findings = {}, {}, {}
         streams = np.random.default_rng(run.seed).spawn(len(models))
@@ -81,8 +81,8 @@ class Study:
                 fit = fit_and_evaluate(train, held, library, each, self.formulation, rng=rng)
                 judged[f"{name}_{kind}"] = fit
                 labels[f"{name}_{kind}"] = f"{name.replace('_', ' ')}, {kind}"
-            findings[name] = {kind: evaluation_summary(judged[f"{name}_{kind}"]) for kind in KINDS}
+            findings[name] = {kind: facts(judged[f"{name}_{kind}"], METHOD) for kind in KINDS}
         relations = dict.fromkeys(text for case in self.models.values() for text in case.relations)
-        return Outcome(
+        return held_out_outcome(
             train, held, judged, labels, list(relations), self.figures, {"models": findings}
         )

@@ -19,7 +19,6 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.terms import variables_of
@@ -28,7 +27,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import dominant_window
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Captioned, Result, Section, Table, Text, pictures
+from ep2sindy.report.document import Block, Captioned, Result, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.forecasts import LEAST_SAMPLES, is_short
@@ -36,13 +35,14 @@ from ep2sindy.studies.source import data_summary
 from ep2sindy.studies.study import Check
 from ep2sindy.studies.views import (
     MARKS,
+    MODEL,
     PlotRange,
     best_run,
     coefficients,
     equation_sections,
     found_model,
+    frequency_words,
     intervals,
-    model_summary,
     rollout_tables,
     run_figures,
     trajectories,
@@ -67,6 +67,10 @@ CAPTIONS = {
     f"data (grey). {MARKS}",
     "trajectories_started": "The same from a start fitted to the first one and a half periods.",
 }
+NOTE = (
+    "Data, held out: {}. Amplitude: standard deviation against the data's. Start fitted: frequency "
+    "error and nrmse from a start fitted to the first one and a half periods."
+)
 SINCE = "time since start of held-out part"
 FIGURES = ("phase", "spectra")
 COMPARED = ("f_error", "nrmse", "amplitude_ratio")
@@ -108,8 +112,8 @@ class Evaluation:
     from_sample: FreeRun
     from_fit: FreeRun
     cpu_s: float
-    status: str | None
-    loss: float
+    status: str | None = None
+    loss: float = float("nan")
 
 
 def n_before(run: Trajectory, held_out: float) -> int:
@@ -152,26 +156,14 @@ def fit_and_evaluate(
         units=train.units,
         provenance={"formulation": repr(formulation), "trajectories": train.label},
     )
-    return evaluate(replace(model, covariance=None), held, cpu_s=process_time() - begun)
+    cpu_s = process_time() - begun
+    model = replace(model, covariance=None)
+    return Evaluation(model, *runs_of(model, held), cpu_s)
 
 
-def evaluate(
-    model: SparseModel,
-    held: Trajectory,
-    *,
-    cpu_s: float = float("nan"),
-    status: str | None = None,
-    loss: float = float("nan"),
-) -> Evaluation:
-    """Integrate a model over the held-out part, from its first sample and from a fitted start."""
-    return Evaluation(
-        model=model,
-        from_sample=free_run(model, held),
-        from_fit=free_run(model, held, initial=_fitted_start(model, held)),
-        cpu_s=cpu_s,
-        status=status,
-        loss=loss,
-    )
+def runs_of(model: SparseModel, held: Trajectory) -> tuple[FreeRun, FreeRun]:
+    """Free runs over the held-out part, from its first sample and from a fitted start."""
+    return free_run(model, held), free_run(model, held, initial=_fitted_start(model, held))
 
 
 def _fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_states"]:
@@ -194,119 +186,128 @@ def _fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Models by name, fitted to `train` and tested on `held`.
+    """Fits of known terms, each run freely over the same samples.
 
-    labels: readable names of the models. relations: those that the constrained models obey.
-    findings, more_tables, more_figures, more_sections: what the study itself adds.
+    data: these samples. seen: whether they were fitted. runs: by name of the fit. labels: readable
+    names. kind: what a fit is called, such as `method`. fits: one row per fit and state. shown: the
+    same for reading. about: blocks before the equations. drawn: figures, of which the first shows
+    what was found. findings: the summary. numbers: the headline. of_best: what is said of the fit
+    that runs best, by name. more_tables, more_sections: what the study itself adds.
     """
 
-    train: Trajectory
-    held: Trajectory
-    judged: Mapping[str, Evaluation]
+    data: Trajectory
+    seen: bool
+    runs: Mapping[str, FreeRun]
     labels: Mapping[str, str]
-    relations: Sequence[str]
-    shown: PlotRange
-    findings: Mapping[str, Any]
+    kind: str
+    fits: pd.DataFrame
+    shown: Table
+    about: Sequence[Block]
+    drawn: Mapping[str, Captioned]
+    findings: dict[str, Any]
+    numbers: Mapping[str, float]
+    of_best: Mapping[str, str] = field(default_factory=dict)
     more_tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    more_figures: Mapping[str, Captioned] = field(default_factory=dict)
     more_sections: Sequence[Section] = ()
 
-    @property
-    def f_data_Hz(self) -> float:
-        """Dominant frequency of the first state on the held-out part; models are compared to it."""
-        return dominant_frequency(self.held.t, self.held.states[:, 0])
-
-    @property
-    def labelled(self) -> dict[str, Evaluation]:
-        return {self.labels[name]: each for name, each in self.judged.items()}
-
     def models(self) -> dict[str, SparseModel]:
-        return {name: each.model for name, each in self.judged.items()}
+        return {name: run.model for name, run in self.runs.items()}
 
     def tables(self) -> dict[str, pd.DataFrame]:
-        integrated = {name: each.from_sample for name, each in self.judged.items()}
         return {
-            **rollout_tables(self.held, integrated),
-            "methods": ResultTable(self.judged, METHOD).csv("method", by_state=True),
-            "coefficients": coefficients(self.models(), heading="method"),
+            **rollout_tables(self.data, self.runs),
+            f"{self.kind}s": self.fits,
+            "coefficients": coefficients(self.models(), heading=self.kind),
             **self.more_tables,
         }
 
-    def figures(self) -> dict[str, Captioned]:
-        sample = {name: each.from_sample for name, each in self.labelled.items()}
-        fit = {name: each.from_fit for name, each in self.labelled.items()}
-        runs = {
-            name: trajectories(self.held, models, self.shown, caption, since=SINCE)
-            for (name, caption), models in zip(CAPTIONS.items(), (sample, fit), strict=True)
-        }
-        more = run_figures(FIGURES, self.held, sample, self.shown)
-        return {**runs, **more, **self.more_figures}
+    def figures(self) -> Mapping[str, Captioned]:
+        return self.drawn
 
     def in_short(self) -> Result:
-        """The model that runs best over held-out time."""
-        best = best_run({name: each.from_sample for name, each in self.judged.items()})
+        """The model that runs best."""
+        best = best_run(self.runs)
         return found_model(
-            f"Found by {self.labels[best]}",
-            self.judged[best].from_sample,
+            f"Found by the {self.kind} {self.labels[best]}",
+            self.runs[best],
             file=best,
-            picture=next(iter(CAPTIONS)),
-            more=[Text(f"the best of {len(self.judged)} models that were fitted")],
-            where="held-out time",
+            picture=next(iter(self.drawn)),
+            more=[Text(f"{self.of_best.get(best, '')}the best of {len(self.runs)} {self.kind}s")],
+            where="the record" if self.seen else "held-out time",
+            seen=self.seen,
         )
 
     def sections(self) -> list[Section]:
-        models = {label: each.model for label, each in self.labelled.items()}
-        known = any(model.covariance is not None for model in models.values())
-        relations = [Text(f"relation: {text}") for text in self.relations]
-        intervals = [Text(INTERVALS, page_only=True)] if known else []
-        shown = pictures([*CAPTIONS, *FIGURES, *self.more_figures])
+        models = {self.labels[name]: model for name, model in self.models().items()}
+        shown: list[Block] = [self.shown, *pictures(self.drawn)]
         return [
-            Section("Equations", [*relations, *intervals]),
-            *equation_sections(models, self.held.clock, page_only=True),
-            Section("Held-out time", [self._table(), *shown]),
+            Section("Equations", self.about),
+            *equation_sections(models, self.data.clock, page_only=not self.seen),
+            Section("Integrated" if self.seen else "Held-out time", shown),
             *self.more_sections,
         ]
 
-    def _table(self) -> Table:
-        """One row per model: how it runs."""
-        metrics = [self._frequency, *METHOD]
-        rows = ResultTable(self.labelled, metrics).screen("method")
-        if rows["status"].isna().all():  # least squares has no status
-            del rows["status"]
-        return Table(
-            rows,
-            title=TITLE,
-            note=f"Data, held out: {self.held.clock.frequency_text(self.f_data_Hz)}. Amplitude: "
-            "standard deviation against the data's. Start fitted: frequency error and nrmse from "
-            "a start fitted to the first one and a half periods.",
-        )
-
-    @property
-    def _frequency(self) -> Metric[Evaluation]:
-        """The frequency of a model, beside that of the data."""
-
-        def text(judged: Evaluation) -> str:
-            run = judged.from_sample
-            frequency = run.rollout.clock.frequency_text(run.frequency_Hz[run.model.states[0]])
-            return _or_verdict(run, f"{frequency} ({100 * run.f_error:+.1f} %)")
-
-        return Metric("f", text, View.SCREEN)
-
     def summary(self) -> dict[str, Any]:
-        n_held_out = self.held.n_samples
-        data = data_summary(self.train) | {
-            "n_samples": self.train.n_samples + n_held_out,
-            "n_held_out": n_held_out,
-            "f_kHz": 1e-3 * self.f_data_Hz,
-        }
-        return {"data": data, **self.findings}
+        return self.findings
 
-    def headline(self) -> dict[str, float]:
-        return ResultTable(self.judged, METHOD).headline()
+    def headline(self) -> Mapping[str, float]:
+        return self.numbers
+
+
+def held_out_outcome(
+    train: Trajectory,
+    held: Trajectory,
+    judged: Mapping[str, Evaluation],
+    labels: Mapping[str, str],
+    relations: Sequence[str],
+    shown: PlotRange,
+    findings: Mapping[str, Any],
+) -> Outcome:
+    """The outcome of models that were fitted to `train` and tested on `held`.
+
+    relations: those that the constrained models obey. findings: what the study itself adds.
+    """
+    f_data_Hz = dominant_frequency(held.t, held.states[:, 0])
+    n_samples = {"n_samples": train.n_samples + held.n_samples, "n_held_out": held.n_samples}
+    data = data_summary(train) | n_samples | {"f_kHz": 1e-3 * f_data_Hz}
+    fits = ResultTable(judged, METHOD)
+    labelled = {labels[name]: each for name, each in judged.items()}
+    rows = ResultTable(labelled, METHOD).screen("method")
+    if rows["status"].isna().all():  # least squares has no status
+        del rows["status"]
+    known = any(each.model.covariance is not None for each in judged.values())
+    relation_lines = [Text(f"relation: {text}") for text in relations]
+    return Outcome(
+        data=held,
+        seen=False,
+        runs={name: each.from_sample for name, each in judged.items()},
+        labels=labels,
+        kind="method",
+        fits=fits.csv("method", by_state=True),
+        shown=Table(rows, title=TITLE, note=NOTE.format(held.clock.frequency_text(f_data_Hz))),
+        about=[*relation_lines, *([Text(INTERVALS, page_only=True)] if known else [])],
+        drawn=held_out_figures(held, labelled, shown),
+        findings={"data": data, **findings},
+        numbers=fits.headline(),
+    )
+
+
+def held_out_figures(
+    held: Trajectory, labelled: Mapping[str, Evaluation], shown: PlotRange
+) -> dict[str, Captioned]:
+    """Runs from the first sample and from a fitted start, phase portraits and spectra."""
+    sample = {name: each.from_sample for name, each in labelled.items()}
+    fit = {name: each.from_fit for name, each in labelled.items()}
+    runs = {
+        name: trajectories(held, models, shown, caption, since=SINCE)
+        for (name, caption), models in zip(CAPTIONS.items(), (sample, fit), strict=True)
+    }
+    return runs | run_figures(FIGURES, held, sample, shown)
 
 
 # Metrics of a free run. CSV has values by state; JSON and headlines have the first state's.
 RUN: Metrics[FreeRun] = [
+    Metric("f", frequency_words, View.SCREEN),
     Metric("f_Hz", lambda run: run.frequency_Hz, View.CSV),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.JSON),
     Metric("f_error", lambda run: run.f_error, View.FILES | View.HEADLINE),
@@ -319,15 +320,14 @@ RUN: Metrics[FreeRun] = [
     Metric("amplitude", lambda run: run.amplitude_ratio, View.SCREEN, "amplitude {}"),
     Metric("waveform_error", lambda run: run.waveform_error[run.model.states[0]], View.JSON),
     Metric("periods", lambda run: run.periods, View.JSON),
-    Metric("verdict", lambda run: str(run.verdict), View.SCREEN),
-    Metric("verdict", lambda run: run.text, View.JSON),
+    Metric("verdict", lambda run: run.text, View.JSON | View.SCREEN),
 ]  # fmt: skip
 METHOD: Metrics[Evaluation] = [
-    Metric("text", lambda judged: equation_texts(judged.model), View.CSV),
+    *(metric.of(lambda judged: judged.model) for metric in MODEL),
     *(metric.of(lambda judged: judged.from_sample) for metric in RUN),
     *(metric.of(lambda judged: judged.from_fit, "{}_started", View.CSV) for metric in RUN),
     Metric("start fitted", lambda judged: _started_text(judged.from_fit), View.SCREEN),
-    Metric("fitted_start", lambda judged: run_summary(judged.from_fit), View.JSON),
+    Metric("fitted_start", lambda judged: facts(judged.from_fit, RUN), View.JSON),
     Metric("ci95", lambda judged: intervals(judged.model), View.JSON),
     Metric("loss", lambda judged: judged.loss),
     Metric("status", lambda judged: judged.status, View.SHOWN),
@@ -335,26 +335,7 @@ METHOD: Metrics[Evaluation] = [
 ]
 
 
-def equation_texts(model: SparseModel) -> dict[str, str]:
-    return {state: equation_text(state, model.terms(state)) for state in model.states}
-
-
 def _started_text(run: FreeRun) -> str:
-    return _or_verdict(run, f"{100 * run.f_error:+.1f} %, {run.nrmse:.2f}")
-
-
-def _or_verdict(run: FreeRun, text: str) -> str:
-    """The text; for a model without a frequency, its verdict instead."""
-    return run.text if np.isnan(run.f_error) else text
-
-
-def evaluation_summary(judged: Evaluation) -> dict[str, Any]:
-    """Summary of the run from the first sample: f_kHz, f_error, nrmse, amplitude_ratio.
-
-    Quantities by state are those of the first state.
-    """
-    return model_summary(judged.model) | facts(judged, METHOD)
-
-
-def run_summary(run: FreeRun) -> dict[str, Any]:
-    return facts(run, RUN)
+    """Frequency error and nrmse; the verdict of a run without a frequency."""
+    has_none = np.isnan(run.f_error)
+    return run.text if has_none else f"{100 * run.f_error:+.1f} %, {run.nrmse:.2f}"

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.forecasts import forecast_figure
+from ep2sindy.figures.series import forecast_figure
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
 from ep2sindy.forecasting.tracking import track

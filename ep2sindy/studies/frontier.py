@@ -174,11 +174,7 @@ class Outcome:
 
     def summary(self) -> dict[str, Any]:
         kept = self.points[["variant", "rate_Hz", "duration_s", "identified"]]
-        return {
-            "points": [
-                row | {"identified": bool(row["identified"])} for row in kept.to_dict("records")
-            ]
-        }
+        return {"points": kept.to_dict("records")}
 
     def headline(self) -> dict[str, float]:
         percent = 100.0 * self.points.groupby("variant", sort=False)["identified"].mean()

@@ -6,15 +6,14 @@ The study also measures how far the result of a refinement depends on the window
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from time import process_time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
@@ -27,24 +26,26 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned, Section, Table
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import (
     COMPARED,
+    METHOD,
+    RUN,
     Evaluation,
     Outcome,
     Relations,
     Terms,
-    evaluate,
-    evaluation_summary,
     fit_and_evaluate,
-    run_summary,
+    held_out_outcome,
+    runs_of,
     split_in_time,
     terms_of,
 )
 from ep2sindy.studies.living import LivingSearch, two_periods
-from ep2sindy.studies.source import Source, balances_of
+from ep2sindy.studies.source import Source, Zones, zones_of
 from ep2sindy.studies.study import Count, Counts, Share
 from ep2sindy.studies.views import PlotRange
 
@@ -96,9 +97,7 @@ class Study:
     def compute(self, run: Run) -> Outcome:
         library, terms = terms_of(self.model, states=self.source.states)
         free, tied = constraint(library, terms), constraint(library, terms, self.relations)
-        with run.progress(None, "", "data"):
-            field = self.source.field()
-        data = self.source.sampled(field, [library], run)
+        field, data = self.source.opened([library], run)
         train, held = split_in_time(data, self.held_out)
         self._check_windows(train)
         window = two_periods(train) if self.window is None else self.window
@@ -113,8 +112,8 @@ class Study:
             name: fit_and_evaluate(train, held, library, each, form, rng=next(streams))
             for name, each, form in count_pieces(run.watch, fits, "fit")
         }
-        balances = balances_of(self.source, field, run)
-        lives, own = self._living(train, balances, rng=next(streams), progress=run.watch)
+        zones = zones_of(self.source, field, run)
+        lives, own = self._living(train, zones, rng=next(streams), progress=run.watch)
         starts = {
             "ils": (judged["base"].model, free),
             "ils_constrained": (judged["constrained"].model, tied),
@@ -144,19 +143,12 @@ class Study:
         return self._outcome(train, held, judged, by_window, draws)
 
     def _living(
-        self,
-        train: Trajectory,
-        balances: Mapping[str, xr.Dataset],
-        *,
-        rng: np.random.Generator,
-        progress: Progress,
+        self, train: Trajectory, zones: Zones, *, rng: np.random.Generator, progress: Progress
     ) -> tuple[SparseModel, Constraint]:
         """The model that oscillates on its own, and what its coefficients obey."""
         rows = Regression(self.formulation)
         library = polynomial(train.state_names, degree=2)
-        found = self.living.found(
-            train, library, rows, balances=balances, rng=rng, progress=progress
-        )
+        found = self.living.found(train, library, rows, zones, rng=rng, progress=progress)
         model = found.model
         support = {state: list(model.terms(state)) for state in model.states}
         return model, found.constraint or constraint(model.library, support)
@@ -194,23 +186,18 @@ class Study:
         windows = window_table(by_window, dt_s=train.dt_s, period_s=period_s)
         labelled = windows.replace({"method": LABELS})
         draw = partial(loss_against_window_figure, labelled, period=period_s / train.dt_s)
-        return Outcome(
-            train,
-            held,
-            judged,
-            LABELS,
-            self.relations,
-            self.figures,
-            findings={
-                "methods": {
-                    name: evaluation_summary(each) | spread_summary(draws.get(name, ()))
-                    for name, each in judged.items()
-                },
-                "loss_against_window": windows.to_dict("records"),
-            },
+        methods = {
+            name: facts(each, METHOD)
+            | ({"spread": facts(of, SPREAD)} if (of := draws.get(name)) else {})
+            for name, each in judged.items()
+        }
+        findings = {"methods": methods, "loss_against_window": windows.to_dict("records")}
+        fits = held_out_outcome(train, held, judged, LABELS, self.relations, self.figures, findings)
+        return replace(
+            fits,
+            drawn={**fits.drawn, "loss_against_window": Captioned(draw, CAPTION)},
             more_tables={"loss_against_window": windows, "draws": draws_table(draws)},
-            more_sections=[spread_section({LABELS[name]: runs for name, runs in draws.items()})],
-            more_figures={"loss_against_window": Captioned(draw, CAPTION)},
+            more_sections=[spread_section(draws)],
         )
 
 
@@ -220,7 +207,8 @@ def refine_and_judge(
     begun = process_time()
     found = refinement(seed=seed)
     cpu_s = process_time() - begun
-    return evaluate(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
+    runs = runs_of(found.model, held)
+    return Evaluation(found.model, *runs, cpu_s, found.status, found.loss)
 
 
 def window_table(
@@ -239,7 +227,7 @@ def window_table(
                 "text": each.model.text(),
             }
             for run, suffix in ((each.from_sample, ""), (each.from_fit, "_started")):
-                numbers = run_summary(run)
+                numbers = facts(run, RUN)
                 row |= {f"{key}{suffix}": numbers[key] for key in COMPARED}
             rows.append(row)
     return pd.DataFrame(rows)
@@ -269,11 +257,8 @@ def watcher(
 # How far the result of a refinement depends on the windows that were drawn.
 
 
-FIGURES = ("f_error", "nrmse", "amplitude", "waveform")
-
-
-def _figures(run: FreeRun) -> dict[str, float]:
-    """Figures of one free run; amplitude and waveform error are those of the worst state."""
+def _of_worst(run: FreeRun) -> dict[str, float]:
+    """Numbers of one free run; amplitude and waveform error are those of the worst state."""
     ratios = np.array(list(run.amplitude_ratio.values()))
     return {
         "f_error": run.f_error,
@@ -286,61 +271,49 @@ def _figures(run: FreeRun) -> dict[str, float]:
 def draws_table(draws: Mapping[str, Sequence[FreeRun]]) -> pd.DataFrame:
     """One row per method and draw of windows: the model's run over the held-out part."""
     rows = [
-        {"method": name, "draw": k, "verdict": str(run.verdict), **_figures(run)}
+        {"method": name, "draw": k, "verdict": str(run.verdict), **_of_worst(run)}
         for name, runs in draws.items()
         for k, run in enumerate(runs)
     ]
     return pd.DataFrame(rows)
 
 
-def spread_summary(runs: Sequence[FreeRun]) -> dict[str, Any]:
-    """`spread`: lowest and highest value of each figure over the draws; number that live."""
-    if not runs:
-        return {}
-    found: dict[str, Any] = {
-        "n_draws": len(runs),
-        "n_living": sum(run.verdict is Verdict.LIVES for run in runs),
-    }
-    for name, (low, high) in _spread(runs).items():
-        found[name] = [low, high]
-    return {"spread": found}
+def _n_living(runs: Sequence[FreeRun]) -> int:
+    return sum(run.verdict is Verdict.LIVES for run in runs)
 
 
-def _spread(runs: Sequence[FreeRun]) -> dict[str, tuple[float, float]]:
-    """Lowest and highest value of each figure over the draws that have it; NaN if none has it."""
-    found = {}
-    for name in FIGURES:
-        values = np.array([_figures(run)[name] for run in runs])
-        known = values[np.isfinite(values)]
-        found[name] = (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
-    return found
+def _ends(runs: Sequence[FreeRun], name: str) -> list[float]:
+    """Lowest and highest value of a number over the draws that have it; NaN if none has it."""
+    values = np.array([_of_worst(run)[name] for run in runs])
+    known = values[np.isfinite(values)]
+    return [float(known.min()), float(known.max())] if known.size else [np.nan, np.nan]
+
+
+def _range_text(ends: Sequence[float], form: str = "{:.3f} to {:.3f}", factor: float = 1.0) -> str:
+    low, high = (factor * value for value in ends)
+    return "-" if np.isnan(low) else form.format(low, high)
+
+
+_RELATIVE = partial(_range_text, form="{:+.2f} to {:+.2f} %", factor=100.0)
+BOTH = View.JSON | View.SCREEN
+SPREAD: Metrics[Sequence[FreeRun]] = [
+    Metric("n_draws", len, View.JSON),
+    Metric("n_living", _n_living, View.JSON),
+    Metric("live", lambda runs: f"{_n_living(runs)} of {len(runs)}", View.SCREEN),
+    Metric("f_error", partial(_ends, name="f_error"), BOTH, "frequency error", _RELATIVE),
+    *(
+        Metric(name, partial(_ends, name=name), BOTH, format=_range_text)
+        for name in ("nrmse", "amplitude", "waveform")
+    ),
+]
 
 
 def spread_section(draws: Mapping[str, Sequence[FreeRun]]) -> Section:
-    """One row per method: the range of its figures over the draws."""
-    rows = []
-    for name, runs in draws.items():
-        spread = _spread(runs)
-        low, high = (100.0 * value for value in spread["f_error"])
-        row = {
-            "method": name,
-            "live": f"{sum(run.verdict is Verdict.LIVES for run in runs)} of {len(runs)}",
-            "frequency error": _range(low, high, "+.2f", " %"),
-        }
-        row |= {key: _range(*spread[key], ".3f") for key in ("nrmse", "amplitude", "waveform")}
-        rows.append(row)
-    n = max(map(len, draws.values()))
-    return Section(
-        f"Over {n} draws of windows",
-        [
-            Table(
-                pd.DataFrame(rows),
-                title="lowest and highest, over held-out time from its first sample",
-                note="Amplitude and waveform are those of the state that is farthest off.",
-            )
-        ],
+    """One row per method: the range of its numbers over the draws."""
+    rows = ResultTable({LABELS[name]: runs for name, runs in draws.items()}, SPREAD)
+    table = Table(
+        rows.screen("method"),
+        title="lowest and highest, over held-out time from its first sample",
+        note="Amplitude and waveform are those of the state that is farthest off.",
     )
-
-
-def _range(low: float, high: float, form: str, unit: str = "") -> str:
-    return "-" if np.isnan(low) else f"{low:{form}} to {high:{form}}{unit}"
+    return Section(f"Over {max(map(len, draws.values()))} draws of windows", [table])

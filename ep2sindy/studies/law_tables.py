@@ -21,12 +21,12 @@ from ep2sindy.operating.quantities import PointResult
 from ep2sindy.operating.quantity_law import ControlLaw
 from ep2sindy.operating.records import OperatingRecord, point_label
 from ep2sindy.report.document import Equation, places
-from ep2sindy.report.results import Metric, ResultTable, View, percent
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.forecasts import skill_of
-from ep2sindy.studies.views import with_error
+from ep2sindy.studies.views import terms_text, with_error
 
 Parameters = Mapping[str, float]
 Laws = Mapping[str, Mapping[str, ControlLaw]]  # fit -> quantity -> law
@@ -186,14 +186,14 @@ def left_out_metrics(points: Sequence[LeftOutPoint]) -> list[Metric[LeftOutPoint
     return [
         Metric("branch", lambda p: p.branch, several, "cycle"),
         *(_parameter(name) for name in points[0].record.parameters),
-        Metric("enclosed", lambda p: p.result.inside, View.SHOWN, format=_yes_or_no),
         Metric(
-            "f_kHz",
-            lambda p: p.f_kHz,
+            "enclosed",
+            lambda p: p.result.inside,
             View.SHOWN,
-            f"f ({unit})",
-            lambda f_kHz: places(factor * f_kHz, 2),
+            format=lambda inside: "yes" if inside else "no",
         ),
+        Metric("f_kHz", lambda p: p.f_kHz),
+        Metric("f", lambda p: factor * p.f_kHz, View.SCREEN, f"f ({unit})", "{:.2f}"),
         Metric("f_model_kHz", lambda p: p.f_kHz * (1.0 + p.result.run.f_error)),
         Metric("f_error", lambda p: p.result.run.f_error, View.SHOWN, format=relative),
         Metric(
@@ -204,20 +204,12 @@ def left_out_metrics(points: Sequence[LeftOutPoint]) -> list[Metric[LeftOutPoint
             lambda ratio: relative(ratio - 1.0),
         ),
         Metric(
-            "waveform",
-            lambda p: p.result.run.waveform_error,
-            View.SHOWN,
-            "waveform {}",
-            lambda error: places(error, 3),
+            "waveform", lambda p: p.result.run.waveform_error, View.SHOWN, "waveform {}", "{:.3f}"
         ),
         Metric("verdict", lambda p: str(p.result.run.verdict), View.SHOWN),
         Metric("forecast", lambda p: p.forecast_error(MODEL), forecast, format="{:.3f}"),
         Metric(
-            "autoregression",
-            lambda p: p.forecast_error(AUTOREGRESSION),
-            forecast,
-            "AR",
-            "{:.3f}",
+            "autoregression", lambda p: p.forecast_error(AUTOREGRESSION), forecast, "AR", "{:.3f}"
         ),
         Metric("also", lambda p: p.also, several),
     ]
@@ -225,10 +217,6 @@ def left_out_metrics(points: Sequence[LeftOutPoint]) -> list[Metric[LeftOutPoint
 
 def _parameter(name: str) -> Metric[LeftOutPoint]:
     return Metric(name, lambda p: p.record.parameters[name], View.SHOWN, name, "{:g}")
-
-
-def _yes_or_no(value: bool) -> str:
-    return "yes" if value else "no"
 
 
 def structures_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
@@ -245,13 +233,13 @@ def structure_metrics(name: str, branch: Branch) -> list[Metric[StructureTrial]]
         return trial is branch.choice
 
     def marked(trial: StructureTrial) -> str:
-        text = trial.case.name or _terms_text(trial)
+        text = trial.case.name or terms_text(trial.fit.structure)
         return text + ("  <- chosen" if is_chosen(trial) else "")
 
     return [
         Metric("branch", lambda trial: name),
         Metric("model", lambda trial: trial.case.name),
-        Metric("terms", _terms_text),
+        Metric("terms", lambda trial: terms_text(trial.fit.structure)),
         Metric("model" if branch.choice.case.name else "terms", marked, View.SCREEN),
         Metric("degree", lambda trial: trial.degree, View.SHOWN),
         Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
@@ -264,10 +252,6 @@ def structure_metrics(name: str, branch: Branch) -> list[Metric[StructureTrial]]
         ),
         Metric("chosen", is_chosen),
     ]
-
-
-def _terms_text(trial: StructureTrial) -> str:
-    return "; ".join(f"{s}: {', '.join(terms)}" for s, terms in trial.fit.structure.items())
 
 
 def _median_f_error(trial: StructureTrial) -> float:
@@ -351,47 +335,40 @@ def best_fit(fits: Iterable[str], results: Sequence[PointResult], laws: Laws) ->
     return min(fits, key=rank)
 
 
+# A control law with its fit and quantity. Its errors are those at points left out.
+CONTROL_LAW: Metrics[tuple[str, str, ControlLaw]] = [
+    Metric("fit", lambda row: row[0], View.CSV),
+    Metric("quantity", lambda row: row[1], View.CSV),
+    Metric("law", lambda row: Equation(row[1], row[2].coef_by_term, rate=False), View.CSV),
+    Metric("terms", lambda row: row[2].coef_by_term, View.JSON),
+    Metric("r2", lambda row: row[2].r2),
+    Metric("loo_error", lambda row: row[2].loo_error),
+    Metric("search_error", lambda row: row[2].search_error),
+]
+
+
 def control_laws_table(laws: Laws) -> pd.DataFrame:
-    """One row per control law, with its errors at points left out."""
-    rows = [
-        (
-            fit,
-            name,
-            Equation(name, law.coef_by_term, rate=False),
-            law.r2,
-            law.loo_error,
-            law.search_error,
-        )
-        for fit, by_quantity in laws.items()
-        for name, law in by_quantity.items()
-    ]
-    return pd.DataFrame(rows, columns=["fit", "quantity", "law", "r2", "loo_error", "search_error"])
-
-
-def law_errors(laws: Laws, fits: Mapping[str, Case]) -> dict[str, float]:
-    """Prediction error of the laws by fit and quantity; NaN for a law that was not found."""
-    errors = {}
-    for fit, case in fits.items():
-        for name in case.quantities:
-            law = laws.get(fit, {}).get(name)
-            errors[f"law/{fit}/{name}/loo_error"] = law.loo_error if law else float("nan")
-            errors[f"law/{fit}/{name}/search_error"] = law.search_error if law else float("nan")
-    return errors
+    """One row per control law."""
+    rows = [(fit, name, law) for fit, of_fit in laws.items() for name, law in of_fit.items()]
+    return ResultTable(rows, CONTROL_LAW).csv()
 
 
 def control_laws_summary(laws: Laws) -> dict[str, Any]:
     """Terms and errors of every control law, by fit and quantity."""
     return {
-        fit: {
-            name: {
-                "terms": law.coef_by_term,
-                "r2": law.r2,
-                "loo_error": law.loo_error,
-                "search_error": law.search_error,
-            }
-            for name, law in by_quantity.items()
-        }
-        for fit, by_quantity in laws.items()
+        fit: {name: facts((fit, name, law), CONTROL_LAW) for name, law in of_fit.items()}
+        for fit, of_fit in laws.items()
+    }
+
+
+def law_errors(laws: Laws, fits: Mapping[str, Case]) -> dict[str, float]:
+    """Prediction error of the laws by fit and quantity; NaN for a law that was not found."""
+    found = control_laws_summary(laws)
+    return {
+        f"law/{fit}/{name}/{key}": found.get(fit, {}).get(name, {}).get(key, np.nan)
+        for fit, case in fits.items()
+        for name in case.quantities
+        for key in ("loo_error", "search_error")
     }
 
 

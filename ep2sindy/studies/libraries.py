@@ -14,7 +14,7 @@ import xarray as xr
 
 from ep2sindy.data.quantities import KNOWN_UNITS
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.forecasting.skill import ForecastSkill
@@ -50,8 +50,8 @@ from ep2sindy.studies.library_result import (
     run_refitted,
 )  # fmt: skip
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
-from ep2sindy.studies.source import Sampling, Source, Zones, data_summary
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
+from ep2sindy.studies.source import NO_ZONES, Sampling, Source, Zones, data_summary, zones_of
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts
 from ep2sindy.studies.views import (
     FROM_DERIVATIVES,
     INTEGRATED,
@@ -108,7 +108,7 @@ class LibraryCase:
             names,
             degree=self.degree,
             products=list(self.products),
-            functions=register_named(self.functions),
+            functions=[registered(str(name)) for name in self.functions],
             function_degree=self.function_degree,
         )
 
@@ -146,7 +146,7 @@ class Study:
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: ShareOrNone = None
-    forecasts: int = 0
+    forecasts: Starts = 0
     hidden: Sequence[str] = ()
     relations: Sequence[str] = ()
     exclude: Terms | None = None
@@ -163,8 +163,6 @@ class Study:
                 "exclude goes without living, whose roles say which terms there are: "
                 f"exclude={dict(self.exclude)} came; take +exp=discover"
             )
-        if self.forecasts < 0:
-            raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
 
     def compute(self, run: Run) -> Outcome:
         with run.progress(None, "", "data"):
@@ -187,7 +185,7 @@ class Study:
         # Each case has its own random stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         pairs = list(zip(libraries.items(), streams, strict=True))
-        zones = Zones.of(self.source, opened[0], run) if self.living is not None else Zones()
+        zones = NO_ZONES if self.living is None else zones_of(self.source, opened[0], run)
         watch = run.watch
         results = {
             name: self._result(runs, name, library, methods[name], zones, rng=rng, progress=watch)
@@ -232,7 +230,11 @@ class Study:
         lives is searched for in the first one.
         """
         s, measured = self.rollout_s, runs[0]
-        found = self._ask(list(runs), library, method, seed=rng, progress=progress)
+        barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
+        found = discover(
+            list(runs), library, method, hidden=self.hidden, relations=self.relations,
+            exclude=barred, roles=self.roles, seed=rng, progress=progress,
+        )  # fmt: skip
         runs = runs if found.estimate is None else found.estimate.runs
         first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
         data, n_samples = first
@@ -250,7 +252,6 @@ class Study:
         )  # fmt: skip
         with progress.stage(None, "", "free runs"):
             return LibraryResult(
-                method=method,
                 discovery=found,
                 selected=free_run(found.model, data, n_samples=n_samples),
                 given=published,
@@ -261,17 +262,6 @@ class Study:
                 elsewhere=[free_run(found.model, run, n_samples=n) for run, n in others],
                 skill=skill,
             )
-
-    @property
-    def _ask(self) -> partial[Discovery]:
-        barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
-        return partial(
-            discover,
-            hidden=self.hidden,
-            relations=self.relations,
-            exclude=barred,
-            roles=self.roles,
-        )
 
     def _lives(
         self,
@@ -288,12 +278,10 @@ class Study:
         assert self.living is not None
         parts = split_in_time(data, self.held_out or HELD_OUT)
         lives = living_model(
-            *parts, library, rows, self.living, selected, balances=zones.balances,
-            sizes=zones.sizes, rng=rng, progress=progress,
-        )  # fmt: skip
+            *parts, library, rows, self.living, selected, zones, rng=rng, progress=progress
+        )
         beside = model_balance(
-            lives.model, lives.discovery.constraint, data, *parts, zones.balances,
-            self.living.bounds, sizes=zones.sizes,
+            lives.model, lives.discovery.constraint, data, *parts, zones, self.living.bounds,
             period_s=None if lives.cycle is None else lives.cycle.period_s, progress=progress,
         )  # fmt: skip
         return lives, beside
@@ -311,16 +299,12 @@ def alone(data: Trajectory) -> str | None:
     )
 
 
-def register_named(names: Sequence[str]) -> list[str]:
-    """Names in the form that a library takes.
+def registered(text: str) -> str:
+    """A function's name in the form that a library takes.
 
     `my_module.tanh(2*x)` imports my_module and becomes `tanh(2*x)`.
     Raises ValueError for a module that cannot be imported or does not register the name.
     """
-    return [_register_one(str(name)) for name in names]
-
-
-def _register_one(text: str) -> str:
     found = _FROM_MODULE.fullmatch(text.strip())
     if found is None:
         return text

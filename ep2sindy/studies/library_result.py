@@ -12,7 +12,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import LeftOver, NoiseTest
-from ep2sindy.discovery.method import AnyMethod, Regression
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.estimate import Estimate, Rival
 from ep2sindy.forecasting.skill import ForecastSkill
@@ -68,7 +68,6 @@ class LibraryResult:
     the last quarter of the record, which it was fitted to; None if there are none.
     """
 
-    method: AnyMethod
     discovery: Discovery
     selected: FreeRun
     given: Mapping[str, Mapping[str, float]]
@@ -87,12 +86,12 @@ class LibraryResult:
     @property
     def label(self) -> str:
         """The name of the selection score."""
-        return self.method.selection.label
+        return self.discovery.method.selection.label
 
     @property
     def by_runs(self) -> bool:
         """Whether the selection runs or refines whole models, rather than scoring candidates."""
-        return isinstance(self.method.selection, SystemSelection)
+        return isinstance(self.discovery.method.selection, SystemSelection)
 
     @property
     def how(self) -> str:
@@ -166,6 +165,10 @@ class CandidateRow:
     terms: Mapping[str, float]
     left: LeftOver | None = None
 
+    @property
+    def inclusion(self) -> dict[str, float]:
+        return dict(zip(self.candidate.terms, self.candidate.inclusion.tolist(), strict=True))
+
 
 TRAJECTORY: Metrics[FreeRun] = [
     Metric(
@@ -191,14 +194,10 @@ def candidate_metrics(label: str) -> Metrics[CandidateRow]:
             "residual_autocorrelation", lambda row: row.left and row.left.autocorrelation, View.JSON
         ),
         Metric("share", lambda row: row.candidate.share, View.SHOWN, format="{:.2f}"),
-        Metric("inclusion", lambda row: _inclusion(row.candidate), View.JSON),
+        Metric("inclusion", lambda row: row.inclusion, View.JSON),
         Metric("selected", lambda row: row.is_selected, View.CSV),
         Metric("text", lambda row: equation_text(row.candidate.equation, row.terms)),
     ]
-
-
-def _inclusion(chosen: Candidate) -> dict[str, float]:
-    return dict(zip(chosen.terms, chosen.inclusion.tolist(), strict=True))
 
 
 def candidate_rows(front: ParetoFront) -> list[CandidateRow]:
@@ -263,7 +262,7 @@ def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Secti
     blocks: list[Block] = [
         Text(
             f"{len(library)} terms in {', '.join(library.variables)}; "
-            f"selection: {result.method.selection}"
+            f"selection: {found.method.selection}"
         ),
         *([Text(f"selected: {result.decision}")] if result.decision else []),
         *(Text(f"note: {each}") for each in found.remarks),
@@ -276,13 +275,20 @@ def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Secti
         )
     for state in found.fronts:
         blocks.append(readable_front(result, state, clock))
-        blocks += [Text(each) for each in left_over(state, found.noise_test)]
+        if (left := found.noise_test.left.get(state)) is not None:
+            blocks.append(
+                Text(
+                    f"left over of {state}': {left.chi_squared:.3g} times {THE_NOISE}, "
+                    f"autocorrelation {left.autocorrelation:.2f} (1 and 0 where noise alone is "
+                    "left)"
+                )
+            )
     blocks.append(Text(column_note(result.label), page_only=True))
     return Section(f"{name}: candidates", [*blocks, Picture(f"front_{name}")])
 
 
 # Nobody measured a simulation: what its samples show beside their smooth course is numerical.
-NOISE = "the noise of the samples (of a simulation: its numerical noise)"
+THE_NOISE = "the noise of the samples (of a simulation: its numerical noise)"
 
 
 def left_over_of_all(tests: Sequence[NoiseTest]) -> list[Text]:
@@ -291,27 +297,12 @@ def left_over_of_all(tests: Sequence[NoiseTest]) -> list[Text]:
         return []
     left = [each for test in tests for each in test.left.values() if not each.leaves_noise]
     ratios = sorted(each.chi_squared for each in left)
-    size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {NOISE}" if left else "more than noise"
+    size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {THE_NOISE}" if left else "more than noise"
     text = (
         f"The equations fitted to derivatives leave {size}: a state or a term is missing there, so "
         "they have no intervals; the free run above is what judges."
     )
     return [Text(text)]
-
-
-def left_over(state: str, test: NoiseTest) -> list[str]:
-    """A line on the residuals of the selected terms, if the noise of the rows is known."""
-    if (left := test.left.get(state)) is None:
-        return []
-    return [
-        f"left over of {state}': {left.chi_squared:.3g} times {NOISE}, "
-        f"autocorrelation {left.autocorrelation:.2f} (1 and 0 where noise alone is left)"
-    ]
-
-
-def candidate_text(candidate: Candidate) -> str:
-    """`n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
-    return equation_text(candidate.equation, candidate.coef_by_term)
 
 
 def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
@@ -366,7 +357,7 @@ def _published_summary(run: FreeRun, refitted: Mapping[str, Candidate]) -> dict[
             name: {
                 "terms": run.model.terms(name),
                 "r2_test": candidate.r2_test,
-                "text": candidate_text(candidate),
+                "text": equation_text(name, candidate.coef_by_term),
             }
             for name, candidate in refitted.items()
         },

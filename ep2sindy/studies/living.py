@@ -9,12 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
@@ -26,7 +24,7 @@ from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.model.comparison import FreeRunBounds
+from ep2sindy.model.comparison import FreeRunBounds, Verdict
 from ep2sindy.model.display import grouped
 from ep2sindy.model.free_run import FreeCycle, FreeRun, free_run
 from ep2sindy.model.mass_action import consequences
@@ -40,14 +38,15 @@ from ep2sindy.selection.rule import OtherSystem, SystemSelection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.spectrum import samples_in_periods
+from ep2sindy.studies.source import NO_ZONES, TELLING, Zones, told_roles
 from ep2sindy.studies.study import Count, Positive
-from ep2sindy.studies.told import TELLING, told_roles
 from ep2sindy.studies.views import (
     coefficients,
     display_equation,
     interval_table,
     intervals,
     rollout_tables,
+    terms_text,
 )
 
 WAVEFORM = "One period by phase, shown twice: samples, their waveform, and the model's."
@@ -69,7 +68,6 @@ OTHERS_NOTE = (
     "largest of the three in units of the bounds of a model that lives. All stay within them: what "
     "these models have in common is what the record tells."
 )
-NO_SIZES: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -95,20 +93,19 @@ class LivingSearch:
         train: Trajectory,
         library: Library,
         rows: Regression,
+        zones: Zones = NO_ZONES,
         *,
-        balances: Mapping[str, xr.Dataset],
-        sizes: Mapping[str, float] = NO_SIZES,
         rng: np.random.Generator,
         progress: Progress = SILENT,
     ) -> Discovery:
         """The discovery in a record, with the formulation and bootstraps of `rows`.
 
-        balances: of the zones, which tell what the roles take as known. sizes: length of each of
-        several zones, in which the roles then hold.
+        zones: their balances tell what the roles take as known, and of several, the roles hold in
+        each.
         """
         own = replace(rows, search=self.search, depth=self.depth, selection=self.selection)
         library = polynomial(train.state_names, degree=self.degree) if self.degree else library
-        roles, told = self._told(train, balances, sizes)
+        roles, told = self._told(train, zones)
         seen, words = self._quiet(train)
         found = discover(seen, library, own, roles=roles, seed=rng, progress=progress)
         found = replace(found, note=f"{found.note}{told}")
@@ -118,14 +115,12 @@ class LivingSearch:
         model = replace(found.model, covariance=None)
         return replace(found, model=model, note=f"{words}{found.note}")
 
-    def _told(
-        self, train: Trajectory, balances: Mapping[str, xr.Dataset], sizes: Mapping[str, float]
-    ) -> tuple[Roles | None, str]:
+    def _told(self, train: Trajectory, zones: Zones) -> tuple[Roles | None, str]:
         """The roles with what the record tells, and how well it tells what is fitted to it."""
         if self.roles is None:
             return None, ""
-        roles = self.roles.in_zones(sizes) if sizes else self.roles
-        told = told_roles(balances, train)
+        roles = self.roles.in_zones(zones.sizes) if zones.sizes else self.roles
+        told = told_roles(zones.balances, train)
         fitted = [role for role in roles.open if role in told and role in TELLING]
         known = {name: role.terms for name, role in told.items()}
         words = (
@@ -211,7 +206,9 @@ class Living:
             *pictures(self.figures(name)),
             *self._others(),
         ]
-        return Section(f"{name}: a model that {_ending(self)}", blocks)
+        lives = self.run.verdict is Verdict.LIVES
+        ending = "lives" if lives else f"does not live ({self.run.text})"
+        return Section(f"{name}: a model that {ending}", blocks)
 
     def _others(self) -> list[Block]:
         """The other systems of this size that live: whether the found one is the law."""
@@ -233,9 +230,8 @@ class Living:
                 figures.free_run_figure, held, run.rollout, period_s=period_s
             )
             if len(self.model.states) > 1:
-                plane, paths = held.state_names[:2], figures.paths_off(self.cycle)
-                drawn["cycle"] = partial(figures.cycle_figure, held, self.cycle, paths, plane=plane)
-            if figures.has_waveform(held, run.rollout):
+                drawn["cycle"] = partial(figures.cycle_figure, held, self.cycle)
+            if figures.find_waveforms(held, run.rollout):
                 drawn["waveform"] = partial(figures.waveform_figure, held, run.rollout)
         return {f"{key}_{name}": Captioned(draw, CAPTIONS[key]) for key, draw in drawn.items()}
 
@@ -283,7 +279,7 @@ LIVING: Metrics[Living] = [
     Metric("by_derivatives", lambda found: facts(found.by_derivatives, REFINED), View.JSON),
 ]
 OTHERS: Metrics[OtherSystem] = [
-    Metric("terms", lambda each: _structure(each), View.SHOWN),
+    Metric("terms", lambda each: terms_text(each.terms), View.SHOWN),
     Metric("f_error", lambda each: each.f_error, View.SHOWN, "frequency", percent(2)),
     Metric("amplitude_error", lambda each: each.amplitude, View.SHOWN, "amplitude", percent(1)),
     Metric("waveform_error", lambda each: each.waveform, View.SHOWN, "waveform", "{:.3f}"),
@@ -314,11 +310,6 @@ def _text(living: Living) -> str:
     return "\n".join(equation_text(state, terms) for state, terms in sums.items())
 
 
-def _structure(system: OtherSystem) -> str:
-    """Terms of every role or equation."""
-    return "; ".join(f"{part}: {', '.join(terms)}" for part, terms in system.terms.items())
-
-
 def _terms(model: SparseModel) -> dict[str, list[str]]:
     return {state: list(model.terms(state)) for state in model.states}
 
@@ -347,10 +338,6 @@ def _with_intervals(model: SparseModel) -> dict[str, dict[str, Any]]:
         }
         for state in model.states
     }
-
-
-def _ending(living: Living) -> str:
-    return "lives" if living.run.verdict == "lives" else f"does not live ({living.run.text})"
 
 
 def run_title(run: FreeRun) -> str:
@@ -397,20 +384,16 @@ def living_model(
     rows: Regression,
     settings: LivingSearch,
     selected: SparseModel,
+    zones: Zones,
     *,
-    balances: Mapping[str, xr.Dataset],
-    sizes: Mapping[str, float],
     rng: np.random.Generator,
     progress: Progress = SILENT,
 ) -> Living:
     """Find a living model in one part of a record, and run it over the other.
 
-    selected: the model selected by derivatives, which is refined for comparison. balances: of
-    the zones, as far as the record gives them. sizes: length of each of several zones.
+    selected: the model selected by derivatives, which is refined for comparison.
     """
-    found = settings.found(
-        train, library, rows, balances=balances, sizes=sizes, rng=rng, progress=progress
-    )
+    found = settings.found(train, library, rows, zones, rng=rng, progress=progress)
     with progress.stage(None, "", "free run and limit cycle"):
         start = start_of(held, found.model)
         run = free_run(found.model, held, initial=start, bounds=settings.bounds)

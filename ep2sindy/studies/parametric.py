@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.figures.trends import PUBLISHED, rows_at, trends_figure
+from ep2sindy.figures.operating import PUBLISHED, rows_at, trends_figure
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import constraint
 from ep2sindy.library.units import SECONDS

@@ -15,8 +15,7 @@ from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.oscillation import Oscillation
-from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation, quiet
-from ep2sindy.studies.source import Source
+from ep2sindy.studies.source import DivergedError, Source, amiss, is_simulation, quiet
 from ep2sindy.studies.study import Check, Deferred
 
 QUIET = (
@@ -176,21 +175,16 @@ def open_points(
     """Open or simulate all points, and report their data and warnings."""
     stage = run.progress(len(sources), "point opened")
     points = collect(workers, partial(PointSource.open, inputs=inputs), sources, stage)
-    _say_used(run, points)
+    used = {point.label: point.used for point in points if point.used}
+    if len(alike := {*used.values()}) == 1:  # all points are averaged alike
+        run.say(f"data: {alike.pop()}")
+    else:
+        for label, words in used.items():
+            run.say(f"data: {label}: {words}")
     for point in points:
         for note in point.notes:
             run.warn(f"{point.label}: {note}")
     return points
-
-
-def _say_used(run: Run, points: Sequence[OperatingRecord]) -> None:
-    """Report which data are used: one line if all points are averaged alike, else one line each."""
-    used = {point.label: point.used for point in points if point.used}
-    if len({*used.values()}) == 1:
-        run.say(f"data: {next(iter(used.values()))}")
-        return
-    for label, words in used.items():
-        run.say(f"data: {label}: {words}")
 
 
 def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:

@@ -16,10 +16,7 @@ import xarray as xr
 from ep2sindy.data.fields import SPACE, write_netcdf
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.point_search import PointSearch
-from ep2sindy.discovery.pointwise import (
-    STATUSES,
-    pointwise,
-)
+from ep2sindy.discovery.pointwise import STATUSES, pointwise
 from ep2sindy.discovery.recipe import regression_of
 from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes, spread
 from ep2sindy.figures.maps import coefficient_maps, quality_maps, regime_map
@@ -40,8 +37,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.runtime.progress import Advance
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.simulated import say_simulation
-from ep2sindy.studies.source import Step, open_prepared, say_field
+from ep2sindy.studies.source import Step, open_prepared, say_field, say_simulation
 from ep2sindy.studies.study import A_LIST, Count, Deferred, Names
 from ep2sindy.thruster.parameters import Thruster
 

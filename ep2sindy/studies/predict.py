@@ -14,25 +14,12 @@ from ep2sindy.figures.operating import cycle_figure, laws_figure, left_out_figur
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.choice import (
-    Branch,
-    BranchSettings,
-    find_branch,
-    group_by_cycle,
-)
+from ep2sindy.operating.choice import Branch, BranchSettings, find_branch, group_by_cycle
 from ep2sindy.operating.fit import SETTINGS, error_statistics
 from ep2sindy.operating.law import law_basis
 from ep2sindy.operating.map import Fate
 from ep2sindy.operating.records import OperatingRecord, most_central, point_label
-from ep2sindy.report.document import (
-    Block,
-    Captioned,
-    Picture,
-    Result,
-    Section,
-    Table,
-    Text,
-)  # fmt: skip
+from ep2sindy.report.document import Block, Captioned, Picture, Result, Section, Table, Text
 from ep2sindy.report.results import ResultTable
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
@@ -67,9 +54,8 @@ from ep2sindy.studies.points import (
     oscillating_records,
 )
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.simulated import compile_kernels
-from ep2sindy.studies.source import Source
-from ep2sindy.studies.study import Count, Counts, Positive
+from ep2sindy.studies.source import Source, compile_kernels
+from ep2sindy.studies.study import Count, Counts, Positive, Starts
 from ep2sindy.studies.views import display_equation
 
 INTERVALS = (
@@ -153,12 +139,10 @@ class Study:
     windows: Followed
     map_points: Count
     labels: Mapping[str, str]
-    forecasts: int = 0
+    forecasts: Starts = 0
     keep: bool = True
 
     def __post_init__(self) -> None:
-        if self.forecasts < 0:
-            raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
         self._how(0)
         given = self._given
         sources, names = given.sources(self.source), given.names

@@ -13,23 +13,11 @@ from typing import Any
 import pandas as pd
 import xarray as xr
 
-from ep2sindy.figures.stability import curves_figure, stability_figure
+from ep2sindy.figures.breathing import curves_figure, stability_figure
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import (
-    Captioned,
-    Result,
-    Section,
-    Table,
-    Text,
-    pictures,
-    places,
-)
+from ep2sindy.report.document import Captioned, Result, Section, Table, Text, pictures, places
 from ep2sindy.runtime.files import WriteError
-from ep2sindy.studies.simulated import (
-    doubts,
-    is_simulation,
-    quiet,
-)
+from ep2sindy.studies.source import doubts, is_simulation, quiet
 from ep2sindy.studies.study import Deferred
 
 FAILED = "failed"

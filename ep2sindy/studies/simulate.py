@@ -38,11 +38,7 @@ from ep2sindy.studies.scan import (
     run_point,
     scan_points,
 )
-from ep2sindy.studies.simulated import (
-    compile_kernels,
-    say_simulation,
-    status_text,
-)
+from ep2sindy.studies.source import compile_kernels, say_simulation, status_text
 from ep2sindy.studies.study import Check, Deferred, Positive, PositiveOrAll
 from ep2sindy.thruster.axial.output import POWERS
 from ep2sindy.thruster.cache import write

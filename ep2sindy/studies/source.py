@@ -1,4 +1,4 @@
-"""Data of a study: the field, its preparation and its trajectory."""
+"""Data of a study: field, preparation and trajectory; what simulations and their zones tell."""
 
 from __future__ import annotations
 
@@ -7,23 +7,22 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import xarray as xr
+from jaxtyping import Float
 
 from ep2sindy.data.fields import clock_of, grid_points
 from ep2sindy.data.gaps import describe_breaks, describe_gaps, usual_step
-from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit
+from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit, to_si
 from ep2sindy.data.sampling import ZoneAverage
 from ep2sindy.data.steps import records_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone, describe_zone
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, polynomial
+from ep2sindy.model.scores import r2
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.screen import in_line
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.simulated import (
-    check_recorded,
-    say_simulation,
-)
 from ep2sindy.studies.study import Deferred
 from ep2sindy.thruster.balance import zone_balance
 
@@ -112,6 +111,12 @@ class Source:
         variables = dict.fromkeys(v for library in libraries for v in library.variables)
         return list(dict.fromkeys(v.partition("@")[0] for v in variables if v not in known))
 
+    def opened(self, libraries: Iterable[Library], run: Run) -> tuple[xr.Dataset, Trajectory]:
+        """The single record, and its trajectory as `sampled` makes it."""
+        with run.progress(None, "", "data"):
+            field = self.field()
+        return field, self.sampled(field, libraries, run)
+
     def sampled(self, field: xr.Dataset, libraries: Iterable[Library], run: Run) -> Trajectory:
         """The trajectory that the libraries need; also reports the data on screen and page."""
         say_simulation(run, field.attrs)  # first, as it may explain later errors
@@ -125,19 +130,19 @@ def zone_of(source: Source) -> Zone | None:
     return source.trajectory.zone if isinstance(source.trajectory, ZoneAverage) else None
 
 
-def zone_sizes_of(source: Source, field: xr.Dataset) -> dict[str, float]:
-    """Length in m of each of several zones that the trajectory is averaged over; else empty."""
-    sampling = source.trajectory
-    return sampling.sizes(field) if isinstance(sampling, ZoneAverage) else {}
-
-
-def balances_of(source: Source, field: xr.Dataset, run: Run) -> dict[str, xr.Dataset]:
-    """Balance of ions and neutrals in every zone that is averaged over; a single one is called "".
+def zones_of(source: Source, field: xr.Dataset, run: Run) -> Zones:
+    """The zones that the trajectory is averaged over; none if it is that of a point.
 
     Balances that cannot be made, as of a zone that reaches into the plume, are reported.
     """
     sampling = source.trajectory
-    if not isinstance(sampling, ZoneAverage) or not {"n_i", "n_n"} <= set(field.data_vars):
+    if not isinstance(sampling, ZoneAverage):
+        return Zones()
+    return Zones(_balances(sampling, field, run), sampling.sizes(field))
+
+
+def _balances(sampling: ZoneAverage, field: xr.Dataset, run: Run) -> dict[str, xr.Dataset]:
+    if not {"n_i", "n_n"} <= set(field.data_vars):
         return {}
     zones = sampling.parts(field)
     if any(zone.r is not None for zone in zones.values()):
@@ -204,16 +209,221 @@ def data_summary(data: Trajectory) -> dict[str, Any]:
     }
 
 
+def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str] = ()) -> Deferred:
+    """Data read from a file with this variable alone, whatever other variables a config expects.
+
+    without: axes that are not required. Data that are not read from a file are unchanged.
+    """
+    variables: Mapping[str, Any] | None = data.settings.get("variables")
+    if variables is None:
+        return data
+    places: dict[str, Any] = {
+        f"variables.{name}.name": None for name in variables if name != signal
+    }
+    places |= {f"{axis}.name": None for axis in without if data.settings.get(axis)}
+    if signal not in variables:
+        new = {"name": signal, "unit": unit or "1", "dims": None}
+        return data.changed(places, {"variables": {signal: new}})
+    if unit is not None:
+        places[f"variables.{signal}.unit"] = unit
+    return data.changed(places)
+
+
+def in_unit(field: xr.Dataset, *, signal: str, unit: str) -> xr.Dataset:
+    """A field whose signal, so far without a unit, is converted from this unit to SI.
+
+    Raises ValueError if the data already say the signal's unit.
+    """
+    if signal not in field:
+        return field  # the trajectory reports what the data hold
+    if (stated := field[signal].attrs.get("units", "1")) != "1":
+        raise ValueError(
+            f"unit is for a signal whose unit the data do not say: {signal} comes in {stated!r}, "
+            f"and unit={unit} came; leave unit out, or describe the file by data=file"
+        )
+    return field.assign({signal: to_si(field[signal], signal, unit, is_variable=True)})
+
+
+# Checks and messages for simulations used as data, and compilation of their kernels.
+
+MIN_SAMPLES = 200  # some breathing periods at the usual step; fewer cannot be judged
+GLIMPSE_SAMPLES = 20
+BALANCE_TOLERANCE = 1e-3  # relative to the inflow; a float32 record closes to 1e-4
+BALANCES = {"mass_balance": "mass", "energy_balance": "energy"}
+VERDICTS = {
+    "diverged": "the simulation diverged: the end of its record is no physics",
+    "out": "the discharge has gone out: there is no plasma to learn from",
+    "steady": "the simulation is steady: there is no oscillation to learn from",
+    "decaying": "the simulation's oscillation dies out: what is found describes a transient",
+}
+
+
+class DivergedError(ValueError):
+    """A run that diverged before it had recorded enough to study."""
+
+
+def is_simulation(attributes: Mapping[str, Any]) -> bool:
+    """Whether these are the attributes of a run of this package's simulators."""
+    return {"status", "I_d_mean", "I_d_std", "parameters"} <= set(attributes)
+
+
+def check_recorded(field: xr.Dataset) -> None:
+    """Raise DivergedError for a run that diverged before it had recorded enough to study."""
+    if is_simulation(field.attrs) and field.attrs["status"] == "diverged":
+        n_samples = field.sizes["time"]
+        if n_samples < MIN_SAMPLES:
+            raise DivergedError(
+                f"the simulation must record {MIN_SAMPLES} samples or more to be studied: it "
+                f"diverged after {n_samples}; try shorter steps (++data.cfl=0.4), more cells, "
+                "other parameters or another start; +exp=simulate shows what it did"
+            )
+
+
+def amiss(attributes: Mapping[str, Any]) -> list[str]:
+    """Warnings about a simulation, empty if there are none."""
+    status = attributes["status"]
+    if status == "oscillating":
+        return doubts(attributes)
+    if status == "transit":
+        verdict = (
+            f"the simulation oscillates at {attributes['f_kHz']:.3g} kHz, above 60 kHz: that is "
+            "ions in transit, not breathing"
+        )
+    else:
+        verdict = VERDICTS.get(status, f"the simulation is {status}")
+    return [verdict, *doubts(attributes)]
+
+
+def doubts(attributes: Mapping[str, Any]) -> list[str]:
+    """Warnings besides the status: rates used beyond their table, balances that do not close."""
+    found = []
+    if (rates := attributes.get("rates", "covered")) != "covered":
+        found.append(str(rates))
+    for name, words in BALANCES.items():
+        value = attributes.get(name, 1.0)
+        if not abs(value - 1.0) <= BALANCE_TOLERANCE:  # a NaN balance fails, too
+            found.append(
+                f"the simulation's {words} balance does not close: (out + stored)/in is {value:.4f}"
+            )
+    return found
+
+
+def say_simulation(run: Run, attributes: Mapping[str, Any]) -> None:
+    """Report a simulation in one line, with its warnings, on screen, page and in the summary."""
+    if not is_simulation(attributes):
+        return
+    known = [name for name in BALANCES if name in attributes]
+    balances = ", ".join(f"{BALANCES[name]} {attributes[name]:.4f}" for name in known)
+    run.say(
+        f"simulation: {status_text(attributes)}, from {attributes.get('initial', 'its start')}; "
+        f"I_d {attributes['I_d_mean']:.2f} A, std {attributes['I_d_std']:.2f} A; "
+        f"out/in {balances or 'unknown'}"
+    )
+    for text in amiss(attributes):
+        run.warn(text)
+
+
+def status_text(attributes: Mapping[str, Any]) -> str:
+    """`oscillating, strong cycle`; the status alone if there is no cycle."""
+    cycle = attributes.get("cycle", "none")
+    return attributes["status"] + (f", {cycle} cycle" if cycle != "none" else "")
+
+
+def quiet(data: Deferred) -> Deferred:
+    """Turn off progress bars: points run in parallel, and their bars would mix."""
+    try:
+        return data.changed({"progress": False})
+    except ValueError:
+        return data  # these data show no progress
+
+
+def compile_kernels(data: Sequence[Deferred]) -> None:
+    """Run a few samples in this process, so that workers find the compiled kernels on disk."""
+    for each in data:
+        sample_s = each.settings.get("sample_s") or 1e-6
+        brief = {"duration_s": GLIMPSE_SAMPLES * sample_s, "warm_up_s": 0.0, "cache": None}
+        try:
+            each.changed({"sample_s": sample_s, **brief}).build()
+        except ValueError:
+            continue  # the point reports the reason when it is run
+        return
+
+
+IONS, NEUTRALS = "n_i", "n_n"
+
+# Role -> what the balance calls it, and the terms that tell it: neutrals leave the faster the more
+# ions there are, and walls and anode give back what reaches them.
+TELLING: Mapping[str, tuple[str, Sequence[str]]] = {
+    f"{NEUTRALS} out": ("exit_n", [NEUTRALS, f"{IONS}*{NEUTRALS}"]),
+    f"{IONS} to {NEUTRALS}": ("returned", [IONS]),
+}
+
+
 @dataclass(frozen=True)
 class Zones:
     """The zones of a record: balances of ions and neutrals, and lengths in m if there are several.
 
-    balances: by name, see `balances_of`.
+    balances: by name, from `ep.thruster.zone_balance`; a single one is called "".
     """
 
     balances: Mapping[str, xr.Dataset] = field(default_factory=dict)
     sizes: Mapping[str, float] = field(default_factory=dict)
 
-    @staticmethod
-    def of(source: Source, data: xr.Dataset, run: Run) -> Zones:
-        return Zones(balances_of(source, data, run), zone_sizes_of(source, data))
+
+NO_ZONES = Zones()
+
+
+@dataclass(frozen=True)
+class FittedRate:
+    """A recorded rate by terms, their coefficients in SI, with R2 at each instant."""
+
+    terms: Mapping[str, float]
+    r2: float = float("nan")
+
+
+def told_roles(balances: Mapping[str, xr.Dataset], run: Trajectory) -> dict[str, FittedRate]:
+    """What the balances of zones tell about roles, over the samples of a run.
+
+    balances: by zone, from `ep.thruster.zone_balance`; a single one is called "". The inflow is the
+    mean supply of neutrals. In a single zone the neutrals that leave, and what walls and anode give
+    back, are told by least squares. A role that a balance does not give is left out.
+    """
+    found = {}
+    for zone, balance in balances.items():
+        if "supply" in balance:
+            name = f"{NEUTRALS}@{zone} in" if zone else f"{NEUTRALS} in"
+            found[name] = FittedRate({"1": float(balance["supply"].mean())})
+    if "" not in balances or not {IONS, NEUTRALS} <= set(run.state_names):
+        return found
+    known, library = recorded_rates(balances[""], run), polynomial(run.state_names, degree=2)
+    for role, (rate, terms) in TELLING.items():
+        if rate in known:
+            columns = library.evaluate(run.states)[:, [library.index(term) for term in terms]]
+            found[role] = fitted_rate(known[rate], columns, terms)
+    return found
+
+
+def fitted_rate(
+    rate: Float[np.ndarray, " samples"],
+    columns: Float[np.ndarray, "samples terms"],
+    terms: Sequence[str],
+) -> FittedRate:
+    """A rate by least squares on terms, whose values are the columns."""
+    size = np.abs(columns).max(axis=0)
+    coef = np.linalg.lstsq(columns / size, rate, rcond=None)[0] / size
+    return FittedRate(dict(zip(terms, coef.tolist(), strict=True)), rate_r2(rate, columns @ coef))
+
+
+def rate_r2(
+    recorded: Float[np.ndarray, " samples"], modelled: Float[np.ndarray, " samples"]
+) -> float:
+    """R2 at each instant; NaN for a recorded rate that varies by no more than rounding."""
+    if np.ptp(recorded) <= 1e-6 * np.abs(recorded).max():
+        return float("nan")
+    return float(r2(truth=recorded, prediction=modelled[None])[0])
+
+
+def recorded_rates(balance: xr.Dataset, data: Trajectory) -> dict[str, np.ndarray]:
+    """Terms of the balance at the samples of the trajectory."""
+    there = np.isin(balance["time"].values, data.t)
+    return {str(name): balance[name].values[there] for name in balance.data_vars}

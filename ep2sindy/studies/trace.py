@@ -13,22 +13,64 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import xarray as xr
+import pandas as pd
 
-from ep2sindy.data.quantities import to_si
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
 from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.discovery.one_signal import SignalSearch, choose_attempt, count_fitted, evaluate
-from ep2sindy.discovery.signal_unknowns import fit_offset
+from ep2sindy.discovery.one_signal import (
+    SignalDiscovery,
+    SignalSearch,
+    choose_attempt,
+    count_fitted,
+    evaluate,
+)
+from ep2sindy.discovery.result import Discovery
+from ep2sindy.discovery.signal_unknowns import HiddenStates, fit_offset
+from ep2sindy.figures.fronts import front_figure
+from ep2sindy.figures.living import cycle_figure, find_waveforms, free_run_figure, waveform_figure
+from ep2sindy.library.equations import equation_text
+from ep2sindy.model.comparison import Verdict
+from ep2sindy.model.free_run import FreeRun
+from ep2sindy.model.model import SparseModel
+from ep2sindy.model.stability import LimitCycle
+from ep2sindy.report.document import (
+    Block,
+    Captioned,
+    Equation,
+    Result,
+    Section,
+    Table,
+    Text,
+    pictures,
+)
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Once
-from ep2sindy.signals.embedding import Delays, LogRate, Rate
+from ep2sindy.selection.rule import SystemSelection
+from ep2sindy.signals.attractor import find_cycle
+from ep2sindy.signals.embedding import Chosen, Delays, LogRate, Rate
 from ep2sindy.signals.trace import Trace, prepare_signal
+from ep2sindy.studies.forecasts import forecast_errors, forecast_picture, forecast_section
+from ep2sindy.studies.library_result import (
+    CandidateRow,
+    candidate_rows,
+    column_note,
+    estimate_section,
+)
+from ep2sindy.studies.living import WAVEFORM
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.source import Source, zone_of
-from ep2sindy.studies.study import Count, Deferred, Positive, Share
-from ep2sindy.studies.trace_result import Outcome
+from ep2sindy.studies.source import Source, data_summary, in_unit, only, zone_of
+from ep2sindy.studies.study import Count, Positive, Share
+from ep2sindy.studies.views import (
+    MODEL,
+    coefficients,
+    display_equation,
+    found_model,
+    interval_table,
+    intervals,
+    rollout_tables,
+)
 
 PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
 
@@ -126,9 +168,7 @@ class Study:
         if self.unit is not None and data.settings.get("variables") is None:
             step = partial(in_unit, signal=self.signal, unit=self.unit)
             source = replace(source, prepare=[step, *source.prepare])
-        with run.progress(None, "", "data"):
-            field = source.field()
-        sampled = source.sampled(field, [], run)
+        _, sampled = source.opened([], run)
         known = 0.0 if isinstance(self.offset, str) else self.offset
         return replace(sampled, states=sampled.states + known)
 
@@ -146,36 +186,282 @@ def lost_mean(signal: Trace) -> str | None:
     )
 
 
-def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str] = ()) -> Deferred:
-    """Data read from a file with this variable alone, whatever other variables a config expects.
-
-    without: axes that are not required. Data that are not read from a file are unchanged.
-    """
-    variables: Mapping[str, Any] | None = data.settings.get("variables")
-    if variables is None:
-        return data
-    places: dict[str, Any] = {
-        f"variables.{name}.name": None for name in variables if name != signal
-    }
-    places |= {f"{axis}.name": None for axis in without if data.settings.get(axis)}
-    if signal not in variables:
-        new = {"name": signal, "unit": unit or "1", "dims": None}
-        return data.changed(places, {"variables": {signal: new}})
-    if unit is not None:
-        places[f"variables.{signal}.unit"] = unit
-    return data.changed(places)
+SCORED = (
+    "Score against number of terms: the supports that were weighed against each other; the star is "
+    "selected."
+)
 
 
-def in_unit(field: xr.Dataset, *, signal: str, unit: str) -> xr.Dataset:
-    """A field whose signal, so far without a unit, is converted from this unit to SI.
+RUN_SCORE = "largest deviation of a free run, in units of its bound; one lives."
+CAPTIONS = {
+    "free_run": "The model run freely from one sample (colour) over the record that it never saw "
+    "(grey): the first periods, and the last.",
+    "plane": "The model's cycle in the plane of both states, over the data (grey), and runs from "
+    "other starts.",
+    "waveform": WAVEFORM,
+    "front": "Error of the derivative against number of terms: every candidate that was refined "
+    "and run freely; the star is selected, by its free runs.",
+}
 
-    Raises ValueError if the data already say the signal's unit.
-    """
-    if signal not in field:
-        return field  # the trajectory reports what the data hold
-    if (stated := field[signal].attrs.get("units", "1")) != "1":
-        raise ValueError(
-            f"unit is for a signal whose unit the data do not say: {signal} comes in {stated!r}, "
-            f"and unit={unit} came; leave unit out, or describe the file by data=file"
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """The model found from one signal, and its tests."""
+
+    tested: SignalDiscovery
+
+    @property
+    def chosen(self) -> Chosen:
+        return self.tested.best.chosen
+
+    @property
+    def found(self) -> Discovery:
+        return self.tested.discovery
+
+    @property
+    def label(self) -> str:
+        """The name of the scores."""
+        return self.found.method.selection.label
+
+    @property
+    def by_runs(self) -> bool:
+        """Whether whole models were run freely, rather than weighed by their likelihood."""
+        return isinstance(self.found.method.selection, SystemSelection)
+
+    @property
+    def run(self) -> FreeRun:
+        return self.tested.free.run
+
+    @property
+    def cycle(self) -> LimitCycle | None:
+        return self.tested.free.cycle
+
+    @property
+    def model(self) -> SparseModel:
+        return self.found.model
+
+    @property
+    def is_held_out(self) -> bool:
+        return self.tested.skill is not None
+
+    @property
+    def where(self) -> str:
+        """What the model was run over, in words."""
+        return "held-out record" if self.is_held_out else "whole record, too short to hold out"
+
+    @property
+    def words(self) -> str:
+        return self.run.words(seen=not self.is_held_out, misfit=self.found.misfit)
+
+    @property
+    def searched(self) -> list[str]:
+        return self.chosen.embedded.searched
+
+    @property
+    def data_frequency(self) -> str:
+        cycle = find_cycle(self.tested.measured.t, self.tested.measured.states[:, :1])
+        frequency_Hz = cycle.frequency_Hz if cycle else float("nan")
+        return self.run.rollout.clock.frequency_text(frequency_Hz)
+
+    def models(self) -> dict[str, SparseModel]:
+        return {"trace": self.model}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        fronts = {f"front_{state}": self._front(state).csv() for state in self.searched}
+        samples = dict(
+            zip(self.tested.states.state_names, self.tested.states.states.T, strict=True)
         )
-    return field.assign({signal: to_si(field[signal], signal, unit, is_variable=True)})
+        return {
+            **fronts,
+            **rollout_tables(self.tested.measured, {"trace": self.run}),
+            "states": pd.DataFrame({"t_s": self.tested.states.t, **samples}),
+            "coefficients": coefficients(self.models(), heading="model"),
+            **(
+                {}
+                if self.tested.skill is None
+                else {"forecasts": forecast_errors(self.tested.skill)}
+            ),
+        }
+
+    def _front(self, state: str) -> ResultTable[CandidateRow]:
+        front = self.found.fronts[state]
+        metrics = [m for m in CANDIDATES if m.key != "r2" or front.has_errors]
+        return ResultTable(candidate_rows(front), metrics)
+
+    def figures(self) -> dict[str, Captioned]:
+        held, rollout = self.tested.measured, self.run.rollout
+        period_s = self.tested.signal.period_s
+        drawn: dict[str, Any] = {
+            "free_run": partial(free_run_figure, held, rollout, period_s=period_s)
+        }
+        if self.cycle is not None:
+            drawn["plane"] = partial(cycle_figure, self.tested.states, self.cycle)
+        if find_waveforms(held, rollout) and self.tested.signal.cycle is not None:
+            drawn["waveform"] = partial(waveform_figure, held, rollout)
+        fronts = {state: self.found.fronts[state] for state in self.searched}
+        drawn["front"] = partial(front_figure, fronts, label=self.label)
+        captions = CAPTIONS if self.by_runs else CAPTIONS | {"front": SCORED}
+        pictures_of = {name: Captioned(draw, captions[name]) for name, draw in drawn.items()}
+        if self.tested.skill is not None:
+            pictures_of["forecast"] = forecast_picture(self.tested.states, self.tested.skill)
+        return pictures_of
+
+    def in_short(self) -> Result:
+        caution = self.tested.free.caution
+        return found_model(
+            f"Found from {self.tested.signal.name}",
+            self.run,
+            file="trace",
+            picture="free_run",
+            more=[Text(caution, warning=True)] if caution else [],
+            where=f"the {self.where}",
+            seen=not self.is_held_out,
+            misfit=self.found.misfit,
+        )
+
+    def sections(self) -> list[Section]:
+        forecasts = [] if self.tested.skill is None else [forecast_section(self.tested.skill)]
+        said = [self._search_section()]
+        if (estimate := self.found.estimate) is not None:
+            tested = self.found.noise_test.tested
+            said.append(
+                estimate_section(
+                    self.tested.signal.name, estimate, self.tested.states, of_model=tested
+                )
+            )
+        return [self._signal_section(), *said, self._living_section(), *forecasts]
+
+    def _signal_section(self) -> Section:
+        signal, embedded = self.tested.signal, self.chosen.embedded
+        names = self.tested.states.state_names
+        made = f"{self.chosen.embedding.says}, {', '.join(names[:-1])} and {names[-1]}"
+        per_period = signal.period_s / self.tested.states.dt_s
+        is_hidden = isinstance(self.chosen.embedding, HiddenStates)
+        too_fast = "" if is_hidden else ", and what is too fast to be followed"
+        turns = "periods" if signal.cycle is not None else "turns, which do not repeat themselves,"
+        blocks: list[Block] = [
+            Text(
+                f"{signal.clock.frequency_text(1.0 / signal.period_s)}, "
+                f"{signal.n_periods:.0f} {turns} of {per_period:.0f} samples"
+            ),
+            Text(f"states: {made} ({self.chosen.reason})"),
+            Text(
+                f"noise{too_fast}: {embedded.noise_std:.3g} {signal.unit}, "
+                f"{100.0 * embedded.noise_std / signal.x.std():.2g} % of the standard deviation"
+            ),
+            *(Text(each) for each in signal.done),
+            *(Text(each.text) for each in self.tested.attempts),
+        ]
+        return Section(f"The signal {signal.name}", blocks)
+
+    def _search_section(self) -> Section:
+        blocks: list[Block] = []
+        score = RUN_SCORE if self.by_runs else column_note(self.label)
+        for state in self.searched:
+            front = self._front(state)
+            table = front.csv()
+            order = table.sort_values(["terms", "score"], kind="stable")
+            shown = sorted(order.groupby("terms").head(3).index.tolist())  # the best of every size
+            blocks.append(
+                Table(
+                    front.screen().iloc[shown].reset_index(drop=True),
+                    title=f"candidates for {state}'",
+                    bold=np.flatnonzero(table["selected"].to_numpy()[shown]).tolist(),
+                    note=f"Of every size the best three. Score: {score}",
+                )
+            )
+        return Section("Search", [*blocks, *pictures(["front"])])
+
+    def _living_section(self) -> Section:
+        model, clock = self.model, self.tested.states.clock
+        blocks: list[Block] = [Text(self.found.note)] if self.found.note else []
+        for state in model.states:
+            exact = "known" if state not in self.searched else ""
+            blocks.append(display_equation(model, state, clock, lead=exact))
+        blocks += interval_table(model, self.searched, clock)
+        rows = ResultTable({"model": self}, FREE_RUN).upright("")
+        blocks.append(Table(rows, title=f"run freely from one sample over the {self.where}"))
+        blocks += [Text(text, warning=warn) for text, warn in self._stability()]
+        return Section("Living model", [*blocks, *pictures(["free_run", "plane", "waveform"])])
+
+    def _stability(self) -> list[tuple[str, bool]]:
+        if self.cycle is None:
+            is_asked = self.tested.signal.cycle is not None
+            return [("the model has no cycle near its run", True)] if is_asked else []
+        return [(self.tested.free.text, self.run.verdict is not Verdict.LIVES)]
+
+    def n_terms(self, *, known: bool) -> int:
+        states = [s for s in self.model.states if (s not in self.searched) == known]
+        return sum(len(self.model.terms(state)) for state in states)
+
+    def summary(self) -> dict[str, Any]:
+        name = self.tested.signal.name
+        return {
+            "data": data_summary(self.tested.states),
+            "signal": {
+                "name": name,
+                "unit": self.tested.signal.unit,
+                "done": list(self.tested.signal.done),
+                "embedding": type(self.chosen.embedding).__name__,
+                "n_states": self.tested.best.n_states,
+                "reason": self.chosen.reason,
+                "noise_std": self.chosen.embedded.noise_std,
+                "period_s": self.tested.signal.period_s,
+            },
+            "model": facts(self.model, MODEL) | {"intervals": intervals(self.model)},
+            "states": {
+                str(each.n_states): {"error": each.error, "unexplained": each.share}
+                for each in self.tested.attempts
+            },
+            "misfit": self.found.misfit,
+            "living": facts(self, FREE_RUN),
+            "forecast": self.tested.skill and self.tested.skill.summary(),
+        }
+
+    def headline(self) -> Mapping[str, float]:
+        return ResultTable([self], FREE_RUN).headline()
+
+
+COMPARED = View.JSON | View.HEADLINE
+FREE_RUN: Metrics[Outcome] = [
+    Metric("verdict", lambda o: o.run.text, View.JSON),
+    Metric("verdict", lambda o: o.words, View.SCREEN),
+    Metric("note", lambda o: o.found.note, View.JSON),
+    Metric("held_out", lambda o: o.is_held_out, View.JSON),
+    Metric("frequency of the data", lambda o: o.data_frequency, View.SCREEN),
+    Metric("f_error", lambda o: o.run.f_error, View.ALL, "frequency error", percent(2)),
+    Metric("amplitude_ratio", lambda o: o.run.amplitude_ratio[o.tested.signal.name], COMPARED),
+    Metric(
+        "amplitude_error",
+        lambda o: {o.tested.signal.name: o.run.amplitude_ratio[o.tested.signal.name] - 1.0},
+        View.SCREEN, "amplitude error of {}", percent(2),
+    ),
+    Metric("waveform_error", lambda o: o.run.waveform_error[o.tested.signal.name], COMPARED),
+    Metric(
+        "waveform", lambda o: {o.tested.signal.name: o.run.waveform_error[o.tested.signal.name]},
+        View.SCREEN, "waveform error of {}", "{:.3f} std",
+    ),
+    Metric("n_terms", lambda o: o.n_terms(known=False), View.HEADLINE),
+    Metric("n_terms_searched", lambda o: o.n_terms(known=False), View.JSON),
+    Metric("n_terms_known", lambda o: o.n_terms(known=True), View.JSON),
+    Metric(
+        "terms", lambda o: f"{o.n_terms(known=False)} searched, {o.n_terms(known=True)} known",
+        View.SCREEN,
+    ),
+    Metric("stability", lambda o: o.cycle.stability if o.cycle else None, View.JSON),
+    Metric("multiplier", lambda o: o.tested.free.multiplier, COMPARED),
+    Metric("share_reaching", lambda o: o.tested.free.share, COMPARED),
+]  # fmt: skip
+CANDIDATES: Metrics[CandidateRow] = [
+    Metric("terms", lambda row: row.candidate.n_terms, View.SHOWN),
+    Metric("r2", lambda row: row.candidate.r2_train, View.SHOWN, "R2", "{:.3f}"),
+    Metric("score", lambda row: row.candidate.score, View.SHOWN, format="{:.3f}"),
+    Metric("selected", lambda row: row.is_selected),
+    Metric("text", lambda row: equation_text(row.candidate.equation, row.terms)),
+    Metric("model", lambda row: _marked(row), View.SCREEN),
+]
+
+
+def _marked(row: CandidateRow) -> Equation:
+    mark = "  <- selected" if row.is_selected else ""
+    return Equation(row.candidate.equation, row.terms, mark=mark)

@@ -12,6 +12,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
+from ep2sindy.library.equations import equation_text
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.units import SECONDS, Clock, unit_product
 from ep2sindy.model.comparison import Verdict
@@ -19,6 +20,7 @@ from ep2sindy.model.display import grouped
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Result, Section, Table, Text
+from ep2sindy.report.results import Metric, Metrics, View
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.studies.study import PositiveOrAll
 
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
+NO_ENDS = (np.nan, np.nan)  # of an interval that is not known
 FROM_DERIVATIVES = (
     "These are the equations that fits of the derivatives select; the models that live, which are "
     "selected by free runs, stand above."
@@ -103,9 +106,9 @@ def run_figures(
         drawn["derivatives"] = partial(
             series.derivative_figure, data, sides, smoother=smoother, duration_s=span
         )
-    if len(plane := data.state_names[:2]) > 1:
+    if len(data.state_names) > 1:
         drawn["phase"] = partial(
-            series.phase_figure, data, rollouts, plane=plane, duration_s=span, verdicts=verdicts
+            series.phase_figure, data, rollouts, duration_s=span, verdicts=verdicts
         )
     return {name: Captioned(drawn[name], CAPTIONS[name]) for name in names if name in drawn}
 
@@ -123,6 +126,11 @@ def trajectories(
     return replace(figure, caption=caption)
 
 
+def terms_text(terms: Mapping[str, Sequence[str]]) -> str:
+    """`x: x, x*y; y: y`: the terms of every equation or role."""
+    return "; ".join(f"{part}: {', '.join(names)}" for part, names in terms.items())
+
+
 def intervals(model: SparseModel) -> dict[str, dict[str, tuple[float, float]]] | None:
     """95 % intervals by state and term; None if they are not known."""
     if model.covariance is None:
@@ -130,11 +138,17 @@ def intervals(model: SparseModel) -> dict[str, dict[str, tuple[float, float]]] |
     return {state: model.intervals(state) for state in model.states}
 
 
-def model_summary(model: SparseModel) -> dict[str, Any]:
-    return {
-        "text": model.text(),
-        "equations": {state: model.terms(state) for state in model.states},
-    }
+MODEL: Metrics[SparseModel] = [
+    Metric("text", lambda model: model.text(), View.JSON),
+    Metric(
+        "text",
+        lambda model: {state: equation_text(state, model.terms(state)) for state in model.states},
+        View.CSV,
+    ),
+    Metric(
+        "equations", lambda model: {state: model.terms(state) for state in model.states}, View.JSON
+    ),
+]
 
 
 def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataFrame:
@@ -142,15 +156,13 @@ def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataF
 
     heading: heading of the column with the models' names.
     """
-    rows = []
-    for name, model in models.items():
-        known = intervals(model) or {}
-        for state in model.states:
-            for term, value in model.terms(state).items():
-                lower, upper = known.get(state, {}).get(term, (np.nan, np.nan))
-                row: dict[str, Any] = {heading: name, "state": state, "term": term}
-                rows.append(row | {"coef": value, "lower": lower, "upper": upper})
-    return pd.DataFrame(rows)
+    rows = [
+        (name, state, term, value, *(intervals(model) or {}).get(state, {}).get(term, NO_ENDS))
+        for name, model in models.items()
+        for state in model.states
+        for term, value in model.terms(state).items()
+    ]
+    return pd.DataFrame(rows, columns=[heading, "state", "term", "coef", "lower", "upper"])
 
 
 def display_equation(
@@ -274,13 +286,23 @@ def _fate(run: FreeRun, *, seen: bool, misfit: str) -> str:
     return words.get(run.verdict, run.words(seen=seen, misfit=misfit))
 
 
+def frequency_words(run: FreeRun, form: str = "+.1f") -> str:
+    """`20 kHz (+1.2 %)`: the first state's frequency and its error; a dash if it has none.
+
+    form: of the error in percent.
+    """
+    frequency_Hz = run.frequency_Hz[run.model.states[0]]
+    if not np.isfinite(frequency_Hz):
+        return "-"
+    error = f" ({100 * run.f_error:{form}} %)" if np.isfinite(run.f_error) else ""
+    return f"{run.rollout.clock.frequency_text(frequency_Hz)}{error}"
+
+
 def run_words(run: FreeRun) -> str:
     """Frequency, amplitude and waveform of a run beside the data's, as far as they are known."""
     found = []
-    frequency_Hz = run.frequency_Hz[run.model.states[0]]
-    if np.isfinite(frequency_Hz):
-        error = f" ({100 * run.f_error:+.2g} %)" if np.isfinite(run.f_error) else ""
-        found.append(f"frequency {run.rollout.clock.frequency_text(frequency_Hz)}{error}")
+    if (frequency := frequency_words(run, "+.2g")) != "-":
+        found.append(f"frequency {frequency}")
     ratios = [value for value in run.amplitude_ratio.values() if np.isfinite(value)]
     if ratios:
         ends = dict.fromkeys(f"{value:.3g}" for value in (min(ratios), max(ratios)))

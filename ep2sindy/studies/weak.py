@@ -7,47 +7,41 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import EquationFit, assemble_model, reweight
 from ep2sindy.library.library import Library
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
-from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.front import fit_support
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.weak import Weak
-from ep2sindy.report.document import Captioned, Equation, Result, Section, Table, Text, pictures
+from ep2sindy.report.document import Equation, Table, Text
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.fits import Terms, equation_texts, terms_of
+from ep2sindy.studies.fits import RUN, Outcome, Terms, terms_of
 from ep2sindy.studies.source import Source, data_summary
 from ep2sindy.studies.study import Coefficients, Count, Counts, Deferred, PositiveOrAll
-from ep2sindy.studies.views import (
-    INTEGRATED,
-    PlotRange,
-    best_run,
-    coefficients,
-    equation_sections,
-    found_model,
-    intervals,
-    model_summary,
-    rollout_tables,
-    run_figures,
-)
+from ep2sindy.studies.views import INTEGRATED, MODEL, PlotRange, intervals, run_figures
 
 FIGURES = ("trajectories", "phase", "derivatives", "spectra")
 INTERVALS = (
     "The intervals say how far the noise of the samples moves the coefficients if these terms are "
     "the whole law; what the terms lack, they do not count."
 )
+NOTE = (
+    "The data's first state has {}. R2 is on each setting's own rows: windows average, so it is "
+    "not comparable between settings."
+)
+TOLD = ("f", "f_Hz", "f_kHz", "f_error", "nrmse")  # of a run
+WHOLE = {"n_points": "Int64", "half_width": "Int64"}
 
 
 @dataclass(frozen=True)
@@ -80,9 +74,7 @@ class Study:
             n_points=self.n_points,
         )
         library, terms = terms_of(self.model, states=self.source.states)
-        with run.progress(None, "", "data"):
-            record = self.source.field()
-        data = self.source.sampled(record, [library], run)
+        _, data = self.source.opened([library], run)
         fitted = fit_settings(
             data,
             library,
@@ -92,7 +84,7 @@ class Study:
             rng=np.random.default_rng(run.seed),
             progress=run.watch,
         )
-        return Outcome(self, data, dominant_frequency(data.t, data.states[:, 0]), fitted)
+        return _outcome(self, data, fitted)
 
 
 @dataclass(frozen=True)
@@ -280,139 +272,83 @@ def _r2_own_rows(fit: EquationFit, problem: RegressionRows) -> float:
     return float(r2(truth=truth, prediction=prediction)[0])
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Fits of the data in every setting. f_data_Hz: dominant frequency of the first state."""
-
-    study: Study
-    data: Trajectory
-    f_data_Hz: float
-    fitted: Mapping[str, SettingFit]
-
-    @property
-    def labelled(self) -> dict[str, SettingFit]:
-        """The fits by readable names of the settings."""
-        return {_label(name, fitted): fitted for name, fitted in self.fitted.items()}
-
-    def models(self) -> dict[str, SparseModel]:
-        return {name: fitted.integrated.model for name, fitted in self.fitted.items()}
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        models = {name: fitted.integrated for name, fitted in self.fitted.items()}
-        return {
-            **rollout_tables(self.data, models),
-            "settings": self._settings(),
-            "coefficients": coefficients(self.models(), heading="setting"),
-        }
-
-    def figures(self) -> dict[str, Captioned]:
-        models = {name: fitted.integrated for name, fitted in self.labelled.items()}
-        shown, smoother = self.study.figures, self.study.formulation.smoother
-        return run_figures(FIGURES, self.data, models, shown, smoother=smoother)
-
-    def in_short(self) -> Result:
-        """The setting whose model runs best over the record."""
-        best = best_run({name: fitted.integrated for name, fitted in self.fitted.items()})
-        fitted = self.fitted[best]
-        scores = ", ".join(f"{state}' {value:.3f}" for state, value in fitted.r2.items())
-        more = [Text(f"R2 of its rows: {scores}; the best of {len(self.fitted)} settings")]
-        return found_model(
-            f"Found with {_label(best, fitted)}",
-            fitted.integrated,
-            file=best,
-            picture="trajectories",
-            more=more,
-            where="the record",
-            seen=True,
-        )
-
-    def sections(self) -> list[Section]:
-        published = [
-            Equation(state, terms, lead="thesis, Eq. 24", aside=True, on_screen=True)
-            for state, terms in self.study.thesis.items()
-        ]
-        models = {name: fitted.integrated.model for name, fitted in self.labelled.items()}
-        return [
-            Section("Equations", [*published, Text(INTERVALS, page_only=True)]),
-            *equation_sections(models, self.data.clock),
-            Section("Integrated", [self._table(), *pictures(FIGURES)]),
-        ]
-
-    def _settings(self) -> pd.DataFrame:
-        """One row per setting and state: windows, equation, R2, and how the model runs."""
-        rows = ResultTable(self.fitted, self._metrics()).csv("setting", by_state=True)
-        return rows.astype({"n_points": "Int64", "half_width": "Int64"})
-
-    def _table(self) -> Table:
-        rows = ResultTable(self.labelled, self._metrics()).screen("setting", by_state=True)
-        n = len(self.data.state_names)
-        return Table(
-            rows,
+def _outcome(study: Study, data: Trajectory, fitted: Mapping[str, SettingFit]) -> Outcome:
+    """Fits of the data in every setting."""
+    f_Hz = dominant_frequency(data.t, data.states[:, 0])
+    metrics = _metrics(data, f_Hz)
+    labels = {name: _label(name, each) for name, each in fitted.items()}
+    settings = ResultTable(fitted, metrics)
+    rows = ResultTable({labels[name]: each for name, each in fitted.items()}, metrics)
+    scores = {
+        name: ", ".join(f"{state}' {value:.3f}" for state, value in each.r2.items())
+        for name, each in fitted.items()
+    }
+    summaries = {
+        name: rows | _windows_summary(fitted[name], data.dt_s)
+        for name, rows in settings.json().items()
+    }
+    n, smoother = len(data.state_names), study.formulation.smoother
+    drawn = {labels[name]: each.integrated for name, each in fitted.items()}
+    return Outcome(
+        data=data,
+        seen=True,
+        runs={name: each.integrated for name, each in fitted.items()},
+        labels=labels,
+        kind="setting",
+        fits=settings.csv("setting", by_state=True).astype(WHOLE),
+        shown=Table(
+            rows.screen("setting", by_state=True),
             title=f"Models {INTEGRATED}",
-            breaks=range(n - 1, len(rows), n),
-            note=f"The data's first state has {self.data.clock.frequency_text(self.f_data_Hz)}. "
-            "R2 is on each setting's own rows: windows average, so it is not comparable between "
-            "settings.",
-        )
-
-    def _metrics(self) -> Metrics[SettingFit]:
-        """Metrics of the fits; samples, length and periods are of the first state's window."""
-        clock, dt_s = self.data.clock, self.data.dt_s
-
-        def frequency(fitted: SettingFit) -> str:
-            f_Hz, error = first_frequency_Hz(fitted), fitted.integrated.f_error
-            if not np.isfinite(f_Hz):
-                return "-"
-            text = clock.frequency_text(f_Hz)
-            return f"{text} ({100 * error:+.0f} %)" if np.isfinite(error) else text
-
-        return [
-            Metric("n_points", lambda f: f.setting.boxes and f.setting.boxes.n_points, View.CSV),
-            Metric("half_width", lambda f: f.by_state(f.half_width.get), View.CSV),
-            Metric(
-                "half_width_s",
-                lambda f: f.by_state(lambda s: dt_s * f.half_width[s] if f.half_width else None),
-                View.CSV,
+            breaks=range(n - 1, n * len(fitted), n),
+            note=NOTE.format(data.clock.frequency_text(f_Hz)),
+        ),
+        about=[
+            *(
+                Equation(state, terms, lead="thesis, Eq. 24", aside=True, on_screen=True)
+                for state, terms in study.thesis.items()
             ),
-            Metric("text", lambda f: equation_texts(f.integrated.model), View.CSV),
+            Text(INTERVALS, page_only=True),
+        ],
+        drawn=run_figures(FIGURES, data, drawn, study.figures, smoother=smoother),
+        findings={"data": data_summary(data), "settings": summaries},
+        numbers={"data/f_kHz": 1e-3 * f_Hz} | settings.headline(),
+        of_best={name: f"R2 of its rows: {text}; " for name, text in scores.items()},
+    )
+
+
+def _metrics(data: Trajectory, f_data_Hz: float) -> Metrics[SettingFit]:
+    """Metrics of the fits; samples, length and periods are of the first state's window."""
+    clock, dt_s = data.clock, data.dt_s
+    lengths: dict[str, Callable[[int], str]] = {
+        "samples": lambda n: str(n + 1),
+        "length": lambda n: clock.duration_text(n * dt_s),
+        "periods": lambda n: f"{n * dt_s * f_data_Hz:.2f}",
+    }
+    return [
+        *(metric.of(lambda f: f.integrated.model) for metric in MODEL),
+        Metric("n_points", lambda f: f.setting.boxes and f.setting.boxes.n_points, View.CSV),
+        Metric("half_width", lambda f: f.by_state(f.half_width.get), View.CSV),
+        Metric(
+            "half_width_s",
+            lambda f: f.by_state(lambda s: dt_s * f.half_width[s] if f.half_width else None),
+            View.CSV,
+        ),
+        *(
             Metric(
-                "samples", lambda f: f.by_state(f.window_steps), View.SCREEN,
-                format=lambda n: str(n + 1) if n else "-",
-            ),
-            Metric(
-                "length", lambda f: f.by_state(f.window_steps), View.SCREEN,
-                format=lambda n: clock.duration_text(n * dt_s) if n else "-",
-            ),
-            Metric(
-                "periods", lambda f: f.by_state(f.window_steps), View.SCREEN,
-                format=lambda n: f"{n * dt_s * self.f_data_Hz:.2f}" if n else "-",
-            ),
-            Metric("r2", lambda f: f.r2, View.ALL, "R2", "{:.3f}"),
-            Metric("f", frequency, View.SCREEN),
-            Metric("f_Hz", lambda f: f.integrated.frequency_Hz, View.CSV),
-            Metric("f_kHz", lambda f: 1e-3 * first_frequency_Hz(f), View.JSON),
-            Metric("f_error", lambda f: f.integrated.f_error, View.FILES | View.HEADLINE),
-            Metric("nrmse", lambda f: f.integrated.nrmse, View.ALL, format="{:.2f}"),
-            Metric("verdict", lambda f: f.integrated.text, View.SHOWN),
-        ]  # fmt: skip
-
-    def summary(self) -> dict[str, Any]:
-        rows = ResultTable(self.fitted, self._metrics()).json()
-        settings = {
-            name: model_summary(fitted.integrated.model)
-            | _windows_summary(fitted, self.data.dt_s)
-            | rows[name]
-            for name, fitted in self.fitted.items()
-        }
-        return {"data": data_summary(self.data), "settings": settings}
-
-    def headline(self) -> dict[str, float]:
-        models = ResultTable(self.fitted, self._metrics()).headline()
-        return {"data/f_kHz": 1e-3 * self.f_data_Hz} | models
+                name, lambda f: f.by_state(f.window_steps), View.SCREEN,
+                format=partial(_or_dash, text=text),
+            )
+            for name, text in lengths.items()
+        ),
+        Metric("r2", lambda f: f.r2, View.ALL, "R2", "{:.3f}"),
+        *(metric.of(lambda f: f.integrated) for metric in RUN if metric.key in TOLD),
+        Metric("verdict", lambda f: f.integrated.text, View.SHOWN),
+    ]  # fmt: skip
 
 
-def first_frequency_Hz(fitted: SettingFit) -> float:
-    return fitted.integrated.frequency_Hz[fitted.integrated.model.states[0]]
+def _or_dash(n: int, text: Callable[[int], str]) -> str:
+    """The text for a number of steps; a dash if there are no windows."""
+    return text(n) if n else "-"
 
 
 def _label(name: str, fitted: SettingFit) -> str:

@@ -21,6 +21,7 @@ from ep2sindy.library.library import Library, named_terms
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned, Picture, Result, Section, Table, Text
+from ep2sindy.report.results import json_rows
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Positive
@@ -191,14 +192,7 @@ class Outcome:
         ]
 
     def summary(self) -> dict[str, Any]:
-        counts = ("n_windows", "n_points")
-        rows = self.cells.to_dict("records")
-        return {
-            "cells": [
-                row | {key: None if pd.isna(row[key]) else int(row[key]) for key in counts}
-                for row in rows
-            ]
-        }
+        return {"cells": json_rows(self.cells)}
 
     def headline(self) -> dict[str, float]:
         return {
