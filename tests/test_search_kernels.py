@@ -7,13 +7,6 @@ import pytest
 
 from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, rank_masks, solve_masks
-from ep2sindy.regression.row_kernels import (
-    TILE,
-    add_residuals,
-    gather_columns,
-    scale_draws,
-    spread,
-)
 from ep2sindy.regression.search_kernels import key_words, pool_masks
 from ep2sindy.regression.searches import STLSQ, AdaptiveLasso
 
@@ -33,43 +26,6 @@ def random_grams(n_draws: int, n_terms: int) -> tuple[np.ndarray, np.ndarray, np
     return products[:, :-1, :-1].copy(), products[:, -1, :-1].copy(), products[:, -1, -1].copy()
 
 
-def test_columns_are_gathered_and_scaled() -> None:
-    rng = np.random.default_rng(0)
-    values, places = rng.normal(size=(50, 3)) * [1.0, 1e200, 0.0], np.array([3, 7, 41])
-    values.flags.writeable = False
-    columns, norms = np.zeros((5, 3)), np.array([1.0, 2e200, 1.0])
-    gather_columns(values, places, norms, 1, columns)
-    np.testing.assert_allclose(columns[1:4], (values[places] / norms).T, rtol=1e-15)
-    assert not columns[[0, 4]].any()
-
-
-def test_the_spread_of_a_constant_is_zero() -> None:
-    values = np.random.default_rng(0).normal(3.0, 1.0, size=101)
-    assert spread(values) == pytest.approx(np.square(values - values.mean()).sum())
-    assert spread(np.full(999, 0.1)) == 0.0
-
-
-def test_draws_are_scaled_to_unit_norm() -> None:
-    n_draws, n_terms, n_equations = 3, 4, 2
-    columns = np.random.default_rng(0).normal(size=(n_draws, 20, n_terms + n_equations))
-    columns[2, :, 1] = 0.0
-    products = columns.transpose(0, 2, 1) @ columns
-    kept = np.ones((n_draws, n_terms), dtype=bool)
-    kept[0, 2] = False
-    xx, xy = np.empty((n_draws, n_terms, n_terms)), np.empty((n_draws, n_equations, n_terms))
-    yy, scale = np.empty((n_draws, n_equations)), np.empty((n_draws, n_terms))
-    sums = products[:, *np.triu_indices(n_terms + n_equations)]
-    scale_draws(sums, kept, xx, xy, yy, scale)
-    norms = np.linalg.norm(columns[:, :, :n_terms], axis=1)
-    plain = np.where(kept & (norms > 0.0), 1.0 / np.where(norms > 0.0, norms, 1.0), 0.0)
-    np.testing.assert_allclose(scale, plain, rtol=1e-14)
-    unit = columns[:, :, :n_terms] * plain[:, None]
-    np.testing.assert_allclose(xx, unit.transpose(0, 2, 1) @ unit, atol=1e-14)
-    targets = columns[:, :, n_terms:]
-    np.testing.assert_allclose(xy, targets.transpose(0, 2, 1) @ unit, atol=1e-13)
-    np.testing.assert_allclose(yy, np.square(targets).sum(axis=1), rtol=1e-14)
-
-
 @pytest.mark.parametrize("block", [1, 7])
 def test_draws_are_those_of_plain_calls_of_the_generator(block: int) -> None:
     boots = Bootstraps(n=6, n_culled=2, smallest=0.3, largest=0.9, block=block)
@@ -86,20 +42,6 @@ def test_draws_are_those_of_plain_calls_of_the_generator(block: int) -> None:
     first = np.random.default_rng(5).integers(60 - block + 1, size=-(-13 // block))
     rows = (first[:, None] + np.arange(block)).ravel()[:13]
     np.testing.assert_array_equal(one, np.bincount(rows, minlength=60))
-
-
-def test_residuals_and_their_products_are_those_of_matrices() -> None:
-    rng = np.random.default_rng(0)
-    columns, masks = rng.normal(size=(6, 2 * TILE + 5)), random_masks(7, 4)
-    coef = np.where(masks, rng.normal(size=(7, 4)), 0.0)
-    products, squares = np.ones((7, 4)), np.ones(7)
-    add_residuals(columns, 5, coef, np.empty(TILE), products, squares)
-    left = columns[5] - coef @ columns[:4]
-    np.testing.assert_allclose(squares, 1.0 + np.square(left).sum(axis=1), rtol=1e-13)
-    plain = 1.0 + np.where(masks, left @ columns[:4].T, 0.0)
-    np.testing.assert_allclose(products, plain, rtol=1e-12, atol=1e-10)
-    add_residuals(columns, 5, coef, np.empty(TILE), np.empty((0, 4)), squares)
-    np.testing.assert_allclose(squares, 1.0 + 2.0 * np.square(left).sum(axis=1), rtol=1e-13)
 
 
 def test_supports_in_any_order_are_fitted_alone() -> None:

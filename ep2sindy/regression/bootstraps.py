@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.regression.ambiguity import row_limit, usable_terms
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
-from ep2sindy.regression.row_kernels import count_drawn, scale_draws
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.search_kernels import key_words, pool_masks
 from ep2sindy.regression.searches import Search, SearchOfDraws
@@ -89,15 +89,13 @@ class Bootstraps:
                 f"n_culled must leave a term: {self.n_culled} of {len(usable)} would go; lower it "
                 "or use a larger library"
             )
-        sizes, first, culled = [], [], np.empty((self.n, self.n_culled), dtype=np.int64)
+        counts, kept = np.empty((self.n, n_groups)), np.repeat(terms[None], self.n, axis=0)
         for k in range(self.n):
             share = self.smallest + (self.largest - self.smallest) * rng.random()
-            sizes.append(max(1, round(share * n_groups)))
-            first.append(draw_blocks(n_groups, n_drawn=sizes[-1], block=self.block, rng=rng))
-            culled[k] = rng.permutation(usable)[: self.n_culled]
-        kept = np.repeat(terms[None], self.n, axis=0)
-        kept[np.arange(self.n)[:, None], culled] = False
-        return _counts(first, sizes, n_rows=n_groups, block=self.block), kept
+            n_drawn = max(1, round(share * n_groups))
+            counts[k] = moving_block_counts(n_groups, n_drawn=n_drawn, block=self.block, rng=rng)
+            kept[k, rng.permutation(usable)[: self.n_culled]] = False
+        return counts, kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,21 +205,25 @@ def draw_resamples(
         problem.check_grams(bootstraps.n)  # before the work on terms, which may take minutes
     usable = usable_terms(problem)
     sums, kept = bootstraps.draw(problem, usable, rng)
-    n_draws, n_terms, n_equations = *kept.shape, len(problem.equations)
-    draws = Resamples(
+    n_columns, n_terms = len(problem.library) + len(problem.equations), len(problem.library)
+    products = np.empty((len(sums), n_columns, n_columns))
+    left, right = np.triu_indices(n_columns)
+    products[:, left, right] = products[:, right, left] = sums
+    squares = products.diagonal(axis1=1, axis2=2)
+    # Resampling changes the norms, so columns are scaled to unit norm again; then the search does
+    # not depend on units or draws. A culled term becomes a column of zeros.
+    kept_squares = np.where(kept, squares[:, :n_terms], 0.0)
+    scale = np.where(kept_squares > 0.0, 1.0 / np.sqrt(zero_to_one(kept_squares)), 0.0)
+    return Resamples(
         equations=problem.equations,
-        xx=np.empty((n_draws, n_terms, n_terms)),
-        xy=np.empty((n_draws, n_equations, n_terms)),
-        yy=np.empty((n_draws, n_equations)),
-        scale=np.empty((n_draws, n_terms)),
+        xx=products[:, :n_terms, :n_terms] * (scale[:, :, None] * scale[:, None, :]),
+        xy=products[:, n_terms:, :n_terms] * scale[:, None, :],
+        yy=squares[:, n_terms:].copy(),
+        scale=scale,
         kept=kept,
         counted=bootstraps.n > 0,
         largest=row_limit(int(usable.sum()), problem.n_train),
     )
-    # Resampling changes the norms, so columns are scaled to unit norm again; then the search does
-    # not depend on units or draws. A culled term becomes a column of zeros.
-    scale_draws(sums, kept, draws.xx, draws.xy, draws.yy, draws.scale)
-    return draws
 
 
 def pooled_supports(
@@ -272,26 +274,11 @@ def moving_block_counts(
     Raises ValueError for a block that is not between one row and all of them.
     Source: Kuensch 1989, doi:10.1214/aos/1176347265.
     """
-    first = draw_blocks(n_rows, n_drawn=n_drawn, block=block, rng=rng)
-    return _counts([first], [n_drawn], n_rows=n_rows, block=block)[0].astype(np.int64)
-
-
-def draw_blocks(
-    n_rows: int, *, n_drawn: int, block: int, rng: np.random.Generator
-) -> Int[np.ndarray, " runs"]:
-    """First row of each run of `moving_block_counts`."""
     if not 1 <= block <= n_rows:
         raise ValueError(
             f"a block must hold between one and all {n_rows} groups of training rows: {block} "
             "came; shorten it, or use more data"
         )
-    return rng.integers(n_rows - block + 1, size=-(-n_drawn // block))
-
-
-def _counts(
-    first: Sequence[Int[np.ndarray, " _"]], sizes: Sequence[int], *, n_rows: int, block: int
-) -> Float[np.ndarray, "draws rows"]:
-    """How often each row occurs in every draw, from its runs and its number of rows."""
-    counts, ends = np.empty((len(first), n_rows)), np.cumsum([len(runs) for runs in first])
-    count_drawn(np.concatenate(first), ends, np.array(sizes), block, counts)
-    return counts
+    first = rng.integers(n_rows - block + 1, size=-(-n_drawn // block))
+    drawn = (first[:, None] + np.arange(block)).ravel()[:n_drawn]
+    return np.bincount(drawn, minlength=n_rows)

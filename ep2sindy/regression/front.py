@@ -14,13 +14,14 @@ from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
 from ep2sindy.regression.gram_kernels import fit_masks, rank_masks, solve_masks
-from ep2sindy.regression.row_kernels import TILE, add_residuals, spread
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
 
 # Correction of coefficients, as a share of them, after which another one would be rounding.
 REFINED = 1e-9
+
+ROWS_AT_ONCE = 4096  # rows whose residuals, of all fits, are held at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,9 +270,16 @@ class RowFits(NamedTuple):
 def _spread(problem: RegressionRows, equation: int) -> Spread:
     held_out = problem.test_target(equation)
     return Spread(
-        train=spread(problem.train_target(equation)),
-        test=spread(held_out) if len(held_out) else float("nan"),
+        train=_squares_about_mean(problem.train_target(equation)),
+        test=_squares_about_mean(held_out) if len(held_out) else float("nan"),
     )
+
+
+def _squares_about_mean(values: Float[np.ndarray, " rows"]) -> float:
+    """Sum of squares about the mean, exactly zero for a constant."""
+    values = values - values[0]
+    values -= values.mean()
+    return float(values @ values)
 
 
 def _candidates(
@@ -385,8 +393,12 @@ def _residual_squares(
 
     products: if given, the products of the residuals and the terms are added.
     """
-    squares, left = np.zeros(len(coef)), np.empty(TILE)
-    out = np.empty((0, coef.shape[1])) if products is None else products
+    squares, n_terms = np.zeros(len(coef)), len(problem.library)
     for columns in problem.blocks(test=test):
-        add_residuals(columns, len(problem.library) + equation, coef, left, out, squares)
+        for start in range(0, columns.shape[1], ROWS_AT_ONCE):
+            some = columns[:, start : start + ROWS_AT_ONCE]
+            left = some[n_terms + equation] - coef @ some[:n_terms]
+            squares += np.einsum("sr,sr->s", left, left)
+            if products is not None:
+                products += left @ some[:n_terms].T
     return squares
