@@ -14,7 +14,6 @@ from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.test_functions import spectral_change_point
 from ep2sindy.regression.whitening import _covariance, _Sums
 from ep2sindy.regression.window_kernels import linearise, spread_windows, sum_windows
-from ep2sindy.signals.kernels import likelihood, smooth
 
 
 def plain_covariance(rows: NoisyRows, sensitivity: np.ndarray, target_scale: float) -> np.ndarray:
@@ -133,19 +132,6 @@ def test_the_change_point_is_the_corner_of_least_squares() -> None:
             for c in corners
         ]
         assert spectral_change_point(x) == corners[np.argmin(left)]
-
-
-@pytest.mark.parametrize("ratio", [1e-10, 1e-3, 10.0])
-def test_even_steps_give_what_nearly_even_ones_give(ratio: float) -> None:
-    """At even steps the gains are repeated once they have settled, and otherwise never."""
-    rng = np.random.default_rng(0)
-    values = np.cumsum(rng.normal(size=(3000, 1)), axis=0) / 100.0
-    even, nearly = np.ones(2999), 1.0 + 2e-9 * (-1.0) ** np.arange(2999)
-    for route, samples in ((likelihood, values[:, 0].copy()), (smooth, values)):
-        for found, plain in zip(
-            route(even, samples, ratio), route(nearly, samples, ratio), strict=True
-        ):
-            np.testing.assert_allclose(found, plain, rtol=1e-6, atol=1e-7)
 
 
 def test_steps_that_are_left_out_hardly_change_the_residuals() -> None:
