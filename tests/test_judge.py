@@ -13,7 +13,7 @@ from ep2sindy.discovery import choice
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.test_functions import spectral_change_point
 from ep2sindy.regression.whitening import _covariance, _Sums
-from ep2sindy.regression.window_kernels import linearise, spread_windows, sum_windows
+from ep2sindy.regression.window_kernels import spread_windows, sum_windows
 
 
 def plain_covariance(rows: NoisyRows, sensitivity: np.ndarray, target_scale: float) -> np.ndarray:
@@ -67,7 +67,7 @@ def test_sums_over_windows_are_sparse_products() -> None:
 
 
 @pytest.mark.parametrize("kept", [[0, 4, 7, 9, 12], list(range(13))])
-def test_compiled_terms_and_slopes_are_those_of_the_library(kept: list[int]) -> None:
+def test_sums_of_products_and_their_slopes_are_those_of_the_library(kept: list[int]) -> None:
     problem, rng = rows_of_lorenz("even", functions=["sin"]), np.random.default_rng(0)
     library, scale = problem.library, problem.theta_scale
     x, moved, coef = rng.normal(size=(3, 700)), rng.normal(size=(3, 700)), np.zeros(len(library))
@@ -76,9 +76,7 @@ def test_compiled_terms_and_slopes_are_those_of_the_library(kept: list[int]) -> 
     plain = library.evaluate(x.T) / scale
     change = np.einsum("vst,vs->st", slopes, moved)
     sums = _Sums.of(problem, np.isin(np.arange(len(library)), kept))
-    columns = sums.products.with_functions(np.concatenate([x, np.ones((1, 700))]), axis=0)
-    terms, sensitivity = np.empty((2, len(kept), 700)), np.empty((3, 700))
-    linearise(columns, sums.table, *sums.entries, moved, coef[kept], terms, sensitivity)
+    terms, sensitivity = sums.linearise(x, moved, coef[kept])
     np.testing.assert_allclose(terms[0], plain.T[kept], rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(terms[1], (plain + change).T[kept], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(sensitivity, slopes @ coef, rtol=1e-12, atol=1e-12)

@@ -1,13 +1,17 @@
-"""Every compiled step of a search against the same step in plain NumPy."""
+"""Steps of a search, compiled ones among them, against the same step in plain NumPy."""
 
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
-from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, rank_masks, solve_masks
-from ep2sindy.regression.search_kernels import key_words, pool_masks
+from ep2sindy.regression.bootstraps import (
+    Bootstraps,
+    Resamples,
+    moving_block_counts,
+    pool,
+)
+from ep2sindy.regression.gram_kernels import fit_masks, solve_masks
 from ep2sindy.regression.searches import STLSQ, AdaptiveLasso
 
 
@@ -55,23 +59,6 @@ def test_supports_in_any_order_are_fitted_alone() -> None:
             np.testing.assert_allclose(fit, plain, atol=1e-11)
 
 
-@pytest.mark.parametrize("depth", [1, 3])
-def test_supports_are_ranked_by_what_they_explain(depth: int) -> None:
-    xx, xy, _ = random_grams(2, 6)
-    masks = np.unique(random_masks(60, 6), axis=0)
-    explained, best = np.empty(len(masks)), np.empty((7, depth), dtype=np.int64)
-    scratch = np.empty((6, 6)), np.empty(6), np.empty(6, dtype=np.int64)
-    rank_masks(xx[1], xy[1], xx[0], xy[0], masks, *scratch, explained, best)
-    plain = explained_squares(fit_masks(xx[1], xy[1], masks), xx[0], xy[0])
-    assert np.isnan(plain).sum() == masks[:, [0, 1, 5]].all(axis=1).sum() > 0
-    np.testing.assert_allclose(explained, plain, rtol=1e-10, atol=1e-10)
-    sizes = masks.sum(axis=1)
-    for size in range(7):
-        own = [k for k in np.argsort(-plain) if sizes[k] == size and np.isfinite(plain[k])]
-        own = own[:depth] if size else []
-        assert best[size].tolist() == own + [-1] * (depth - len(own))
-
-
 def plain_thresholding(xx: np.ndarray, xy: np.ndarray, start: np.ndarray, limit: float) -> list:
     """The support at which thresholded least squares ends."""
     mask = start.copy()
@@ -105,21 +92,19 @@ def test_draws_in_one_call_are_searched_as_each_alone(search: AdaptiveLasso | ST
         np.testing.assert_array_equal(masks, search.supports(xx[k], xy[k], float(yy[k])))
 
 
-@pytest.mark.parametrize("n_terms", [5, 70])  # 70 take two numbers
+@pytest.mark.parametrize("n_terms", [5, 70])
 def test_masks_are_pooled_as_sets(n_terms: int) -> None:
     some = random_masks(12, n_terms, seed=3)
     masks = some[np.random.default_rng(0).integers(12, size=90)]
     ends = np.array([20, 20, 55, 90])
-    keys = np.empty((90, key_words(n_terms)), dtype=np.int64)
-    places = np.empty((3, 90), dtype=np.int64)
-    held, last = np.empty((2, n_terms + 1, n_terms), dtype=np.int64)
-    n_distinct = pool_masks(masks, ends, keys, places, held, last)
+    kept, nothing = np.ones((4, n_terms), dtype=bool), np.empty((4, 0, 0))
+    draws = Resamples(["x"], nothing, nothing, nothing[:, 0], nothing[:, 0], kept, True, n_terms)
+    supports = pool(draws, 0, np.split(masks, ends[:-1]))
     of_draws = [{tuple(m) for m in masks[a:b].tolist()} for a, b in pairwise([0, *ends.tolist()])]
     pooled = sorted(set().union(*of_draws), key=lambda m: (sum(m), m))
-    order = places[0, :n_distinct]
-    assert [tuple(m) for m in masks[order].tolist()] == pooled
-    assert places[1, order].tolist() == [sum(m in draw for draw in of_draws) for m in pooled]
+    assert [tuple(m) for m in supports.masks.tolist()] == pooled
+    assert supports.share.tolist() == [np.mean([m in draw for draw in of_draws]) for m in pooled]
     for size in range(n_terms + 1):
         for j in range(n_terms):
-            n_draws = sum(any(m[j] and sum(m) == size for m in draw) for draw in of_draws)
-            assert held[size, j] == n_draws
+            found = [any(m[j] and sum(m) == size for m in draw) for draw in of_draws]
+            assert supports.inclusion[size, j] == np.mean(found)

@@ -16,7 +16,6 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.regression.ambiguity import row_limit, usable_terms
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.search_kernels import key_words, pool_masks
 from ep2sindy.regression.searches import Search, SearchOfDraws
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.runtime.values import set_counts
@@ -240,17 +239,18 @@ def pooled_supports(
 
 def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ terms"]]) -> Supports:
     """Count the supports and terms that `search` found over the draws of one equation."""
-    masks, n_terms = np.concatenate(found), draws.kept.shape[1]
-    ends = np.cumsum([len(each) for each in found])
-    keys = np.empty((len(masks), key_words(n_terms)), dtype=np.int64)
-    places = np.empty((3, len(masks)), dtype=np.int64)
-    held, last = np.empty((2, n_terms + 1, n_terms), dtype=np.int64)
-    n_distinct = pool_masks(masks, ends, keys, places, held, last)
-    order, n_draws = places[0, :n_distinct], places[1]
+    masks, which = _distinct(np.concatenate(found))
+    in_draw = np.zeros((len(found), len(masks)), dtype=np.bool_)
+    in_draw[np.repeat(np.arange(len(found)), [len(each) for each in found]), which] = True
+    sizes, n_terms = masks.sum(axis=1), masks.shape[1]
+    held = np.zeros((n_terms + 1, n_terms))
+    for size in np.unique(sizes):
+        own = sizes == size
+        held[size] = (in_draw[:, own].astype(np.float64) @ masks[own] > 0.0).sum(axis=0)
     supports = Supports(
         equation=draws.equations[equation],
-        masks=masks[order],
-        share=n_draws[order] / len(found),
+        masks=masks,
+        share=in_draw.mean(axis=0),
         inclusion=held / draws.n_kept,
     )
     if draws.counted:
@@ -261,6 +261,17 @@ def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ te
         share=np.full_like(supports.share, np.nan),
         inclusion=np.full_like(supports.inclusion, np.nan),
     )
+
+
+def _distinct(
+    masks: Bool[np.ndarray, "masks terms"],
+) -> tuple[Bool[np.ndarray, "distinct terms"], Int[np.ndarray, " masks"]]:
+    """The distinct masks by size, then by terms, and the number of each mask among them."""
+    sizes = masks.sum(axis=1).astype(">u4")  # whose bytes are in the order of the numbers
+    keys = np.column_stack([sizes[:, None].view(np.uint8), np.packbits(masks, axis=1)])
+    whole = np.ascontiguousarray(keys).view(f"V{keys.shape[1]}")[:, 0]
+    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
+    return masks[first], which
 
 
 def moving_block_counts(

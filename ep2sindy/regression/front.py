@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
-from ep2sindy.regression.gram_kernels import fit_masks, rank_masks, solve_masks
+from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, solve_masks
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
@@ -323,13 +323,17 @@ def _rank(
     Computed from Gram matrices only; NaN for linearly dependent terms. And the indices of the
     `depth` supports that reduce it most of each size, ordered by size.
     """
-    train, n_terms = problem.train_gram, len(problem.library)
+    train = problem.train_gram
     judge = problem.test_gram if problem.test.any() else train
-    explained, best = np.empty(len(masks)), np.empty((n_terms + 1, depth), dtype=np.int64)
-    scratch = np.empty((n_terms, n_terms)), np.empty(n_terms), np.empty(n_terms, dtype=np.int64)
-    grams = train.xx[0], train.xy[0, equation], judge.xx[0], judge.xy[0, equation]
-    rank_masks(*grams, masks, *scratch, explained, best)
-    return explained, best[best >= 0]
+    coef = fit_masks(train.xx[0], train.xy[0, equation], masks)
+    explained, sizes = (
+        explained_squares(coef, judge.xx[0], judge.xy[0, equation]),
+        masks.sum(axis=1),
+    )
+    order = np.lexsort((-explained, sizes))
+    order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
+    rank = np.arange(len(order)) - np.searchsorted(sizes[order], sizes[order])
+    return explained, order[rank < depth]
 
 
 def _cloud(

@@ -18,8 +18,6 @@ from ep2sindy.regression.gram_kernels import (
 )
 from ep2sindy.runtime.compilation import GIVEN_ARRAYS, LOOPS, compiled
 
-BITS = 62  # terms in one number of a key
-
 PATH_PER_TERM = 8  # supports on a lasso path, per term, at which it ends; they may come and go
 
 
@@ -234,79 +232,6 @@ def _fit_support(xx, xy, mask, active, lower, coef):
     substitute(lower, xy, active, n_active, coef)
     for i in range(n_active - 1, -1, -1):  # each place is read before it is written
         coef[active[i]] = coef[i]
-
-
-@compiled(**LOOPS)
-def pool_masks(masks, ends, keys, places, held, last):
-    """Order the distinct masks of all draws by size, then by terms, and count the draws of each.
-
-    Counted are also the draws in which a support of each size held each term: held: (terms + 1,
-    terms). Each mask is sought among those known, which are kept in order.
-    ends: (draws,), number of masks up to each draw. places: (3, masks) of int: the first row gets
-    the number of a mask in order, each once; the second, by the number of the mask, its draws; one
-    is scratch, and so are keys: (masks, `key_words`) of int and last: (terms + 1, terms) of int.
-    Returns the number of distinct masks.
-    """
-    order, n_draws, latest = places[0], places[1], places[2]
-    for k in range(len(held)):  # assigning slices would compile messages of errors
-        for j in range(held.shape[1]):
-            held[k, j], last[k, j] = 0, -1
-    n_known, start = 0, 0
-    for d in range(len(ends)):
-        for m in range(start, ends[d]):
-            _write_key(masks, m, keys)
-            if m > start and _compare(keys, m, m - 1) == 0:
-                continue
-            size = keys[m, 0]
-            for j in range(masks.shape[1]):
-                if masks[m, j] and last[size, j] != d:
-                    last[size, j] = d
-                    held[size, j] += 1
-            rank, end = 0, n_known
-            while rank < end:
-                middle = (rank + end) // 2
-                if _compare(keys, order[middle], m) < 0:
-                    rank = middle + 1
-                else:
-                    end = middle
-            if rank == n_known or _compare(keys, order[rank], m) != 0:
-                for k in range(n_known, rank, -1):
-                    order[k] = order[k - 1]
-                order[rank], n_draws[m], latest[m] = m, 0, -1
-                n_known += 1
-            known = order[rank]
-            if latest[known] != d:
-                latest[known] = d
-                n_draws[known] += 1
-        start = ends[d]
-    return n_known
-
-
-def key_words(n_terms):
-    """Number of whole numbers in the key of a mask: its size, and its terms as bits."""
-    return 1 + -(-n_terms // BITS)
-
-
-@compiled(**WITHIN)
-def _write_key(masks, m, keys):
-    """Write the size of a mask and its terms, BITS in a number, the first the most significant."""
-    n_terms = masks.shape[1]
-    keys[m, 0] = 0
-    for word in range(1, keys.shape[1]):
-        code = 0
-        for j in range((word - 1) * BITS, min(word * BITS, n_terms)):
-            code = 2 * code + masks[m, j]
-            keys[m, 0] += masks[m, j]
-        keys[m, word] = code
-
-
-@compiled(**WITHIN)
-def _compare(keys, k, m):
-    """Negative if key k comes before key m, zero if they are the same."""
-    for word in range(keys.shape[1]):
-        if keys[k, word] != keys[m, word]:
-            return -1 if keys[k, word] < keys[m, word] else 1
-    return 0
 
 
 # For kernels that are given their arrays; sweeps are made in place, so these are not separate ones.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg.lapack import dpbtrf, dtbtrs
+from scipy.sparse import csr_array
 
 from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import zero_to_one
@@ -15,7 +17,6 @@ from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.window_kernels import (
     banded_covariance,
-    linearise,
     spread_windows,
     sum_windows,
 )
@@ -140,26 +141,47 @@ def _following(
 
 
 class _Sums(NamedTuple):
-    """Some scaled terms and their derivatives, as sums of products: arguments of `linearise`.
+    """Some scaled terms and their derivatives, as sums of products.
 
     kept: (library terms,), mask of the terms. products: library of the products, of which the rows
-    of `table` are used.
+    of `table` are used. shares: (kept, products), of the terms, then of their derivatives by each
+    variable.
     """
 
     kept: Bool[np.ndarray, " terms"]
     products: Library
     table: Int[np.ndarray, "products factors"]
-    entries: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    shares: Sequence[csr_array]
 
     @staticmethod
     def of(problem: RegressionRows, kept: Bool[np.ndarray, " terms"]) -> _Sums:
         products, shares = problem.library.derivatives
         shares = shares[kept] / problem.theta_scale[kept, None, None]
         used = shares.any(axis=(0, 1))
-        shares = shares[:, :, used]
-        term, column, product = np.nonzero(shares)
-        entries = term, column - 1, product, shares[term, column, product]
-        return _Sums(kept, products, products.table[used], entries)
+        parts = [csr_array(share) for share in shares[:, :, used].transpose(1, 0, 2)]
+        return _Sums(kept, products, products.table[used], parts)
+
+    def linearise(
+        self,
+        x: Float[np.ndarray, "variables samples"],
+        departure: Float[np.ndarray, "variables samples"],
+        coef: Float[np.ndarray, " kept"],
+    ) -> tuple[Float[np.ndarray, "two kept samples"], Float[np.ndarray, "variables samples"]]:
+        """Terms at x, terms moved by a departure along their derivatives, and slopes of the model.
+
+        The slopes are those of the sum of coef times term, by each variable.
+        """
+        columns = self.products.with_functions(np.vstack([x, np.ones(x.shape[1])]), axis=0)
+        values = columns[self.table[:, 0]]
+        for factor in self.table.T[1:]:
+            values *= columns[factor]
+        own, *derivatives = self.shares
+        terms, sensitivity = np.stack([own @ values] * 2), np.empty(x.shape)
+        for v, share in enumerate(derivatives):
+            slopes = share @ values
+            terms[1] += slopes * departure[v]
+            sensitivity[v] = coef @ slopes
+        return terms, sensitivity
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,14 +220,8 @@ class _Linearised:
         rows, library = problem.noisy, problem.library
         assert rows is not None
         (values, _, noise_std), n, n_samples = rows.columns, len(library.variables), x.shape[1]
-        columns = np.ones((n + 1, n_samples))
-        columns[:n] = x[:n]
-        departure = values[:n] - x[:n]
-        terms, sensitivity = np.empty((2, len(coef), n_samples)), np.zeros(x.shape)
-        linearise(
-            sums.products.with_functions(columns, axis=0), sums.table, *sums.entries,
-            departure, coef, terms, sensitivity[:n],
-        )  # fmt: skip
+        sensitivity = np.zeros(x.shape)
+        terms, sensitivity[:n] = sums.linearise(x[:n], values[:n] - x[:n], coef)
         if noisy and library.functions:
             terms -= (_lift(problem, x[:n].T) / problem.theta_scale).T[sums.kept]
         sensitivity *= noise_std
