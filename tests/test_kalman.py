@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.linalg import cho_factor, cho_solve, null_space
 
+from ep2sindy.signals import wiener
 from ep2sindy.signals.kalman import KalmanSmoother, most_likely_ratios
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.signals.wiener import WienerProcess
@@ -60,11 +61,12 @@ def restricted_likelihood(
 def test_smoother_is_the_process_conditioned_on_the_samples(
     t: np.ndarray, log10_ratio: float
 ) -> None:
-    signal, slope = WienerProcess.at(np.diff(t)).smooth(NOISE, 10.0**log10_ratio)
+    process = WienerProcess.at(np.diff(t))
+    signal = process.signal(NOISE, 10.0**log10_ratio)
     exact_signal, exact_slope = universal_kriging(t, NOISE, 10.0**log10_ratio)
     # Dense algebra loses the digits here: its condition number reaches ratio * 11^5.
     assert np.allclose(signal, exact_signal, atol=1e-8)
-    assert np.allclose(slope, exact_slope, atol=1e-8 * np.abs(exact_slope).max())
+    assert np.allclose(process.slope(signal), exact_slope, atol=1e-8 * np.abs(exact_slope).max())
 
 
 @every_time
@@ -80,13 +82,27 @@ def test_likelihood_is_that_of_the_joint_normal(t: np.ndarray, log10_ratio: floa
     assert found_noise == pytest.approx(exact_noise, rel=1e-8)
 
 
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_both_factorisations_give_one_likelihood(
+    monkeypatch: pytest.MonkeyPatch, jitter: float
+) -> None:
+    rng = np.random.default_rng(0)
+    steps = 1.0 + jitter * rng.uniform(-1.0, 1.0, 2999)
+    process, values = WienerProcess.at(steps), np.cumsum(rng.normal(size=(3000, 2)), axis=0)
+    ratios = 10.0 ** np.arange(-12.0, 5.0, 2.0)
+    plain = [process.likelihood(values, ratio) for ratio in ratios]
+    monkeypatch.setattr(wiener, "WELL_CONDITIONED", np.inf)
+    joint = [process.likelihood(values, ratio) for ratio in ratios]
+    np.testing.assert_allclose(plain, joint, rtol=1e-6, atol=1e-3)  # as WELL_CONDITIONED says
+
+
 @every_time
 @every_ratio
 def test_smoother_is_a_symmetric_matrix(t: np.ndarray, log10_ratio: float) -> None:
     process = WienerProcess.at(np.diff(t))
-    matrix = process.smooth(np.eye(12), 10.0**log10_ratio)[0]
+    matrix = process.signal(np.eye(12), 10.0**log10_ratio)
     assert np.allclose(matrix, matrix.T, atol=1e-10)
-    assert np.allclose(process.smooth(NOISE, 10.0**log10_ratio)[0], matrix @ NOISE)
+    assert np.allclose(process.signal(NOISE, 10.0**log10_ratio), matrix @ NOISE)
     eigenvalues = np.linalg.eigvalsh(matrix)
     assert eigenvalues.min() >= -1e-10
     assert eigenvalues.max() <= 1.0 + 1e-10
@@ -208,7 +224,7 @@ def test_noise_and_ratio_are_those_of_a_draw_from_the_model() -> None:
 def test_crowded_samples_cost_few_digits() -> None:
     t = np.concatenate([[0.0, 1e-3, 2e-3], 2e-3 + np.arange(1.0, 20.0)])
     values = (1.0 + t - 0.3 * t**2)[:, None]
-    matrix = WienerProcess.at(np.diff(t) / np.diff(t).mean()).smooth(np.eye(22), 1e-8)[0]
+    matrix = WienerProcess.at(np.diff(t) / np.diff(t).mean()).signal(np.eye(22), 1e-8)
     assert np.allclose(matrix, matrix.T, atol=1e-9)
     assert np.allclose(matrix @ values, values, atol=1e-8)
 

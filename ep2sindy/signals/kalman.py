@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.numbers import least_beside_grid, zero_to_one
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.values import read_only
-from ep2sindy.signals.wiener import WienerProcess, most_likely
+from ep2sindy.signals.wiener import WienerProcess
 
 # The range extends from a memory of about 200 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
@@ -81,15 +81,15 @@ class KalmanSmoother:
         steps, step_s = _unit_steps(t, values)
         process, spread = WienerProcess.at(steps), values.max(axis=0) - values.min(axis=0)
         columns = (values - values[0]) / zero_to_one(spread)
-        signal, slope = np.empty((2, *values.shape))
-        noise_std, log10_ratio = np.empty(len(spread)), self._ratios(process, columns, step_s)
+        signal, noise_std = np.empty(values.shape), np.empty(len(spread))
+        log10_ratio = self._ratios(process, columns, step_s)
         for j, ratio in enumerate((10.0**log10_ratio).tolist()):
             column = columns[:, j : j + 1]
-            signal[:, j : j + 1], slope[:, j : j + 1] = process.smooth(column, ratio)
+            signal[:, j : j + 1] = process.signal(column, ratio)
             noise_std[j] = np.sqrt(process.likelihood(column, ratio)[1][0])
         return KalmanEstimate(
             smoothed=values[0] + spread * signal,
-            derivative=spread * slope / step_s,
+            derivative=spread * process.slope(signal) / step_s,
             noise_std=spread * noise_std,
             log10_ratio=log10_ratio,
         )
@@ -137,12 +137,14 @@ def most_likely_ratios(
     highest: float = LOG10_RATIO_MAX,
 ) -> Float[np.ndarray, " columns"]:
     """log10 of the noise ratio of greatest likelihood for each column, within bounds."""
+    if not values.shape[1]:
+        return np.empty(0)  # LAPACK takes no empty right-hand sides
     decades = np.append(np.arange(lowest, highest, 1.0), highest)
     on_grid = np.stack([-process.likelihood(values, 10.0**decade)[0] for decade in decades])
     ratios = np.empty(values.shape[1])
     for j, misfits in enumerate(on_grid.T):
         column = values[:, j : j + 1]
-        ratios[j] = most_likely(
+        ratios[j] = least_beside_grid(
             lambda ratio, column=column: -process.likelihood(column, 10.0**ratio)[0][0],
             decades,
             misfits,

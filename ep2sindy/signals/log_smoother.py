@@ -9,10 +9,11 @@ from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 from scipy.linalg import cholesky_banded, solveh_banded
 
+from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.kalman import check_memory_bounds, ratio_bounds
-from ep2sindy.signals.wiener import most_likely, third_differences
+from ep2sindy.signals.wiener import third_differences
 
 # Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
 # time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.
@@ -124,7 +125,7 @@ def _best_mode(
         log = modes[-1].log
     misfits = np.array([mode.misfit for mode in modes])
     start = modes[int(misfits.argmin())].log
-    ratio = most_likely(
+    ratio = least_beside_grid(
         lambda ratio: _mode(y, penalty, ratio, start).misfit,
         decades,
         misfits,
