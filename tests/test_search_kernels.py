@@ -12,7 +12,7 @@ from ep2sindy.regression.bootstraps import (
     pool,
 )
 from ep2sindy.regression.gram_kernels import fit_masks, solve_masks
-from ep2sindy.regression.searches import STLSQ, AdaptiveLasso
+from ep2sindy.regression.searches import STLSQ
 
 
 def random_masks(n_masks: int, n_terms: int, seed: int = 0) -> np.ndarray:
@@ -73,23 +73,13 @@ def plain_thresholding(xx: np.ndarray, xy: np.ndarray, start: np.ndarray, limit:
 
 def test_thresholds_are_iterated_alone() -> None:
     xx, xy, yy = random_grams(4, 6)
-    search = STLSQ(n_thresholds=30, lowest=1e-3)
-    found = search.supports_of_draws(xx, xy, yy)
-    limits = np.geomspace(1e-3, 10.0, 30)
-    for k, masks in enumerate(found):
-        start = np.array([True] * 5 + [k != 1])
-        plain = [plain_thresholding(xx[k], xy[k], start, s * np.sqrt(yy[k])) for s in limits]
+    search, limits = STLSQ(n_thresholds=30, lowest=1e-3), np.geomspace(1e-3, 10.0, 30)
+    small = STLSQ(n_thresholds=30, lowest=1e-3, max_terms=2)
+    for k, case in enumerate(zip(xx, xy, yy, strict=True)):
+        masks, start = search.supports(*case), np.array([True] * 5 + [k != 1])
+        plain = [plain_thresholding(*case[:2], start, s * np.sqrt(case[2])) for s in limits]
         assert masks.tolist() == plain
-    small = STLSQ(n_thresholds=30, lowest=1e-3, max_terms=2).supports_of_draws(xx, xy, yy)
-    for masks, few in zip(found, small, strict=True):
-        assert few.tolist() == masks[masks.sum(axis=1) <= 2].tolist()
-
-
-@pytest.mark.parametrize("search", [AdaptiveLasso(), AdaptiveLasso(gamma=0.5), STLSQ()])
-def test_draws_in_one_call_are_searched_as_each_alone(search: AdaptiveLasso | STLSQ) -> None:
-    xx, xy, yy = random_grams(4, 6)
-    for k, masks in enumerate(search.supports_of_draws(xx, xy, yy)):
-        np.testing.assert_array_equal(masks, search.supports(xx[k], xy[k], float(yy[k])))
+        assert small.supports(*case).tolist() == masks[masks.sum(axis=1) <= 2].tolist()
 
 
 @pytest.mark.parametrize("n_terms", [5, 70])
@@ -97,8 +87,9 @@ def test_masks_are_pooled_as_sets(n_terms: int) -> None:
     some = random_masks(12, n_terms, seed=3)
     masks = some[np.random.default_rng(0).integers(12, size=90)]
     ends = np.array([20, 20, 55, 90])
-    kept, nothing = np.ones((4, n_terms), dtype=bool), np.empty((4, 0, 0))
-    draws = Resamples(["x"], nothing, nothing, nothing[:, 0], nothing[:, 0], kept, True, n_terms)
+    whole, part = np.empty((4, 0, 0)), np.empty((4, 0))
+    kept = np.ones((4, n_terms), dtype=bool)
+    draws = Resamples(["x"], whole, whole, part, part, kept, True, n_terms)
     supports = pool(draws, 0, np.split(masks, ends[:-1]))
     of_draws = [{tuple(m) for m in masks[a:b].tolist()} for a, b in pairwise([0, *ends.tolist()])]
     pooled = sorted(set().union(*of_draws), key=lambda m: (sum(m), m))

@@ -16,12 +16,11 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.regression.ambiguity import row_limit, usable_terms
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.searches import Search, SearchOfDraws
+from ep2sindy.regression.searches import Search
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.runtime.values import set_counts
 
 MOST_WEIGHTS = 2**24  # weights of rows, over the draws that are made at once
-WORK_AT_ONCE = 1_000_000  # cubes of terms, over the draws whose searches are one call
 
 
 @dataclass(frozen=True)
@@ -155,19 +154,11 @@ class Resamples:
         yy = self.yy[:, equation]
         if allowed is not None and not allowed.all():
             xx, xy = xx * (allowed[:, None] & allowed), xy * allowed
-        n_draws, n_terms = xy.shape
-        in_one_call = search if isinstance(search, SearchOfDraws) else None
-        # Between two reports of progress lies a fraction of a second.
-        step = max(1, WORK_AT_ONCE // n_terms**3) if in_one_call else 1
-        found: list[Bool[np.ndarray, "_ terms"]] = []
-        for start in range(0, n_draws, step):
-            some = slice(start, start + step)
-            if in_one_call:
-                found += in_one_call.supports_of_draws(xx[some], xy[some], yy[some])
-            else:
-                found.append(search.supports(xx[start], xy[start], float(yy[start])))
-            advance(min(step, n_draws - start))
-        if self.largest >= n_terms:
+        found = []
+        for draw in zip(xx, xy, yy.tolist(), strict=True):
+            found.append(search.supports(*draw))
+            advance(1)
+        if self.largest >= xy.shape[1]:
             return found
         return [masks[masks.sum(axis=1) <= self.largest] for masks in found]
 
