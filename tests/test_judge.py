@@ -1,4 +1,4 @@
-"""The test of a regression's residuals: fast kernels against plain forms, and blocks of records."""
+"""The test of a regression's residuals: fast forms against plain ones, and blocks of records."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,12 +13,11 @@ from ep2sindy.discovery import choice
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.test_functions import spectral_change_point
 from ep2sindy.regression.whitening import _covariance, _Sums
-from ep2sindy.regression.window_kernels import spread_windows, sum_windows
 
 
 def plain_covariance(rows: NoisyRows, sensitivity: np.ndarray, target_scale: float) -> np.ndarray:
     """The sum over variables of M M', where M is the rows' change per unit noise of a variable."""
-    total, (mean, slope) = np.zeros((len(rows.windows),) * 2), rows.windows.matrices()
+    total, mean, slope = np.zeros((len(rows.windows),) * 2), rows.windows.mean, rows.windows.slope
     for v, std in enumerate(rows.noise_std.T):
         change = mean @ diags_array(sensitivity[v])
         if v == rows.state:
@@ -51,19 +50,6 @@ def test_the_banded_covariance_is_that_of_sparse_products(steps: str, order: str
         below = np.diagonal(plain, -k)
         found = band[k, : n - k] if k < len(band) else np.zeros(n - k)
         np.testing.assert_allclose(found, below, atol=1e-12 * plain.max())
-
-
-def test_sums_over_windows_are_sparse_products() -> None:
-    rows, rng = rows_of_lorenz("uneven").noisy, np.random.default_rng(0)
-    assert rows is not None
-    windows, n_rows, n_samples = rows.windows, len(rows.windows), rows.windows.n_samples
-    columns, weights = rng.normal(size=(4, n_samples)), rng.normal(size=n_rows)
-    for stretch, matrix in zip((windows.mean, windows.slope), windows.matrices(), strict=True):
-        sums, spread = np.empty((4, n_rows)), np.empty(n_samples)
-        sum_windows(windows.starts, windows.first, stretch, columns, sums)
-        spread_windows(windows.starts, windows.first, stretch, weights, spread)
-        np.testing.assert_allclose(sums.T, matrix @ columns.T, atol=1e-12 * abs(sums).max())
-        np.testing.assert_allclose(spread, matrix.T @ weights, atol=1e-12 * abs(spread).max())
 
 
 @pytest.mark.parametrize("kept", [[0, 4, 7, 9, 12], list(range(13))])

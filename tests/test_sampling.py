@@ -46,8 +46,8 @@ def test_straight_lines_pass_unequal_steps_unchanged() -> None:
     x = np.sin(0.05 * RANDOM)
     windows = Bumps(half_width_s=8.0).windows(RANDOM, x, rng=np.random.default_rng(0))
     n = len(windows)
-    assert windows.slopes(2.0 - 3.0 * RANDOM) == pytest.approx(np.full(n, -3.0), rel=1e-9)
-    assert windows.means(np.ones(400)) == pytest.approx(np.ones(n), rel=1e-12)
+    assert windows.slope @ (2.0 - 3.0 * RANDOM) == pytest.approx(np.full(n, -3.0), rel=1e-9)
+    assert windows.mean @ np.ones(400) == pytest.approx(np.ones(n), rel=1e-12)
     assert np.all(np.diff(windows.first) >= 0)
 
 

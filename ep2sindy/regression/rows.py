@@ -43,7 +43,7 @@ class Grams:
 class NoisyRows:
     """Dependence of the training rows of one equation on the noisy samples x.
 
-    Targets are windows.slopes(x[state]), terms are windows.means(library(x)). target: of the
+    Targets are windows.slope @ x[state], terms are windows.mean @ library(x). target: of the
     samples as they are. values: (samples, variables), the library's variables, then states that it
     lacks.
     smoothed: an estimate of their true values. noise_std: standard deviation of their independent
@@ -150,10 +150,6 @@ class RegressionRows:
     @property
     def train_rows(self) -> Float[np.ndarray, "train columns"]:
         return self.train_columns.T
-
-    @property
-    def test_rows(self) -> Float[np.ndarray, "test columns"]:
-        return self.test_columns.T
 
     @property
     def n_train(self) -> int:

@@ -15,11 +15,7 @@ from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
-from ep2sindy.regression.window_kernels import (
-    banded_covariance,
-    spread_windows,
-    sum_windows,
-)
+from ep2sindy.regression.window_kernels import banded_covariance
 
 # Largest correction of a sample, in standard deviations of its noise; with a wrong model the
 # corrections would otherwise grow without limit.
@@ -227,12 +223,8 @@ class _Linearised:
         sensitivity *= noise_std
         target_scale = float(problem.target_scale[0])
         factor = _banded_cholesky(_covariance(rows, sensitivity, target_scale))
-        windows = rows.windows
-        white = np.empty((2 * len(coef) + 1, len(windows.first)))
-        flat = terms.reshape(2 * len(coef), n_samples)
-        sum_windows(windows.starts, windows.first, windows.mean, flat, white[:-1])
-        white[-1] = rows.target / target_scale
-        white = _solve(factor, white.T)
+        sums = rows.windows.mean @ terms.reshape(2 * len(coef), n_samples).T
+        white = _solve(factor, np.column_stack([sums, rows.target / target_scale]))
         theta, drifted, target = white[:, : len(coef)], white[:, len(coef) : -1], white[:, -1]
         return _Linearised(x, coef, theta, drifted, target, sensitivity, factor, target_scale, rows)
 
@@ -261,12 +253,10 @@ class _Linearised:
     def correct(self, coef: Float[np.ndarray, " terms"]) -> Float[np.ndarray, "variables samples"]:
         """Samples minus their most likely noise."""
         weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
-        rows, windows = self.source, self.source.windows
+        rows = self.source
         values, _, noise_std = rows.columns
-        by_mean, by_slope = np.empty((2, values.shape[1]))
-        for weights, sums in ((windows.mean, by_mean), (windows.slope, by_slope)):
-            spread_windows(windows.starts, windows.first, weights, weighted, sums)
-        noise = by_mean * self.sensitivity
+        noise = (rows.windows.mean.T @ weighted) * self.sensitivity
+        by_slope = rows.windows.slope.T @ weighted
         noise[rows.state] -= by_slope / self.target_scale * noise_std[rows.state]
         np.clip(noise, -LARGEST_CORRECTION, LARGEST_CORRECTION, out=noise)
         return values - noise * noise_std
@@ -304,9 +294,9 @@ def _covariance(
     """Covariance of the rows by the samples' noise, from its diagonal downwards."""
     windows = rows.windows
     own, std = sensitivity[rows.state], rows.columns[2][rows.state] / target_scale
-    band = np.zeros((len(windows.first), windows.width))
+    band = np.zeros((len(windows), windows.width))
     banded_covariance(
-        windows.starts, windows.first, windows.mean, windows.slope,
+        windows.mean.indptr.astype(np.int64), windows.first, windows.mean.data, windows.slope.data,
         np.square(sensitivity).sum(axis=0), own * std, np.square(std), band,
     )  # fmt: skip
     return band.T

@@ -1,4 +1,4 @@
-"""Compiled weak rows, whose windows are short stretches of neighbouring samples.
+"""Compiled covariance of weak rows, whose windows are short stretches of neighbouring samples.
 
 The windows of row i are mean[starts[i]:starts[i + 1]] and slope in the same places, over samples
 from first[i] on. Loops run over slices: with sums of indices in them they would stay scalar.
@@ -6,50 +6,7 @@ from first[i] on. Loops run over slices: with sums of indices in them they would
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import INNER_REORDERED, LOOPS, REORDERED, compiled
-
-
-@compiled(**LOOPS)
-def band_width(first, last):
-    """Largest distance between two rows whose windows overlap, plus one."""
-    width, ordered = 1, True
-    for i in range(len(first) - 1):
-        ordered = ordered and first[i] <= first[i + 1]
-    for i in range(len(first)):
-        for j in range(i + width, len(first)):
-            if first[j] <= last[i] and first[i] <= last[j]:
-                width = j - i + 1
-            elif ordered:
-                break
-    return width
-
-
-@compiled(**INNER_REORDERED)
-def _add(value, weight, total):
-    for i in range(len(value)):
-        total[i] += weight * value[i]
-
-
-@compiled(**REORDERED)
-def sum_windows(starts, first, weights, columns, sums):
-    """Write the weighted sums of columns (columns, samples) over all windows: (columns, rows)."""
-    for i in range(len(first)):
-        window = weights[starts[i] : starts[i + 1]]
-        for c in range(len(columns)):
-            column, total = columns[c, first[i] : first[i] + len(window)], 0.0
-            for s in range(len(window)):
-                total += window[s] * column[s]
-            sums[c, i] = total
-
-
-@compiled(**REORDERED)
-def spread_windows(starts, first, weights, rows, samples):
-    """Write the sums over rows of their windows times `rows` (rows,), a transposed product."""
-    for s in range(len(samples)):
-        samples[s] = 0.0
-    for i in range(len(first)):
-        window = weights[starts[i] : starts[i + 1]]
-        _add(window, rows[i], samples[first[i] : first[i] + len(window)])
+from ep2sindy.runtime.compilation import INNER_REORDERED, REORDERED, compiled
 
 
 @compiled(**INNER_REORDERED)
