@@ -223,8 +223,8 @@ class _Linearised:
         sensitivity *= noise_std
         target_scale = float(problem.target_scale[0])
         factor = _banded_cholesky(_covariance(rows, sensitivity, target_scale))
-        sums = rows.windows.mean @ terms.reshape(2 * len(coef), n_samples).T
-        white = _solve(factor, np.column_stack([sums, rows.target / target_scale]))
+        means = rows.windows.mean @ terms.reshape(2 * len(coef), n_samples).T
+        white = _solve(factor, np.column_stack([means, rows.target / target_scale]))
         theta, drifted, target = white[:, : len(coef)], white[:, len(coef) : -1], white[:, -1]
         return _Linearised(x, coef, theta, drifted, target, sensitivity, factor, target_scale, rows)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -88,7 +88,7 @@ class Windows:
 def _windows(
     first: Int[np.ndarray, " rows"],
     lengths: Int[np.ndarray, " rows"],
-    weights: Sequence[Float[np.ndarray, " weights"]],
+    weights: Iterable[Float[np.ndarray, " weights"]],
     n_samples: int,
 ) -> Windows:
     """Windows from the first sample and the length of each row, and weights row after row."""

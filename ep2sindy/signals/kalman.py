@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -145,12 +146,16 @@ def most_likely_ratios(
     for j, misfits in enumerate(on_grid.T):
         column = values[:, j : j + 1]
         ratios[j] = least_beside_grid(
-            lambda ratio, column=column: -process.likelihood(column, 10.0**ratio)[0][0],
+            partial(_misfit, process, column),
             decades,
             misfits,
             tolerance=LOG10_RATIO_TOLERANCE,
         )
     return ratios
+
+
+def _misfit(process: WienerProcess, column: np.ndarray, log10_ratio: float) -> float:
+    return -float(process.likelihood(column, 10.0**log10_ratio)[0][0])
 
 
 def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> None:
