@@ -74,7 +74,7 @@ def _extend(xx, mask, active, n_active, lower):
     """Write the terms of a mask and their factor; returns how many, and whether they are so.
 
     active: n_active terms that have a row of the factor already. Masks in the order of
-    `pool_masks` often begin with the terms of the one before, whose rows are kept.
+    `bootstraps.pool` often begin with the terms of the one before, whose rows are kept.
     """
     n_same = np.int64(0)  # as a bare 0 it would have callees compiled twice
     for j in range(len(mask)):
