@@ -21,13 +21,13 @@ from scipy.integrate import odeint, solve_ivp
 from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
+from benchmarks.nelder_mead import window_paths
 from benchmarks.timing import cpu_s
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.methods.nelder_mead import window_paths
 from ep2sindy.refinement.ode import ODE
 from ep2sindy.refinement.problem import Iteration, RefinementProblem, RefinementSettings
 from ep2sindy.refinement.refine import refine

@@ -78,7 +78,7 @@ def plain_front(
     problem: RegressionRows, equation: int, supports: list[tuple[int, ...]]
 ) -> dict[int, tuple]:
     """Best support of every size by its error on the held-out rows."""
-    train, test = problem.train_rows, problem.test_rows
+    train, test = problem.train_rows, problem.test_columns.T
     target = len(problem.library) + equation
     best: dict[int, tuple] = {}
     for columns in map(list, supports):

@@ -1,4 +1,4 @@
-"""The test of a regression's residuals: fast kernels against plain forms, and blocks of records."""
+"""The test of a regression's residuals: fast forms against plain ones, and blocks of records."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,13 +13,11 @@ from ep2sindy.discovery import choice
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.test_functions import spectral_change_point
 from ep2sindy.regression.whitening import _covariance, _Sums
-from ep2sindy.regression.window_kernels import linearise, spread_windows, sum_windows
-from ep2sindy.signals.kernels import likelihood, smooth
 
 
 def plain_covariance(rows: NoisyRows, sensitivity: np.ndarray, target_scale: float) -> np.ndarray:
     """The sum over variables of M M', where M is the rows' change per unit noise of a variable."""
-    total, (mean, slope) = np.zeros((len(rows.windows),) * 2), rows.windows.matrices()
+    total, mean, slope = np.zeros((len(rows.windows),) * 2), rows.windows.mean, rows.windows.slope
     for v, std in enumerate(rows.noise_std.T):
         change = mean @ diags_array(sensitivity[v])
         if v == rows.state:
@@ -54,21 +52,8 @@ def test_the_banded_covariance_is_that_of_sparse_products(steps: str, order: str
         np.testing.assert_allclose(found, below, atol=1e-12 * plain.max())
 
 
-def test_sums_over_windows_are_sparse_products() -> None:
-    rows, rng = rows_of_lorenz("uneven").noisy, np.random.default_rng(0)
-    assert rows is not None
-    windows, n_rows, n_samples = rows.windows, len(rows.windows), rows.windows.n_samples
-    columns, weights = rng.normal(size=(4, n_samples)), rng.normal(size=n_rows)
-    for stretch, matrix in zip((windows.mean, windows.slope), windows.matrices(), strict=True):
-        sums, spread = np.empty((4, n_rows)), np.empty(n_samples)
-        sum_windows(windows.starts, windows.first, stretch, columns, sums)
-        spread_windows(windows.starts, windows.first, stretch, weights, spread)
-        np.testing.assert_allclose(sums.T, matrix @ columns.T, atol=1e-12 * abs(sums).max())
-        np.testing.assert_allclose(spread, matrix.T @ weights, atol=1e-12 * abs(spread).max())
-
-
 @pytest.mark.parametrize("kept", [[0, 4, 7, 9, 12], list(range(13))])
-def test_compiled_terms_and_slopes_are_those_of_the_library(kept: list[int]) -> None:
+def test_sums_of_products_and_their_slopes_are_those_of_the_library(kept: list[int]) -> None:
     problem, rng = rows_of_lorenz("even", functions=["sin"]), np.random.default_rng(0)
     library, scale = problem.library, problem.theta_scale
     x, moved, coef = rng.normal(size=(3, 700)), rng.normal(size=(3, 700)), np.zeros(len(library))
@@ -77,9 +62,7 @@ def test_compiled_terms_and_slopes_are_those_of_the_library(kept: list[int]) -> 
     plain = library.evaluate(x.T) / scale
     change = np.einsum("vst,vs->st", slopes, moved)
     sums = _Sums.of(problem, np.isin(np.arange(len(library)), kept))
-    columns = sums.products.with_functions(np.concatenate([x, np.ones((1, 700))]), axis=0)
-    terms, sensitivity = np.empty((2, len(kept), 700)), np.empty((3, 700))
-    linearise(columns, sums.table, *sums.entries, moved, coef[kept], terms, sensitivity)
+    terms, sensitivity = sums.linearise(x, moved, coef[kept])
     np.testing.assert_allclose(terms[0], plain.T[kept], rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(terms[1], (plain + change).T[kept], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(sensitivity, slopes @ coef, rtol=1e-12, atol=1e-12)
@@ -133,19 +116,6 @@ def test_the_change_point_is_the_corner_of_least_squares() -> None:
             for c in corners
         ]
         assert spectral_change_point(x) == corners[np.argmin(left)]
-
-
-@pytest.mark.parametrize("ratio", [1e-10, 1e-3, 10.0])
-def test_even_steps_give_what_nearly_even_ones_give(ratio: float) -> None:
-    """At even steps the gains are repeated once they have settled, and otherwise never."""
-    rng = np.random.default_rng(0)
-    values = np.cumsum(rng.normal(size=(3000, 1)), axis=0) / 100.0
-    even, nearly = np.ones(2999), 1.0 + 2e-9 * (-1.0) ** np.arange(2999)
-    for route, samples in ((likelihood, values[:, 0].copy()), (smooth, values)):
-        for found, plain in zip(
-            route(even, samples, ratio), route(nearly, samples, ratio), strict=True
-        ):
-            np.testing.assert_allclose(found, plain, rtol=1e-6, atol=1e-7)
 
 
 def test_steps_that_are_left_out_hardly_change_the_residuals() -> None:

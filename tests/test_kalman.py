@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 from scipy.linalg import cho_factor, cho_solve, null_space
 
+from ep2sindy.signals import wiener
 from ep2sindy.signals.kalman import KalmanSmoother, most_likely_ratios
-from ep2sindy.signals.kernels import likelihood, likelihoods, smooth
 from ep2sindy.signals.smoothers import Smoother
+from ep2sindy.signals.wiener import WienerProcess
 from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 
 SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
@@ -60,33 +61,48 @@ def restricted_likelihood(
 def test_smoother_is_the_process_conditioned_on_the_samples(
     t: np.ndarray, log10_ratio: float
 ) -> None:
-    signal, slope = smooth(np.diff(t), NOISE, 10.0**log10_ratio)
+    process = WienerProcess.at(np.diff(t))
+    signal = process.signal(NOISE, 10.0**log10_ratio)
     exact_signal, exact_slope = universal_kriging(t, NOISE, 10.0**log10_ratio)
     # Dense algebra loses the digits here: its condition number reaches ratio * 11^5.
     assert np.allclose(signal, exact_signal, atol=1e-8)
-    assert np.allclose(slope, exact_slope, atol=1e-8 * np.abs(exact_slope).max())
+    assert np.allclose(process.slope(signal), exact_slope, atol=1e-8 * np.abs(exact_slope).max())
 
 
 @every_time
 @every_ratio
 def test_likelihood_is_that_of_the_joint_normal(t: np.ndarray, log10_ratio: float) -> None:
-    steps, columns = np.diff(t), np.ascontiguousarray(NOISE.T)
-    each = [likelihood(steps, column, 10.0**log10_ratio) for column in columns]
-    found, found_noise = np.transpose(each)
+    process = WienerProcess.at(np.diff(t))
+    found, found_noise = process.likelihood(NOISE, 10.0**log10_ratio)
     exact, exact_noise = restricted_likelihood(t, NOISE, 10.0**log10_ratio)
     # Contrasts of another length add a constant: compare with the likelihood of ratio 1.
-    found -= [likelihood(steps, column, 1.0)[0] for column in columns]
+    found -= process.likelihood(NOISE, 1.0)[0]
     exact -= restricted_likelihood(t, NOISE, 1.0)[0]
     assert found == pytest.approx(exact, abs=1e-8)
     assert found_noise == pytest.approx(exact_noise, rel=1e-8)
 
 
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_both_factorisations_give_one_likelihood(
+    monkeypatch: pytest.MonkeyPatch, jitter: float
+) -> None:
+    rng = np.random.default_rng(0)
+    steps = 1.0 + jitter * rng.uniform(-1.0, 1.0, 2999)
+    process, values = WienerProcess.at(steps), np.cumsum(rng.normal(size=(3000, 2)), axis=0)
+    ratios = 10.0 ** np.arange(-10.0, 5.0, 2.0)
+    plain = [process.likelihood(values, ratio) for ratio in ratios]
+    monkeypatch.setattr(wiener, "WELL_CONDITIONED", np.inf)
+    joint = [process.likelihood(values, ratio) for ratio in ratios]
+    np.testing.assert_allclose(plain, joint, rtol=1e-6, atol=0.01)  # as WELL_CONDITIONED says
+
+
 @every_time
 @every_ratio
 def test_smoother_is_a_symmetric_matrix(t: np.ndarray, log10_ratio: float) -> None:
-    matrix = smooth(np.diff(t), np.eye(12), 10.0**log10_ratio)[0]
+    process = WienerProcess.at(np.diff(t))
+    matrix = process.signal(np.eye(12), 10.0**log10_ratio)
     assert np.allclose(matrix, matrix.T, atol=1e-10)
-    assert np.allclose(smooth(np.diff(t), NOISE, 10.0**log10_ratio)[0], matrix @ NOISE)
+    assert np.allclose(process.signal(NOISE, 10.0**log10_ratio), matrix @ NOISE)
     eigenvalues = np.linalg.eigvalsh(matrix)
     assert eigenvalues.min() >= -1e-10
     assert eigenvalues.max() <= 1.0 + 1e-10
@@ -152,34 +168,12 @@ def test_smoother_protocol_returns_the_parts_of_the_estimate() -> None:
     assert not estimate.smoothed.flags.writeable
 
 
-@every_time
-def test_ratios_side_by_side_have_the_likelihoods_of_each_alone(t: np.ndarray) -> None:
-    ratios = 10.0 ** np.linspace(-14.0, 4.0, 21)
-    found = likelihoods(np.diff(t), NOISE, ratios)
-    columns = np.ascontiguousarray(NOISE.T)
-    alone = [[likelihood(np.diff(t), each, ratio)[0] for ratio in ratios] for each in columns]
-    assert found == pytest.approx(np.array(alone), rel=1e-12, abs=1e-10)
-
-
-@pytest.mark.parametrize("jumps", [[], [700, 701, 1500]])
-def test_settled_ratios_side_by_side_have_the_likelihoods_of_each_alone(jumps: list[int]) -> None:
-    """After an uneven step, all ratios are followed again."""
-    values, steps = np.random.default_rng(0).normal(size=(2000, 2)), np.ones(1999)
-    values, steps[jumps] = np.cumsum(values, axis=0) / 100.0, 1.5
-    ratios = 10.0 ** np.arange(-14.0, 5.0)
-    alone = [
-        [likelihood(steps, column, ratio)[0] for ratio in ratios]
-        for column in np.ascontiguousarray(values.T)
-    ]
-    np.testing.assert_allclose(likelihoods(steps, values, ratios), alone, rtol=1e-11)
-
-
 def test_the_ratio_found_is_the_most_likely() -> None:
     run = lorenz().trajectory(noise=0.05, rng=np.random.default_rng(2))
-    steps, values = np.ones(499), run.states[:500, :1].copy()
-    (found,) = most_likely_ratios(steps, values)
+    process, values = WienerProcess.at(np.ones(499)), run.states[:500, :1]
+    (found,) = most_likely_ratios(process, values)
     fine = np.arange(-14.0, 4.0, 0.02)
-    best = fine[np.argmax([likelihood(steps, values[:, 0].copy(), 10.0**r)[0] for r in fine])]
+    best = fine[np.argmax([process.likelihood(values, 10.0**r)[0][0] for r in fine])]
     assert found == pytest.approx(best, abs=0.02)
 
 
@@ -230,10 +224,22 @@ def test_noise_and_ratio_are_those_of_a_draw_from_the_model() -> None:
 def test_crowded_samples_cost_few_digits() -> None:
     t = np.concatenate([[0.0, 1e-3, 2e-3], 2e-3 + np.arange(1.0, 20.0)])
     values = (1.0 + t - 0.3 * t**2)[:, None]
-    steps = np.diff(t) / np.diff(t).mean()
-    matrix = smooth(steps, np.eye(22), 1e-8)[0]
+    matrix = WienerProcess.at(np.diff(t) / np.diff(t).mean()).signal(np.eye(22), 1e-8)
     assert np.allclose(matrix, matrix.T, atol=1e-9)
     assert np.allclose(matrix @ values, values, atol=1e-8)
+
+
+@pytest.mark.parametrize("log10_ratio", [-8.0, -2.0, 4.0])
+def test_samples_that_nearly_coincide_are_two_samples_of_one_time(log10_ratio: float) -> None:
+    t = np.arange(200.0)
+    values = np.sin(t / 5.0) + 0.1 * np.random.default_rng(0).standard_normal(200)
+    smoother, other = KalmanSmoother(log10_ratio=log10_ratio), values[[50]] + 0.1
+    near, far = (
+        smoother.estimate(np.insert(t, 51, 50.0 + gap), np.insert(values, 51, other)[:, None])
+        for gap in (1e-12, 1e-5)
+    )
+    assert near.smoothed == pytest.approx(far.smoothed, abs=1e-4)
+    assert near.noise_std == pytest.approx(far.noise_std, rel=1e-4)
 
 
 @pytest.mark.parametrize(

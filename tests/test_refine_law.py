@@ -14,12 +14,12 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import fit_and_judge, is_stationary
 from ep2sindy.refinement.law import LawRefinement, refine_law
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.methods.nelder_mead import NelderMead
 from ep2sindy.refinement.problem import LawMap, RefinementSettings
 from ep2sindy.refinement.problem import RefinementProblem as Problem
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.weighted_law import information_of, weighted_law
 from tests.models import model_of
+from tests.single_shooting import SingleShooting
 
 POINTS = list(PARAMETERS)
 WINDOW, N_WINDOWS = 60, 4
@@ -227,7 +227,10 @@ def test_an_information_of_one_direction_still_gives_a_law() -> None:
         ({"basis": BASIS * np.nan}, "a basis must be finite"),
         ({"basis": BASIS[:5]}, "must be one per point: 6, 6 and 5 came"),
         ({"window": 600}, "a window must fit into a trajectory"),
-        ({"method": NelderMead(), "free_start": False}, "MultipleShooting alone: NelderMead"),
+        (
+            {"method": SingleShooting(), "free_start": False},
+            "MultipleShooting alone: SingleShooting",
+        ),
         (
             {"models": [model_of({"n_i": {"n_i": 1.0}, "n_n": {"n_n": 1.0}}), *truths()[1:]]},
             "must have the same terms: 2 structures came",

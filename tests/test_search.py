@@ -32,9 +32,7 @@ def test_lasso_path_matches_an_independent_implementation(seed: int) -> None:
     xx, xy, _ = random_gram(9, seed, correlation=1.0)
     _, _, path = lars_path_gram(xy, xx, n_samples=200, method="lasso")
     at_knots = {tuple(np.flatnonzero(column)) for column in path.T}
-    masks, scratch = np.empty((80, 9), dtype=bool), (np.empty((9, 9)), np.empty((5, 9)))
-    n_masks = lasso_path(xx, xy, 9, *scratch, np.empty((2, 9), dtype=np.int64), masks, 0)
-    found = {tuple(np.flatnonzero(m)) for m in masks[:n_masks]}
+    found = {tuple(np.flatnonzero(m)) for m in lasso_path(xx, xy, 9)}
     # The support between two knots is ours; at the knot itself a leaving term is zero already.
     assert at_knots <= found
     assert len(found) == len({tuple(c != 0) for c in (path[:, 1:] + path[:, :-1]).T}) + 1
@@ -73,11 +71,9 @@ def test_lasso_paths_hold_the_optimal_supports_and_no_others_if_terms_are_nearly
     xx, xy = xx / size[:, None, None], xy / size[:, None]
     supports = [list(c) for k in range(1, n_terms + 1) for c in combinations(range(n_terms), k)]
     widths = np.array([penalties(xx, xy, chosen) for chosen in supports]).T
-    scratch = np.empty((n_terms, n_terms)), np.empty((5, n_terms))
-    places, masks = np.empty((2, n_terms), dtype=np.int64), np.empty((99, n_terms), dtype=bool)
     for gram, product_with, width in zip(xx, xy, widths, strict=True):
-        n_masks = lasso_path(gram, product_with, n_terms, *scratch, places, masks, 0)
-        found = {tuple(np.flatnonzero(m).tolist()) for m in masks[:n_masks]}
+        masks = lasso_path(gram, product_with, n_terms)
+        found = {tuple(np.flatnonzero(m).tolist()) for m in masks}
         there = np.array([tuple(chosen) in found for chosen in supports])
         n_false += int((there & (width < -1e-10)).sum())
         n_missing += int((~there & (width > 1e-10)).sum())

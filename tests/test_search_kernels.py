@@ -1,21 +1,18 @@
-"""Every compiled step of a search against the same step in plain NumPy."""
+"""Steps of a search, compiled ones among them, against the same step in plain NumPy."""
 
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
-from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, rank_masks, solve_masks
-from ep2sindy.regression.row_kernels import (
-    TILE,
-    add_residuals,
-    gather_columns,
-    scale_draws,
-    spread,
+from ep2sindy.regression.bootstraps import (
+    Bootstraps,
+    Resamples,
+    moving_block_counts,
+    pool,
 )
-from ep2sindy.regression.search_kernels import key_words, pool_masks
-from ep2sindy.regression.searches import STLSQ, AdaptiveLasso
+from ep2sindy.regression.gram_kernels import fit_masks, solve_masks
+from ep2sindy.regression.searches import STLSQ
 
 
 def random_masks(n_masks: int, n_terms: int, seed: int = 0) -> np.ndarray:
@@ -31,43 +28,6 @@ def random_grams(n_draws: int, n_terms: int) -> tuple[np.ndarray, np.ndarray, np
     columns /= np.linalg.norm(columns, axis=1, keepdims=True)
     products = columns.transpose(0, 2, 1) @ columns
     return products[:, :-1, :-1].copy(), products[:, -1, :-1].copy(), products[:, -1, -1].copy()
-
-
-def test_columns_are_gathered_and_scaled() -> None:
-    rng = np.random.default_rng(0)
-    values, places = rng.normal(size=(50, 3)) * [1.0, 1e200, 0.0], np.array([3, 7, 41])
-    values.flags.writeable = False
-    columns, norms = np.zeros((5, 3)), np.array([1.0, 2e200, 1.0])
-    gather_columns(values, places, norms, 1, columns)
-    np.testing.assert_allclose(columns[1:4], (values[places] / norms).T, rtol=1e-15)
-    assert not columns[[0, 4]].any()
-
-
-def test_the_spread_of_a_constant_is_zero() -> None:
-    values = np.random.default_rng(0).normal(3.0, 1.0, size=101)
-    assert spread(values) == pytest.approx(np.square(values - values.mean()).sum())
-    assert spread(np.full(999, 0.1)) == 0.0
-
-
-def test_draws_are_scaled_to_unit_norm() -> None:
-    n_draws, n_terms, n_equations = 3, 4, 2
-    columns = np.random.default_rng(0).normal(size=(n_draws, 20, n_terms + n_equations))
-    columns[2, :, 1] = 0.0
-    products = columns.transpose(0, 2, 1) @ columns
-    kept = np.ones((n_draws, n_terms), dtype=bool)
-    kept[0, 2] = False
-    xx, xy = np.empty((n_draws, n_terms, n_terms)), np.empty((n_draws, n_equations, n_terms))
-    yy, scale = np.empty((n_draws, n_equations)), np.empty((n_draws, n_terms))
-    sums = products[:, *np.triu_indices(n_terms + n_equations)]
-    scale_draws(sums, kept, xx, xy, yy, scale)
-    norms = np.linalg.norm(columns[:, :, :n_terms], axis=1)
-    plain = np.where(kept & (norms > 0.0), 1.0 / np.where(norms > 0.0, norms, 1.0), 0.0)
-    np.testing.assert_allclose(scale, plain, rtol=1e-14)
-    unit = columns[:, :, :n_terms] * plain[:, None]
-    np.testing.assert_allclose(xx, unit.transpose(0, 2, 1) @ unit, atol=1e-14)
-    targets = columns[:, :, n_terms:]
-    np.testing.assert_allclose(xy, targets.transpose(0, 2, 1) @ unit, atol=1e-13)
-    np.testing.assert_allclose(yy, np.square(targets).sum(axis=1), rtol=1e-14)
 
 
 @pytest.mark.parametrize("block", [1, 7])
@@ -88,20 +48,6 @@ def test_draws_are_those_of_plain_calls_of_the_generator(block: int) -> None:
     np.testing.assert_array_equal(one, np.bincount(rows, minlength=60))
 
 
-def test_residuals_and_their_products_are_those_of_matrices() -> None:
-    rng = np.random.default_rng(0)
-    columns, masks = rng.normal(size=(6, 2 * TILE + 5)), random_masks(7, 4)
-    coef = np.where(masks, rng.normal(size=(7, 4)), 0.0)
-    products, squares = np.ones((7, 4)), np.ones(7)
-    add_residuals(columns, 5, coef, np.empty(TILE), products, squares)
-    left = columns[5] - coef @ columns[:4]
-    np.testing.assert_allclose(squares, 1.0 + np.square(left).sum(axis=1), rtol=1e-13)
-    plain = 1.0 + np.where(masks, left @ columns[:4].T, 0.0)
-    np.testing.assert_allclose(products, plain, rtol=1e-12, atol=1e-10)
-    add_residuals(columns, 5, coef, np.empty(TILE), np.empty((0, 4)), squares)
-    np.testing.assert_allclose(squares, 1.0 + 2.0 * np.square(left).sum(axis=1), rtol=1e-13)
-
-
 def test_supports_in_any_order_are_fitted_alone() -> None:
     (xx, _), xy, _ = random_grams(2, 6)
     masks, rhs = random_masks(30, 6), np.random.default_rng(2).normal(size=(30, 6))
@@ -111,23 +57,6 @@ def test_supports_in_any_order_are_fitted_alone() -> None:
             plain = np.zeros(6)
             plain[mask] = np.linalg.solve(xx[np.ix_(mask, mask)], right[mask])
             np.testing.assert_allclose(fit, plain, atol=1e-11)
-
-
-@pytest.mark.parametrize("depth", [1, 3])
-def test_supports_are_ranked_by_what_they_explain(depth: int) -> None:
-    xx, xy, _ = random_grams(2, 6)
-    masks = np.unique(random_masks(60, 6), axis=0)
-    explained, best = np.empty(len(masks)), np.empty((7, depth), dtype=np.int64)
-    scratch = np.empty((6, 6)), np.empty(6), np.empty(6, dtype=np.int64)
-    rank_masks(xx[1], xy[1], xx[0], xy[0], masks, *scratch, explained, best)
-    plain = explained_squares(fit_masks(xx[1], xy[1], masks), xx[0], xy[0])
-    assert np.isnan(plain).sum() == masks[:, [0, 1, 5]].all(axis=1).sum() > 0
-    np.testing.assert_allclose(explained, plain, rtol=1e-10, atol=1e-10)
-    sizes = masks.sum(axis=1)
-    for size in range(7):
-        own = [k for k in np.argsort(-plain) if sizes[k] == size and np.isfinite(plain[k])]
-        own = own[:depth] if size else []
-        assert best[size].tolist() == own + [-1] * (depth - len(own))
 
 
 def plain_thresholding(xx: np.ndarray, xy: np.ndarray, start: np.ndarray, limit: float) -> list:
@@ -144,40 +73,29 @@ def plain_thresholding(xx: np.ndarray, xy: np.ndarray, start: np.ndarray, limit:
 
 def test_thresholds_are_iterated_alone() -> None:
     xx, xy, yy = random_grams(4, 6)
-    search = STLSQ(n_thresholds=30, lowest=1e-3)
-    found = search.supports_of_draws(xx, xy, yy)
-    limits = np.geomspace(1e-3, 10.0, 30)
-    for k, masks in enumerate(found):
-        start = np.array([True] * 5 + [k != 1])
-        plain = [plain_thresholding(xx[k], xy[k], start, s * np.sqrt(yy[k])) for s in limits]
+    search, limits = STLSQ(n_thresholds=30, lowest=1e-3), np.geomspace(1e-3, 10.0, 30)
+    small = STLSQ(n_thresholds=30, lowest=1e-3, max_terms=2)
+    for k, case in enumerate(zip(xx, xy, yy, strict=True)):
+        masks, start = search.supports(*case), np.array([True] * 5 + [k != 1])
+        plain = [plain_thresholding(*case[:2], start, s * np.sqrt(case[2])) for s in limits]
         assert masks.tolist() == plain
-    small = STLSQ(n_thresholds=30, lowest=1e-3, max_terms=2).supports_of_draws(xx, xy, yy)
-    for masks, few in zip(found, small, strict=True):
-        assert few.tolist() == masks[masks.sum(axis=1) <= 2].tolist()
+        assert small.supports(*case).tolist() == masks[masks.sum(axis=1) <= 2].tolist()
 
 
-@pytest.mark.parametrize("search", [AdaptiveLasso(), AdaptiveLasso(gamma=0.5), STLSQ()])
-def test_draws_in_one_call_are_searched_as_each_alone(search: AdaptiveLasso | STLSQ) -> None:
-    xx, xy, yy = random_grams(4, 6)
-    for k, masks in enumerate(search.supports_of_draws(xx, xy, yy)):
-        np.testing.assert_array_equal(masks, search.supports(xx[k], xy[k], float(yy[k])))
-
-
-@pytest.mark.parametrize("n_terms", [5, 70])  # 70 take two numbers
+@pytest.mark.parametrize("n_terms", [5, 70])
 def test_masks_are_pooled_as_sets(n_terms: int) -> None:
     some = random_masks(12, n_terms, seed=3)
     masks = some[np.random.default_rng(0).integers(12, size=90)]
     ends = np.array([20, 20, 55, 90])
-    keys = np.empty((90, key_words(n_terms)), dtype=np.int64)
-    places = np.empty((3, 90), dtype=np.int64)
-    held, last = np.empty((2, n_terms + 1, n_terms), dtype=np.int64)
-    n_distinct = pool_masks(masks, ends, keys, places, held, last)
+    whole, part = np.empty((4, 0, 0)), np.empty((4, 0))
+    kept = np.ones((4, n_terms), dtype=bool)
+    draws = Resamples(["x"], whole, whole, part, part, kept, True, n_terms)
+    supports = pool(draws, 0, np.split(masks, ends[:-1]))
     of_draws = [{tuple(m) for m in masks[a:b].tolist()} for a, b in pairwise([0, *ends.tolist()])]
     pooled = sorted(set().union(*of_draws), key=lambda m: (sum(m), m))
-    order = places[0, :n_distinct]
-    assert [tuple(m) for m in masks[order].tolist()] == pooled
-    assert places[1, order].tolist() == [sum(m in draw for draw in of_draws) for m in pooled]
+    assert [tuple(m) for m in supports.masks.tolist()] == pooled
+    assert supports.share.tolist() == [np.mean([m in draw for draw in of_draws]) for m in pooled]
     for size in range(n_terms + 1):
         for j in range(n_terms):
-            n_draws = sum(any(m[j] and sum(m) == size for m in draw) for draw in of_draws)
-            assert held[size, j] == n_draws
+            found = [any(m[j] and sum(m) == size for m in draw) for draw in of_draws]
+            assert supports.inclusion[size, j] == np.mean(found)

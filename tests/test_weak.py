@@ -56,7 +56,7 @@ def noisy(system: System, noise: float = 0.01) -> Trajectory:
 def dense(problem: RegressionRows) -> tuple[np.ndarray, np.ndarray]:
     """Weights of the training rows on the samples: of the terms, and of the state."""
     assert problem.noisy is not None
-    mean, slope = problem.noisy.windows.matrices()
+    mean, slope = problem.noisy.windows.mean, problem.noisy.windows.slope
     return mean.toarray(), slope.toarray()
 
 
@@ -136,7 +136,7 @@ def test_no_training_row_shares_a_sample_with_a_held_out_row(
     windows = [form.test_functions.windows(run.t, x, rng=rng) for x in run.states.T]
     for state, problem in enumerate(assembled(replace(form, split=split), [run])):
         touched = np.zeros((2, run.n_samples), dtype=bool)
-        every_target = windows[state].slopes(run.states[:, state])
+        every_target = windows[state].slope @ run.states[:, state]
         for target, test in zip(problem.target[:, 0], problem.test, strict=True):
             k = int(np.argmin(np.abs(every_target - target)))
             assert every_target[k] == pytest.approx(target, rel=1e-12)

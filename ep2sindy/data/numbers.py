@@ -5,7 +5,7 @@ Values without a single clear meaning as real numbers are refused.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -170,6 +170,45 @@ def column_norms(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray,
     largest = zero_to_one(columns.max(axis=1, initial=0.0))
     columns /= largest[:, None]
     return zero_to_one(largest * np.sqrt(np.einsum("cr,cr->c", columns, columns)))
+
+
+def least_squares(
+    columns: Float[np.ndarray, "rows columns"],
+    target: Float[np.ndarray, " rows"],
+    *,
+    cutoff: float | None = None,
+) -> Float[np.ndarray, " columns"]:
+    """Least squares of columns in any units, each of which is scaled to unit norm.
+
+    cutoff: singular values below this share of the largest count as zero; None for rounding.
+    """
+    size = column_norms(columns)
+    return np.linalg.lstsq(columns / size, target, rcond=cutoff)[0] / size
+
+
+def least_beside_grid(
+    function: Callable[[float], float],
+    grid: Float[np.ndarray, " points"],
+    on_grid: Float[np.ndarray, " points"],
+    *,
+    tolerance: float,
+) -> float:
+    """Where a function that may be flat or have several minima is least.
+
+    The least of its values on a grid, which are given, finds the deepest minimum, and a bounded
+    search between the neighbours of that point refines it.
+    """
+    from scipy.optimize import minimize_scalar  # import takes 0.5 s; most calls do not need it
+
+    best = int(on_grid.argmin())
+    search = minimize_scalar(
+        function,
+        bounds=sorted(grid[[max(best - 1, 0), min(best + 1, len(grid) - 1)]]),
+        method="bounded",
+        options={"xatol": tolerance},
+    )
+    # The bounded search never tries the bounds themselves, so the grid point may be better.
+    return float(search.x if search.fun < on_grid[best] else grid[best])
 
 
 def quantiles(draws: Float[np.ndarray, "draws ..."], levels: Sequence[float]) -> np.ndarray:

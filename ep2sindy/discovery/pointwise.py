@@ -28,9 +28,6 @@ from ep2sindy.runtime.progress import Advance, Progress, as_progress
 
 NO_FIT = "no_fit"
 
-# Points and samples that are turned at once from rows to columns, few enough to stay in the cache.
-TURNED_POINTS, TURNED_SAMPLES = 16, 64
-
 STATUSES = ("fitted", "no_plasma", "missing_samples", "too_little_variation", NO_FIT)
 
 
@@ -175,14 +172,8 @@ def _columns(
     """All variables at one point after another, the samples of each contiguous in memory."""
     shape = (block.sizes["time"], *(block.sizes.get(axis, 1) for axis in SPACE))
     grids = [np.broadcast_to(grid_values(block[n]), shape).reshape(shape[0], -1) for n in names]
-    for start in range(0, grids[0].shape[1], TURNED_POINTS):
-        parts = [grid[:, start : start + TURNED_POINTS] for grid in grids]
-        group = np.empty((parts[0].shape[1], len(parts), shape[0]))
-        for j, part in enumerate(parts):
-            for first in range(0, len(part), TURNED_SAMPLES):
-                rows = slice(first, first + TURNED_SAMPLES)
-                group[:, j, rows] = part[rows].T
-        yield from group
+    for point in range(grids[0].shape[1]):
+        yield np.stack([grid[:, point] for grid in grids])
 
 
 def _status(values: Float[np.ndarray, "variables samples"], search: PointSearch) -> int:

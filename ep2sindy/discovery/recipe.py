@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
 from ep2sindy.regression.bootstraps import Bootstraps
@@ -43,33 +44,24 @@ def method_of(
             f"a search of trajectories draws no bootstraps: {bootstraps!r} came; take "
             "Bootstraps(n=0) (bootstraps=none), or a regression"
         )
-    plain = TrajectorySearch()  # a group of a config always has a value, perhaps the default
-    return _with_settings(
+    plain = TrajectorySearch()
+    return replace(
         search,
-        None if selection == plain.selection else selection,
-        None if depth == plain.depth else depth,
+        selection=_once("selection", search.selection, selection, plain.selection),
+        depth=_once("depth", search.depth, depth, plain.depth),
     )
 
 
-def _with_settings(
-    search: TrajectorySearch, selection: SystemSelection | Selection | None, depth: int | None
-) -> TrajectorySearch:
-    """The search with another rule and depth; None leaves its own.
+def _once(name: str, own: Any, given: Any, default: Any) -> Any:
+    """A setting of the search, or what was given beside it: a config always has a value there.
 
     Raises ValueError for a setting that the search has already, with another value.
     """
-    plain = TrajectorySearch()
-    for name, own, default, given in (
-        ("selection", search.selection, plain.selection, selection),
-        ("depth", search.depth, plain.depth, depth),
-    ):
-        if given is not None and own not in (default, given):
-            raise ValueError(
-                f"{name} must be set once: {own!r} came in the search (search.{name}), and "
-                f"{given!r} beside it; leave one of them out"
-            )
-    return replace(
-        search,
-        selection=search.selection if selection is None else selection,
-        depth=search.depth if depth is None else depth,
-    )
+    if given == default:
+        return own
+    if own not in (default, given):
+        raise ValueError(
+            f"{name} must be set once: {own!r} came in the search (search.{name}), and "
+            f"{given!r} beside it; leave one of them out"
+        )
+    return given

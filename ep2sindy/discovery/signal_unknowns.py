@@ -11,6 +11,7 @@ from functools import partial
 
 import numpy as np
 
+from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import TrajectorySearch
@@ -215,8 +216,6 @@ def fit_functions(
     Raises ValueError for a function with more than one `?`, of no variable of the run, or none of
     whose numbers can be used.
     """
-    from scipy.optimize import minimize_scalar  # imported only to fit a number
-
     known = [text for text in functions if FITTED not in text]
     for text in functions:
         if FITTED not in text:
@@ -232,11 +231,7 @@ def fit_functions(
                 f"no number in the place of {FITTED} lets {text!r} be used on these data: its "
                 "argument leaves the domain; write the number yourself, or another function"
             )
-        best = int(np.argmin(tried))
-        around = (max(best - 1, 0), min(best + 1, len(SIZES) - 1))
-        bounds = tuple(np.log(SIZES[k]) for k in around)
-        found = minimize_scalar(off, bounds=bounds, method="bounded", options={"xatol": TOLERANCE})
-        log_size = found.x if found.fun < tried[best] else np.log(SIZES[best])
+        log_size = least_beside_grid(off, np.log(SIZES), tried, tolerance=TOLERANCE)
         known.append(_filled(text, np.exp(log_size), unit))
     return known
 

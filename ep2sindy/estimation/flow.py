@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.estimation.kernels import sensitivities
 from ep2sindy.library.library import Library
 from ep2sindy.model.flow_kernels import SumsOfProducts, Tableau, advance, reach_of
 
@@ -117,22 +116,16 @@ class RightHandSides:
 
         Products that neither the coefficients nor the derivatives need stay out.
         """
-        terms, states_of = np.nonzero(coef)
-        first, n_addends = self._first_addend[terms], self._n_addends[terms]
-        which = np.repeat(np.arange(len(terms)), n_addends)  # coefficient of each entry
-        place = np.arange(len(which)) - np.repeat(np.cumsum(n_addends) - n_addends, n_addends)
-        entry = np.repeat(first, n_addends) + place
+        used = coef.any(axis=1)
+        sums = np.tensordot(coef[used].T, self._shares[used], axes=1)
         if not slopes.shape[2]:
-            kept = self._addends[1][entry] == 0
-            which, entry = which[kept], entry[kept]
-        _, column, product = (each[entry] for each in self._addends)
-        target = states_of[which]
-        slope_of = column > 0
+            sums = sums[:, :1]
+        target, column, product = np.nonzero(sums)
+        weight, slope_of = sums[target, column, product], column > 0
         pairs, pair = np.unique(
             target[slope_of] * self.d + column[slope_of] - 1, return_inverse=True
         )
         target[slope_of] = self.d + pair
-        weight = self._shares[terms[which], column, product] * coef[terms, states_of][which]
         # Each coefficient's own product is a sum by itself.
         own, p = self._places[by[1]], np.arange(len(by[0]))
         product = np.append(product, own)
@@ -158,27 +151,26 @@ class RightHandSides:
         slopes: Float[np.ndarray, "steps d columns"],
     ) -> Float[np.ndarray, "steps d"]:
         """`_compiled` for libraries with functions, which are evaluated at all samples at once."""
-        d, of, wanted = self.d, (by[0], self._places[by[1]]), slopes.shape[2] > 0
+        (n, d), (equation, term), wanted = states.shape, by, slopes.shape[2] > 0
         rates = self._shares[:, 0].T @ coef
+        columns = d + np.arange(len(equation))
+        total = slopes[:, :, : d + len(equation)]
         if wanted:
             by_state = np.einsum("tjp,ti->pij", self._shares[:, 1:], coef)
             rates = np.column_stack([rates, by_state.reshape(-1, d * d)])
-            slopes[:, np.arange(d), np.arange(d)] = 1.0
-        leads, weights = np.array(LEADS), np.array(WEIGHTS)
+            total[:, np.arange(d), np.arange(d)] = 1.0
         for k in range(steps.n_substeps):
-            slope, total = np.zeros_like(states), states
-            jacobians, values = [], []
-            for s, (lead, weight) in enumerate(zip(leads, weights, strict=True)):
-                here = states + (lead * steps.h)[:, None] * slope
-                values.append(self._products_of(here, steps.inputs_at(k, s)))
-                both = values[-1] @ rates
+            start, slope, begun, change = states, np.zeros_like(states), total.copy(), 0.0
+            for s, (lead, weight) in enumerate(zip(LEADS, WEIGHTS, strict=True)):
+                ahead, share = (lead * steps.h)[:, None], (weight * steps.h)[:, None]
+                values = self._products_of(start + ahead * slope, steps.inputs_at(k, s))
+                both = values @ rates
                 slope = both[:, :d]
-                jacobians.append(both[:, d:])
-                total = total + (weight * steps.h)[:, None] * slope
-            if wanted:
-                by_state = np.stack(jacobians).reshape(4, -1, d, d)
-                sensitivities(by_state, np.stack(values), *of, leads, weights, steps.h, slopes)
-            states = total
+                states = states + share * slope
+                if wanted:
+                    change = both[:, d:].reshape(n, d, d) @ (begun + ahead[:, None] * change)
+                    change[:, equation, columns] += values[:, self._places[term]]
+                    total += share[:, None] * change
         return states
 
     def _products_of(
@@ -202,16 +194,3 @@ class RightHandSides:
     def _places(self) -> Int[np.ndarray, " terms"]:
         """Index of the product that equals each term."""
         return np.argmax(self._shares[:, 0] != 0.0, axis=1)
-
-    @cached_property
-    def _addends(self) -> tuple[np.ndarray, ...]:
-        """Term, column and product of every share that is not zero, in the order of the terms."""
-        return np.nonzero(self._shares)
-
-    @cached_property
-    def _n_addends(self) -> Int[np.ndarray, " terms"]:
-        return np.bincount(self._addends[0], minlength=len(self.library))
-
-    @cached_property
-    def _first_addend(self) -> Int[np.ndarray, " terms"]:
-        return np.cumsum(self._n_addends) - self._n_addends

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.coerce import Task
-from ep2sindy.data.numbers import column_norms
+from ep2sindy.data.numbers import least_squares
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, parse_relation
@@ -146,8 +146,7 @@ def with_guess(run: Trajectory, library: Library, ways: Sequence[Entrance]) -> T
         rate, units = rates[way.state], units | {way.hidden: _unit(way, library, units)}
         if way.state != whole:
             terms = _evaluate(library, _linear_in(library, "", list(known)), known)
-            size = column_norms(terms)
-            rate = rate - terms @ (np.linalg.lstsq(terms / size, rate, rcond=None)[0] / size)
+            rate = rate - terms @ least_squares(terms, rate)
         one = known | {way.hidden: np.ones(run.n_samples)}
         row = np.arange(len(library)) == library.index(way.term)
         factor = way.coefficient * _evaluate(library, row, one)[:, 0]

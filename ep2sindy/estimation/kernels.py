@@ -1,4 +1,4 @@
-"""Compiled kernels of the trajectory likelihood: sensitivities, filter, smoother.
+"""Compiled kernels of the trajectory likelihood: filter and smoother.
 
 A record has n samples of d states; p coefficients are free. The flow maps a state over one step
 between samples; `flow`: (n - 1, d, d + p) holds its derivatives with respect to the state, then to
@@ -22,53 +22,6 @@ VECTOR = 4  # numbers; rows are padded to whole ones
 # enough that the product takes longer than its addition to the others.
 PIECE, FEWEST = 2**15, 64
 TINY, HUGE = 1e-100, 1e100  # bounds of a product of variances before its logarithm is taken
-
-
-def sensitivities(jacobians, terms, equation, column, leads, weights, steps, slopes):
-    """One Runge-Kutta step of the sensitivities; `slopes` (n, d, d + p) is advanced in place.
-
-    Columns beyond those of the p coefficients are not touched.
-
-    jacobians: (stages, n, d, d) and terms: (stages, n, products), at the stages of each step.
-    leads, weights: (stages,), of the method, as shares of the step; steps: (n,), in time.
-    Coefficient c multiplies terms[..., column[c]] in equation[c]. A sample passes all stages before
-    the next one comes, so that what it needs stays in the cache.
-    """
-    buffers = np.empty((3, slopes.shape[1], slopes.shape[1] + len(equation)))
-    _sensitivities(jacobians, terms, equation, column, leads, weights, steps, slopes, *buffers)
-
-
-@compiled(**LOOPS)
-def _sensitivities(
-    jacobians, terms, equation, column, leads, weights, steps, slopes, here, slope, total
-):
-    d, width = here.shape
-    for k in range(len(slopes)):
-        for i in range(d):
-            for c in range(width):
-                slope[i, c] = 0.0
-                total[i, c] = slopes[k, i, c]
-        for s in range(len(leads)):
-            lead, weight = leads[s] * steps[k], weights[s] * steps[k]
-            for i in range(d):
-                for c in range(width):
-                    here[i, c] = slopes[k, i, c] + lead * slope[i, c]
-            for i in range(d):
-                for c in range(width):
-                    slope[i, c] = 0.0
-                for j in range(d):
-                    factor = jacobians[s, k, i, j]
-                    if factor != 0.0:
-                        for c in range(width):
-                            slope[i, c] += factor * here[j, c]
-            for c in range(width - d):
-                slope[equation[c], d + c] += terms[s, k, column[c]]
-            for i in range(d):
-                for c in range(width):
-                    total[i, c] += weight * slope[i, c]
-        for i in range(d):
-            for c in range(width):
-                slopes[k, i, c] = total[i, c]
 
 
 @compiled(**INNER)

@@ -163,7 +163,7 @@ def _without_negative(
     """The fit without what least squares with bounds puts to zero, or all that is negative."""
     negative = problem.positive & (fit.free < 0.0)
     kept, own = fit.support & ~negative, np.flatnonzero(fit.support)
-    quadratic, gradient = _hessian(problem, fit, fit.support, level)[:2]
+    quadratic, gradient = hessian_on(problem, fit, fit.support, level)[:2]
     if np.isfinite(quadratic).all() and np.isfinite(gradient).all():
         linear = quadratic @ fit.free[own] + gradient
         bounded = within_bounds(quadratic, linear, problem.positive[own])
@@ -273,7 +273,7 @@ def innovations(
 def gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> Gram:
     """Linearise about a fit: all free coefficients of all equations, the states eliminated."""
     everything = np.ones_like(fit.support)
-    quadratic, gradient, least = _hessian(problem, fit, everything, level)[:3]
+    quadratic, gradient, least = hessian_on(problem, fit, everything, level)[:3]
     linear = quadratic @ fit.free + gradient
     offset = least + fit.free @ quadratic @ fit.free + 2.0 * fit.free @ gradient
     return Gram(quadratic, linear, float(offset))
@@ -283,7 +283,7 @@ def covariance(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> Float[np.ndarray, "support support"] | None:
     """Covariance of the support's free coefficients, scaled; None if the fit is not finite."""
-    hessian = _hessian(problem, fit, fit.support, level)[0]
+    hessian = hessian_on(problem, fit, fit.support, level)[0]
     if not np.isfinite(hessian).all():
         return None
     size = unit_sizes(hessian)
@@ -313,7 +313,7 @@ def _step(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> tuple[Float[np.ndarray, " free"], list[np.ndarray]]:
     """One Gauss-Newton step: changes of the free coefficients and of every path."""
-    hessian, gradient, _, flow = _hessian(problem, fit, fit.support, level)
+    hessian, gradient, _, flow = hessian_on(problem, fit, fit.support, level)
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
         return np.full_like(fit.free, np.nan), []
     size = unit_sizes(hessian)
@@ -359,7 +359,7 @@ def _misses(
     return misses
 
 
-def _hessian(
+def hessian_on(
     problem: EstimationProblem, fit: TrajectoryFit, support: Bool[np.ndarray, " free"], level: Level
 ) -> tuple[np.ndarray, np.ndarray, float, Flow]:
     """`hessian` with respect to the coefficients of a support."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.coerce import keep_inside, noise_inside
-from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.numbers import least_squares
 from ep2sindy.estimation.lateness import (
     DelayedGram,
     delayed_gram,
@@ -399,16 +399,10 @@ def _regress(
         for k, (equation, column) in enumerate(zip(problem.equation, problem.column, strict=True)):
             rows[:, equation, k] = theta[:, column]
         target = (rates - rows @ problem.fixed).reshape(-1)
-        return _solve(rows.reshape(n * d, -1) @ problem.C, target)
+        return least_squares(rows.reshape(n * d, -1) @ problem.C, target, cutoff=CUTOFF)
     free = np.zeros(problem.n_free)
     for equation in range(d):  # far smaller systems, one per equation
         own = problem.equation == equation
-        free[own] = _solve(theta[:, problem.column[own]], rates[:, equation])
+        columns = theta[:, problem.column[own]]
+        free[own] = least_squares(columns, rates[:, equation], cutoff=CUTOFF)
     return free
-
-
-def _solve(
-    rows: Float[np.ndarray, "rows columns"], target: Float[np.ndarray, " rows"]
-) -> Float[np.ndarray, " columns"]:
-    size = zero_to_one(np.linalg.norm(rows, axis=0))
-    return np.linalg.lstsq(rows / size, target, rcond=CUTOFF)[0] / size

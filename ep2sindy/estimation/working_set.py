@@ -22,7 +22,7 @@ from ep2sindy.estimation.likelihood import (
     FREE_START,
     Level,
     TrajectoryFit,
-    hessian,
+    hessian_on,
     joined,
     observe,
 )
@@ -236,12 +236,7 @@ def _gains(
     level: Level,
 ) -> Float[np.ndarray, " free"]:
     """Fall of the squares that each coefficient by itself would bring, to first order."""
-    quadratic, _, _, flow = hessian(
-        part,
-        fit,
-        level,
-        lambda record, path: part.flow(record, path[:-1], fit.free, fit.support, level.n_substeps),
-    )
+    quadratic, _, _, flow = hessian_on(part, fit, fit.support, level)
     if not np.isfinite(quadratic).all():
         return np.zeros(problem.n_free)
     # Neither terms nor slopes lead from one record to the next, whatever is missed there.

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from ep2sindy.data.numbers import column_norms
+from ep2sindy.data.numbers import least_squares
 from ep2sindy.library.library import Library
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.quantities import PointResult
@@ -75,7 +75,7 @@ def control_law(
     theta = library.evaluate(parameters)
     support = _best_support(values, theta, max_terms)
     fitted, left_out = left_out_predictions(values, theta[:, support])
-    coef = _least_squares(values, theta[:, support])
+    coef = least_squares(theta[:, support], values)
     others = [np.delete(np.arange(len(values)), k) for k in range(len(values))]
     searched = [
         _predict_left_out(theta[k], values[rest], theta[rest], max_terms)
@@ -128,12 +128,7 @@ def _predict_left_out(
 ) -> float:
     """Prediction at one more point by the law found in these."""
     support = _best_support(values, theta, max_terms)
-    return float(row[support] @ _least_squares(values, theta[:, support]))
-
-
-def _least_squares(values: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    scale = column_norms(columns)
-    return np.linalg.lstsq(columns / scale, values, rcond=None)[0] / scale
+    return float(row[support] @ least_squares(theta[:, support], values))
 
 
 def _rms(errors: np.ndarray) -> float:

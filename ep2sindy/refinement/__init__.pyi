@@ -5,7 +5,6 @@ from ep2sindy.refinement.methods.multiple_shooting import (
 from ep2sindy.refinement.methods.gradient_descent import (
     GradientDescent as GradientDescent,
 )  # for configs
-from ep2sindy.refinement.methods.nelder_mead import NelderMead as NelderMead  # for configs
 from ep2sindy.refinement.steps import RungeKutta as RungeKutta  # for configs
 from ep2sindy.refinement.steps import HermiteSimpson as HermiteSimpson  # for configs
 from ep2sindy.refinement.ode import ODE as ODE

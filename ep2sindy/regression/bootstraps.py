@@ -12,17 +12,15 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.regression.ambiguity import row_limit, usable_terms
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
-from ep2sindy.regression.row_kernels import count_drawn, scale_draws
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.search_kernels import key_words, pool_masks
-from ep2sindy.regression.searches import Search, SearchOfDraws
+from ep2sindy.regression.searches import Search
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.runtime.values import set_counts
 
 MOST_WEIGHTS = 2**24  # weights of rows, over the draws that are made at once
-WORK_AT_ONCE = 1_000_000  # cubes of terms, over the draws whose searches are one call
 
 
 @dataclass(frozen=True)
@@ -89,15 +87,13 @@ class Bootstraps:
                 f"n_culled must leave a term: {self.n_culled} of {len(usable)} would go; lower it "
                 "or use a larger library"
             )
-        sizes, first, culled = [], [], np.empty((self.n, self.n_culled), dtype=np.int64)
+        counts, kept = np.empty((self.n, n_groups)), np.repeat(terms[None], self.n, axis=0)
         for k in range(self.n):
             share = self.smallest + (self.largest - self.smallest) * rng.random()
-            sizes.append(max(1, round(share * n_groups)))
-            first.append(draw_blocks(n_groups, n_drawn=sizes[-1], block=self.block, rng=rng))
-            culled[k] = rng.permutation(usable)[: self.n_culled]
-        kept = np.repeat(terms[None], self.n, axis=0)
-        kept[np.arange(self.n)[:, None], culled] = False
-        return _counts(first, sizes, n_rows=n_groups, block=self.block), kept
+            n_drawn = max(1, round(share * n_groups))
+            counts[k] = moving_block_counts(n_groups, n_drawn=n_drawn, block=self.block, rng=rng)
+            kept[k, rng.permutation(usable)[: self.n_culled]] = False
+        return counts, kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,19 +154,11 @@ class Resamples:
         yy = self.yy[:, equation]
         if allowed is not None and not allowed.all():
             xx, xy = xx * (allowed[:, None] & allowed), xy * allowed
-        n_draws, n_terms = xy.shape
-        in_one_call = search if isinstance(search, SearchOfDraws) else None
-        # Between two reports of progress lies a fraction of a second.
-        step = max(1, WORK_AT_ONCE // n_terms**3) if in_one_call else 1
-        found: list[Bool[np.ndarray, "_ terms"]] = []
-        for start in range(0, n_draws, step):
-            some = slice(start, start + step)
-            if in_one_call:
-                found += in_one_call.supports_of_draws(xx[some], xy[some], yy[some])
-            else:
-                found.append(search.supports(xx[start], xy[start], float(yy[start])))
-            advance(min(step, n_draws - start))
-        if self.largest >= n_terms:
+        found = []
+        for draw in zip(xx, xy, yy.tolist(), strict=True):
+            found.append(search.supports(*draw))
+            advance(1)
+        if self.largest >= xy.shape[1]:
             return found
         return [masks[masks.sum(axis=1) <= self.largest] for masks in found]
 
@@ -207,21 +195,25 @@ def draw_resamples(
         problem.check_grams(bootstraps.n)  # before the work on terms, which may take minutes
     usable = usable_terms(problem)
     sums, kept = bootstraps.draw(problem, usable, rng)
-    n_draws, n_terms, n_equations = *kept.shape, len(problem.equations)
-    draws = Resamples(
+    n_columns, n_terms = len(problem.library) + len(problem.equations), len(problem.library)
+    products = np.empty((len(sums), n_columns, n_columns))
+    left, right = np.triu_indices(n_columns)
+    products[:, left, right] = products[:, right, left] = sums
+    squares = products.diagonal(axis1=1, axis2=2)
+    # Resampling changes the norms, so columns are scaled to unit norm again; then the search does
+    # not depend on units or draws. A culled term becomes a column of zeros.
+    kept_squares = np.where(kept, squares[:, :n_terms], 0.0)
+    scale = np.where(kept_squares > 0.0, 1.0 / np.sqrt(zero_to_one(kept_squares)), 0.0)
+    return Resamples(
         equations=problem.equations,
-        xx=np.empty((n_draws, n_terms, n_terms)),
-        xy=np.empty((n_draws, n_equations, n_terms)),
-        yy=np.empty((n_draws, n_equations)),
-        scale=np.empty((n_draws, n_terms)),
+        xx=products[:, :n_terms, :n_terms] * (scale[:, :, None] * scale[:, None, :]),
+        xy=products[:, n_terms:, :n_terms] * scale[:, None, :],
+        yy=squares[:, n_terms:].copy(),
+        scale=scale,
         kept=kept,
         counted=bootstraps.n > 0,
         largest=row_limit(int(usable.sum()), problem.n_train),
     )
-    # Resampling changes the norms, so columns are scaled to unit norm again; then the search does
-    # not depend on units or draws. A culled term becomes a column of zeros.
-    scale_draws(sums, kept, draws.xx, draws.xy, draws.yy, draws.scale)
-    return draws
 
 
 def pooled_supports(
@@ -238,17 +230,18 @@ def pooled_supports(
 
 def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ terms"]]) -> Supports:
     """Count the supports and terms that `search` found over the draws of one equation."""
-    masks, n_terms = np.concatenate(found), draws.kept.shape[1]
-    ends = np.cumsum([len(each) for each in found])
-    keys = np.empty((len(masks), key_words(n_terms)), dtype=np.int64)
-    places = np.empty((3, len(masks)), dtype=np.int64)
-    held, last = np.empty((2, n_terms + 1, n_terms), dtype=np.int64)
-    n_distinct = pool_masks(masks, ends, keys, places, held, last)
-    order, n_draws = places[0, :n_distinct], places[1]
+    masks, which = _distinct(np.concatenate(found))
+    in_draw = np.zeros((len(found), len(masks)), dtype=np.bool_)
+    in_draw[np.repeat(np.arange(len(found)), [len(each) for each in found]), which] = True
+    sizes, n_terms = masks.sum(axis=1), masks.shape[1]
+    held = np.zeros((n_terms + 1, n_terms))
+    for size in np.unique(sizes):
+        own = sizes == size
+        held[size] = (in_draw[:, own].astype(np.float64) @ masks[own] > 0.0).sum(axis=0)
     supports = Supports(
         equation=draws.equations[equation],
-        masks=masks[order],
-        share=n_draws[order] / len(found),
+        masks=masks,
+        share=in_draw.mean(axis=0),
         inclusion=held / draws.n_kept,
     )
     if draws.counted:
@@ -259,6 +252,17 @@ def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ te
         share=np.full_like(supports.share, np.nan),
         inclusion=np.full_like(supports.inclusion, np.nan),
     )
+
+
+def _distinct(
+    masks: Bool[np.ndarray, "masks terms"],
+) -> tuple[Bool[np.ndarray, "distinct terms"], Int[np.ndarray, " masks"]]:
+    """The distinct masks by size, then by terms, and the number of each mask among them."""
+    sizes = masks.sum(axis=1).astype(">u4")  # whose bytes are in the order of the numbers
+    keys = np.column_stack([sizes[:, None].view(np.uint8), np.packbits(masks, axis=1)])
+    whole = np.ascontiguousarray(keys).view(f"V{keys.shape[1]}")[:, 0]
+    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
+    return masks[first], which
 
 
 def moving_block_counts(
@@ -272,26 +276,11 @@ def moving_block_counts(
     Raises ValueError for a block that is not between one row and all of them.
     Source: Kuensch 1989, doi:10.1214/aos/1176347265.
     """
-    first = draw_blocks(n_rows, n_drawn=n_drawn, block=block, rng=rng)
-    return _counts([first], [n_drawn], n_rows=n_rows, block=block)[0].astype(np.int64)
-
-
-def draw_blocks(
-    n_rows: int, *, n_drawn: int, block: int, rng: np.random.Generator
-) -> Int[np.ndarray, " runs"]:
-    """First row of each run of `moving_block_counts`."""
     if not 1 <= block <= n_rows:
         raise ValueError(
             f"a block must hold between one and all {n_rows} groups of training rows: {block} "
             "came; shorten it, or use more data"
         )
-    return rng.integers(n_rows - block + 1, size=-(-n_drawn // block))
-
-
-def _counts(
-    first: Sequence[Int[np.ndarray, " _"]], sizes: Sequence[int], *, n_rows: int, block: int
-) -> Float[np.ndarray, "draws rows"]:
-    """How often each row occurs in every draw, from its runs and its number of rows."""
-    counts, ends = np.empty((len(first), n_rows)), np.cumsum([len(runs) for runs in first])
-    count_drawn(np.concatenate(first), ends, np.array(sizes), block, counts)
-    return counts
+    first = rng.integers(n_rows - block + 1, size=-(-n_drawn // block))
+    drawn = (first[:, None] + np.arange(block)).ravel()[:n_drawn]
+    return np.bincount(drawn, minlength=n_rows)

@@ -13,14 +13,15 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
-from ep2sindy.regression.gram_kernels import fit_masks, rank_masks, solve_masks
-from ep2sindy.regression.row_kernels import TILE, add_residuals, spread
+from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, solve_masks
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
 
 # Correction of coefficients, as a share of them, after which another one would be rounding.
 REFINED = 1e-9
+
+ROWS_AT_ONCE = 4096  # rows whose residuals, of all fits, are held at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,9 +270,16 @@ class RowFits(NamedTuple):
 def _spread(problem: RegressionRows, equation: int) -> Spread:
     held_out = problem.test_target(equation)
     return Spread(
-        train=spread(problem.train_target(equation)),
-        test=spread(held_out) if len(held_out) else float("nan"),
+        train=_squares_about_mean(problem.train_target(equation)),
+        test=_squares_about_mean(held_out) if len(held_out) else float("nan"),
     )
+
+
+def _squares_about_mean(values: Float[np.ndarray, " rows"]) -> float:
+    """Sum of squares about the mean, exactly zero for a constant."""
+    values = values - values[0]
+    values -= values.mean()
+    return float(values @ values)
 
 
 def _candidates(
@@ -315,13 +323,17 @@ def _rank(
     Computed from Gram matrices only; NaN for linearly dependent terms. And the indices of the
     `depth` supports that reduce it most of each size, ordered by size.
     """
-    train, n_terms = problem.train_gram, len(problem.library)
+    train = problem.train_gram
     judge = problem.test_gram if problem.test.any() else train
-    explained, best = np.empty(len(masks)), np.empty((n_terms + 1, depth), dtype=np.int64)
-    scratch = np.empty((n_terms, n_terms)), np.empty(n_terms), np.empty(n_terms, dtype=np.int64)
-    grams = train.xx[0], train.xy[0, equation], judge.xx[0], judge.xy[0, equation]
-    rank_masks(*grams, masks, *scratch, explained, best)
-    return explained, best[best >= 0]
+    coef = fit_masks(train.xx[0], train.xy[0, equation], masks)
+    explained, sizes = (
+        explained_squares(coef, judge.xx[0], judge.xy[0, equation]),
+        masks.sum(axis=1),
+    )
+    order = np.lexsort((-explained, sizes))
+    order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
+    rank = np.arange(len(order)) - np.searchsorted(sizes[order], sizes[order])
+    return explained, order[rank < depth]
 
 
 def _cloud(
@@ -385,8 +397,12 @@ def _residual_squares(
 
     products: if given, the products of the residuals and the terms are added.
     """
-    squares, left = np.zeros(len(coef)), np.empty(TILE)
-    out = np.empty((0, coef.shape[1])) if products is None else products
+    squares, n_terms = np.zeros(len(coef)), len(problem.library)
     for columns in problem.blocks(test=test):
-        add_residuals(columns, len(problem.library) + equation, coef, left, out, squares)
+        for start in range(0, columns.shape[1], ROWS_AT_ONCE):
+            some = columns[:, start : start + ROWS_AT_ONCE]
+            left = some[n_terms + equation] - coef @ some[:n_terms]
+            squares += np.einsum("sr,sr->s", left, left)
+            if products is not None:
+                products += left @ some[:n_terms].T
     return squares

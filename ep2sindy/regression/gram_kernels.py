@@ -69,39 +69,12 @@ def independent_terms(xx):
     return mask
 
 
-def all_usable(gram, order, same):
-    """True if all is finite, and no term is zero, repeats another, or combines others.
-
-    gram: of terms, and of targets behind them. order: terms, the simplest first. same: 1 - |cosine|
-    below which two terms are the same.
-    """
-    shape = len(order), len(order)
-    return _all_usable(gram, order, same, np.empty(shape), np.empty(shape), np.empty_like(order))
-
-
-@compiled(**LOOPS)
-def _all_usable(gram, order, same, xx, lower, active):
-    n_terms = len(order)
-    for a in range(len(gram)):
-        for b in range(len(gram)):
-            if not np.isfinite(gram[a, b]):
-                return False
-    for a in range(n_terms):
-        for b in range(n_terms):
-            xx[a, b] = gram[order[a], order[b]]
-            if a != b and abs(xx[a, b]) > 1.0 - same:
-                return False
-        if xx[a, a] <= 0.0:
-            return False
-    return factorise(xx, active, lower) == n_terms
-
-
 @compiled(**WITHIN)
 def _extend(xx, mask, active, n_active, lower):
     """Write the terms of a mask and their factor; returns how many, and whether they are so.
 
     active: n_active terms that have a row of the factor already. Masks in the order of
-    `pool_masks` often begin with the terms of the one before, whose rows are kept.
+    `bootstraps.pool` often begin with the terms of the one before, whose rows are kept.
     """
     n_same = np.int64(0)  # as a bare 0 it would have callees compiled twice
     for j in range(len(mask)):
@@ -144,44 +117,6 @@ def fill_solutions(xx, rhs, masks, coef, lower, solution, active):
             substitute(lower, rhs[min(m, len(rhs) - 1)], active, n_active, solution)
             for i in range(n_active):
                 coef[m, active[i]] = solution[i]
-
-
-@compiled(**LOOPS)
-def rank_masks(xx, xy, judge_xx, judge_xy, masks, lower, solution, active, explained, best):
-    """Fit every support, write what it explains on the rows that judge, and rank those of a size.
-
-    As `explained_squares` of `fit_masks`, but coefficients are used as soon as they are there, and
-    only those of the support.
-    best: (sizes, depth), gets the numbers of the best supports of each size but zero, -1 for none.
-    explained: (masks,), NaN for dependent terms. lower: (terms, terms), solution: (terms,) and
-    active: (terms,) of int are scratch.
-    """
-    n_active = np.int64(0)
-    for size in range(len(best)):
-        for k in range(best.shape[1]):
-            best[size, k] = -1
-    for m in range(len(masks)):
-        n_active, solved = _extend(xx, masks[m], active, n_active, lower)
-        explained[m] = np.nan
-        if not solved:
-            continue
-        substitute(lower, xy, active, n_active, solution)
-        total = 0.0
-        for i in range(n_active):
-            change = 2.0 * judge_xy[active[i]]
-            for k in range(n_active):
-                change -= solution[k] * judge_xx[active[i], active[k]]
-            total += solution[i] * change
-        explained[m] = total
-        if n_active == 0 or not np.isfinite(total):
-            continue
-        place, ranked = best.shape[1], best[n_active]
-        while place > 0 and (ranked[place - 1] < 0 or total > explained[ranked[place - 1]]):
-            place -= 1
-        for k in range(best.shape[1] - 1, place, -1):
-            ranked[k] = ranked[k - 1]
-        if place < best.shape[1]:
-            ranked[place] = m
 
 
 def fit_masks(xx, xy, masks):

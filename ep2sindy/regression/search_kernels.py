@@ -13,12 +13,9 @@ from ep2sindy.regression.gram_kernels import (
     ROUNDING,
     WITHIN,
     append_term,
-    factorise,
     substitute,
 )
 from ep2sindy.runtime.compilation import GIVEN_ARRAYS, LOOPS, compiled
-
-BITS = 62  # terms in one number of a key
 
 PATH_PER_TERM = 8  # supports on a lasso path, per term, at which it ends; they may come and go
 
@@ -50,29 +47,38 @@ def _next_event(coef, slope, correlation, drift, level, active, n_active, closed
     return step, term, joins
 
 
-@compiled(**LOOPS)
-def lasso_path(xx, xy, max_terms, lower, vectors, places, masks, n_masks):
-    """Write all supports on the exact lasso path, from the empty one to `max_terms` or all terms.
+def lasso_path(xx, xy, max_terms):
+    """All supports on the exact lasso path, from the empty one to `max_terms` or all terms.
 
     Homotopy in the penalty, in which terms join and leave (Osborne, Presnell & Turlach 2000,
     doi:10.1093/imanum/20.3.389; Efron et al. 2004, doi:10.1214/009053604000000067). The Cholesky
     factor of the active terms grows by a row where one joins, and is made anew from the place where
     one leaves.
-    masks: (room, terms), written from n_masks on; returns how many are written then. lower: (terms,
-    terms), vectors: (5 or more, terms) and places: (2, terms) of int are scratch.
+    """
+    n = len(xy)
+    masks = np.empty((PATH_PER_TERM * (n + 1), n), dtype=np.bool_)
+    scratch = np.empty((n, n)), np.empty((5, n)), np.empty((2, n), dtype=np.int64)
+    return masks[: _lasso_path(xx, xy, max_terms, *scratch, masks)]
+
+
+@compiled(**LOOPS)
+def _lasso_path(xx, xy, max_terms, lower, vectors, places, masks):
+    """Write the supports of `lasso_path` to masks (room, terms); returns how many.
+
+    lower: (terms, terms), vectors: (5, terms) and places: (2, terms) of int are scratch.
     """
     n_terms = len(xy)
     coef, correlation, drift = vectors[0], vectors[1], vectors[2]
     slope, signs, active = vectors[3], vectors[4], places[0]
     closed = places[1]  # 0 for terms that can join
     n_active = np.int64(0)  # as a bare 0 it would have callees compiled twice
-    end, left, level = n_masks + PATH_PER_TERM * (n_terms + 1), -1, 0.0
+    left, level = -1, 0.0
     for j in range(n_terms):
         coef[j], correlation[j], closed[j] = 0.0, xy[j], 0
         level = max(level, abs(xy[j]))
     floor = 1e-13 * level
-    n_masks = _write_support(active, n_active, masks, n_masks)
-    while level > floor and n_masks < end:
+    n_masks = _write_support(active, n_active, masks, np.int64(0))
+    while level > floor and n_masks < len(masks):
         _fill_drift(xx, slope, active, n_active, drift)
         if left >= 0:  # with the sign it had, it would rejoin at this same knot
             closed[left] = LEFT_POSITIVE if correlation[left] > 0.0 else LEFT_NEGATIVE
@@ -144,169 +150,6 @@ def _leave(xx, active, n_active, term, lower):
         active[kept] = active[i]
         kept += 1
     return kept
-
-
-@compiled(**LOOPS)
-def adaptive_lasso_supports(xx, xy, gamma, max_terms, matrices, vectors, places, masks, ends):
-    """Write the supports on the path of the lasso with penalties |b_ols|^-gamma, for every draw.
-
-    Scaling each column by |b_ols|^gamma makes this a plain lasso (Zou 2006). A term that depends on
-    earlier ones has no least-squares coefficient of its own and never joins. All draws are one
-    call, since a path takes no longer than a call of NumPy.
-    xx: (draws, terms, terms). xy: (draws, terms). masks: as in `lasso_path`. ends: (draws,), number
-    of masks up to each draw. matrices: (2, terms, terms), vectors: (7, terms) and places are
-    scratch.
-    """
-    scaled_xx, lower, scale, scaled_xy = matrices[0], matrices[1], vectors[5], vectors[6]
-    active, fitted, n_terms, n_masks = places[0], vectors[0], xy.shape[1], np.int64(0)
-    for d in range(len(xx)):
-        n_kept = factorise(xx[d], active, lower)
-        substitute(lower, xy[d], active, n_kept, fitted)
-        for j in range(n_terms):
-            scale[j] = 0.0
-        for i in range(n_kept):
-            size = abs(fitted[i])
-            scale[active[i]] = size if gamma == 1.0 else size**gamma
-        for i in range(n_terms):
-            scaled_xy[i] = xy[d, i] * scale[i]
-            for j in range(n_terms):
-                scaled_xx[i, j] = xx[d, i, j] * (scale[i] * scale[j])
-        n_masks = lasso_path(
-            scaled_xx, scaled_xy, max_terms, lower, vectors, places, masks, n_masks
-        )
-        ends[d] = n_masks
-
-
-@compiled(**LOOPS)
-def thresholded_supports(xx, xy, thresholds, max_terms, lower, places, chain, fits, masks, ends):
-    """Write the supports by sequentially thresholded least squares, for every draw and threshold.
-
-    Each threshold is iterated to convergence; a support of more than max_terms is left out.
-    Neighbouring thresholds mostly drop the same terms in the same steps, so a fit is made only
-    where the last threshold had another support at that step.
-    thresholds: (draws, thresholds). masks: (draws * thresholds, terms). ends: (draws,), number of
-    masks up to each draw. lower: (terms, terms), places: (1, terms) of int, chain: (terms + 1,
-    terms) of bool and fits: (terms + 1, terms) are scratch: supports at the steps, and their
-    coefficients.
-    """
-    n_terms, n_masks, active = xy.shape[1], np.int64(0), places[0]
-    for d in range(len(xx)):
-        n_known, n_kept = 0, factorise(xx[d], active, lower)
-        _write_support(active, n_kept, chain, np.int64(0))
-        for m in range(thresholds.shape[1]):
-            step, dropped, n_left = np.int64(0), True, n_kept
-            for j in range(n_terms):
-                masks[n_masks, j] = chain[0, j]
-            while dropped:
-                if step >= n_known or not _same(masks, n_masks, chain, step):
-                    _fit_support(xx[d], xy[d], masks[n_masks], active, lower, fits[step])
-                    for j in range(n_terms):
-                        chain[step, j] = masks[n_masks, j]
-                    n_known = step + 1
-                dropped = False
-                for j in range(n_terms):
-                    if masks[n_masks, j] and abs(fits[step, j]) <= thresholds[d, m]:
-                        masks[n_masks, j], dropped, n_left = False, True, n_left - 1
-                step += 1
-            if n_left <= max_terms:
-                n_masks += 1
-        ends[d] = n_masks
-
-
-@compiled(**WITHIN)
-def _same(masks, m, others, k):
-    """True if row m of masks is row k of the others."""
-    n_different = 0
-    for j in range(masks.shape[1]):
-        n_different += masks[m, j] != others[k, j]
-    return n_different == 0
-
-
-@compiled(**WITHIN)
-def _fit_support(xx, xy, mask, active, lower, coef):
-    """Write the least-squares coefficients of a support of independent terms at its terms."""
-    n_active = np.int64(0)
-    for j in range(len(mask)):
-        if mask[j]:
-            append_term(xx, active, n_active, j, lower)
-            active[n_active] = j
-            n_active += 1
-    substitute(lower, xy, active, n_active, coef)
-    for i in range(n_active - 1, -1, -1):  # each place is read before it is written
-        coef[active[i]] = coef[i]
-
-
-@compiled(**LOOPS)
-def pool_masks(masks, ends, keys, places, held, last):
-    """Order the distinct masks of all draws by size, then by terms, and count the draws of each.
-
-    Counted are also the draws in which a support of each size held each term: held: (terms + 1,
-    terms). Each mask is sought among those known, which are kept in order.
-    ends: (draws,), number of masks up to each draw. places: (3, masks) of int: the first row gets
-    the number of a mask in order, each once; the second, by the number of the mask, its draws; one
-    is scratch, and so are keys: (masks, `key_words`) of int and last: (terms + 1, terms) of int.
-    Returns the number of distinct masks.
-    """
-    order, n_draws, latest = places[0], places[1], places[2]
-    for k in range(len(held)):  # assigning slices would compile messages of errors
-        for j in range(held.shape[1]):
-            held[k, j], last[k, j] = 0, -1
-    n_known, start = 0, 0
-    for d in range(len(ends)):
-        for m in range(start, ends[d]):
-            _write_key(masks, m, keys)
-            if m > start and _compare(keys, m, m - 1) == 0:
-                continue
-            size = keys[m, 0]
-            for j in range(masks.shape[1]):
-                if masks[m, j] and last[size, j] != d:
-                    last[size, j] = d
-                    held[size, j] += 1
-            rank, end = 0, n_known
-            while rank < end:
-                middle = (rank + end) // 2
-                if _compare(keys, order[middle], m) < 0:
-                    rank = middle + 1
-                else:
-                    end = middle
-            if rank == n_known or _compare(keys, order[rank], m) != 0:
-                for k in range(n_known, rank, -1):
-                    order[k] = order[k - 1]
-                order[rank], n_draws[m], latest[m] = m, 0, -1
-                n_known += 1
-            known = order[rank]
-            if latest[known] != d:
-                latest[known] = d
-                n_draws[known] += 1
-        start = ends[d]
-    return n_known
-
-
-def key_words(n_terms):
-    """Number of whole numbers in the key of a mask: its size, and its terms as bits."""
-    return 1 + -(-n_terms // BITS)
-
-
-@compiled(**WITHIN)
-def _write_key(masks, m, keys):
-    """Write the size of a mask and its terms, BITS in a number, the first the most significant."""
-    n_terms = masks.shape[1]
-    keys[m, 0] = 0
-    for word in range(1, keys.shape[1]):
-        code = 0
-        for j in range((word - 1) * BITS, min(word * BITS, n_terms)):
-            code = 2 * code + masks[m, j]
-            keys[m, 0] += masks[m, j]
-        keys[m, word] = code
-
-
-@compiled(**WITHIN)
-def _compare(keys, k, m):
-    """Negative if key k comes before key m, zero if they are the same."""
-    for word in range(keys.shape[1]):
-        if keys[k, word] != keys[m, word]:
-            return -1 if keys[k, word] < keys[m, word] else 1
-    return 0
 
 
 # For kernels that are given their arrays; sweeps are made in place, so these are not separate ones.
@@ -426,33 +269,26 @@ def best_subsets(xx, xy, yy, max_terms, n_best, most_work):
     without a proof.
     Returns (supports, terms) of bool, the empty support first, and whether they are proven best.
     """
-    n_terms = xy.shape[1]
-    depth = min(max_terms, n_terms)
-    room = room_for_subsets(len(xy), n_terms, depth, n_best)
-    proven = search_subsets(xx, xy, yy, most_work, *room)
-    best, best_masks = room[-2:]
+    n_problems, n_terms = xy.shape
+    depth, size = min(max_terms, n_terms), n_terms + 1
+    best = np.empty((depth + 1, n_best))
+    best_masks = np.empty((depth + 1, n_best, n_terms), dtype=np.bool_)
+    chosen, following = np.empty((2, depth + 1), dtype=np.int64)
+    proven = _search_subsets(
+        xx, xy, yy, most_work, np.empty((depth + 1, n_problems, size, size)),
+        np.empty((n_problems, size)), np.empty((size, size)), chosen, following, best, best_masks,
+    )  # fmt: skip
     return best_masks[best < np.inf], proven
 
 
-def room_for_subsets(n_problems, n_terms, depth, n_best):
-    """Arrays of `search_subsets` for supports of up to `depth` terms, in its order."""
-    size = n_terms + 1
-    return (
-        np.empty((depth + 1, n_problems, size, size)), np.empty((n_problems, size)),
-        np.empty((size, size)), np.empty(depth + 1, dtype=np.int64),
-        np.empty(depth + 1, dtype=np.int64), np.empty((depth + 1, n_best)),
-        np.empty((depth + 1, n_best, n_terms), dtype=np.bool_),
-    )  # fmt: skip
-
-
 @compiled(**PLAIN)
-def search_subsets(
+def _search_subsets(
     xx, xy, yy, most_work, levels, smallest, scratch, chosen, following, best, best_masks
 ):
     """Branch and bound of `best_subsets`; returns false if it ended for the work that it had done.
 
     Writes residuals to best (sizes, n_best), infinite where there is no support, and supports to
-    best_masks (sizes, n_best, terms). The others are scratch, see `room_for_subsets`.
+    best_masks (sizes, n_best, terms). The others are scratch.
     """
     _begin(xx, xy, yy, levels, smallest, best, best_masks)
     n_problems, size = smallest.shape

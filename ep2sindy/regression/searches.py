@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from ep2sindy.regression.exchanges import exchanged_supports
-from ep2sindy.regression.search_kernels import (
-    PATH_PER_TERM,
-    adaptive_lasso_supports,
-    best_subsets,
-    thresholded_supports,
-)
+from ep2sindy.regression.gram_kernels import fit_masks, independent_terms
+from ep2sindy.regression.search_kernels import best_subsets, lasso_path
 from ep2sindy.runtime.values import set_counts
 from ep2sindy.trust.memory import check_memory
 
@@ -27,7 +21,6 @@ MOST_WORK = 2e9  # multiplications of one search for a proof, a few seconds
 Gram = Float[np.ndarray, "terms terms"]
 Products = Float[np.ndarray, " terms"]
 Masks = Bool[np.ndarray, "supports terms"]
-MasksByDraw = list[Bool[np.ndarray, "_ terms"]]
 
 
 @runtime_checkable
@@ -41,25 +34,8 @@ class Search(Protocol):
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks: ...
 
 
-class SearchOfDraws(ABC):
-    """A search that takes all draws of an equation in one call."""
-
-    @abstractmethod
-    def supports_of_draws(
-        self,
-        xx: Float[np.ndarray, "draws terms terms"],
-        xy: Float[np.ndarray, "draws terms"],
-        yy: Float[np.ndarray, " draws"],
-    ) -> MasksByDraw:
-        """Supports of every draw, as `supports` of one."""
-
-    def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
-        (masks,) = self.supports_of_draws(xx[None], xy[None], np.array([yy]))
-        return masks
-
-
 @dataclass(frozen=True)
-class AdaptiveLasso(SearchOfDraws):
+class AdaptiveLasso:
     """All supports on the exact path of the adaptive lasso.
 
     Each coefficient is penalised by |b_ols|^-gamma. The path is piecewise linear and needs only
@@ -76,23 +52,16 @@ class AdaptiveLasso(SearchOfDraws):
             raise ValueError(f"gamma must be positive: {self.gamma} came")
         set_counts(self, _where_set(self.max_terms))
 
-    def supports_of_draws(
-        self,
-        xx: Float[np.ndarray, "draws terms terms"],
-        xy: Float[np.ndarray, "draws terms"],
-        yy: Float[np.ndarray, " draws"],
-    ) -> MasksByDraw:
-        n_draws, n = xy.shape
-        masks = np.empty((n_draws * PATH_PER_TERM * (n + 1), n), dtype=np.bool_)
-        ends, places = np.empty(n_draws, dtype=np.int64), np.empty((2, n), dtype=np.int64)
-        scratch = np.empty((2, n, n)), np.empty((7, n)), places
-        max_terms = self.max_terms or n
-        adaptive_lasso_supports(xx, xy, self.gamma, max_terms, *scratch, masks, ends)
-        return _by_draw(masks, ends)
+    def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
+        # Scaling each column by |b_ols|^gamma makes this a plain lasso. A term that depends on
+        # earlier ones has no least-squares coefficient of its own and never joins.
+        coef = fit_masks(xx, xy, independent_terms(xx)[None])[0]
+        scale = np.abs(coef) ** self.gamma
+        return lasso_path(xx * np.outer(scale, scale), xy * scale, self.max_terms or len(xy))
 
 
 @dataclass(frozen=True)
-class STLSQ(SearchOfDraws):
+class STLSQ:
     """Sequentially thresholded least squares, over a sweep of thresholds.
 
     Thresholds are fractions of the norm of the target, for columns of unit norm, spaced evenly in
@@ -113,20 +82,15 @@ class STLSQ(SearchOfDraws):
             )
         set_counts(self, {"n_thresholds": 2} | _where_set(self.max_terms))
 
-    def supports_of_draws(
-        self,
-        xx: Float[np.ndarray, "draws terms terms"],
-        xy: Float[np.ndarray, "draws terms"],
-        yy: Float[np.ndarray, " draws"],
-    ) -> MasksByDraw:
-        n_draws, n = xy.shape
-        thresholds = np.sqrt(yy)[:, None] * self._shares
-        masks, ends = np.empty((thresholds.size, n), dtype=np.bool_), np.empty(n_draws, np.int64)
-        chain, fits = np.empty((n + 1, n), dtype=np.bool_), np.empty((n + 1, n))
-        scratch = np.empty((n, n)), np.empty((1, n), dtype=np.int64), chain, fits
-        max_terms = self.max_terms or n
-        thresholded_supports(xx, xy, thresholds, max_terms, *scratch, masks, ends)
-        return _by_draw(masks, ends)
+    def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
+        thresholds = np.sqrt(yy) * self._shares[:, None]
+        masks = np.repeat(independent_terms(xx)[None], self.n_thresholds, axis=0)
+        while True:
+            kept = masks & (np.abs(fit_masks(xx, xy, masks)) > thresholds)
+            if np.array_equal(kept, masks):
+                break
+            masks = kept
+        return masks[masks.sum(axis=1) <= (self.max_terms or len(xy))]
 
     @cached_property
     def _shares(self) -> Float[np.ndarray, " thresholds"]:
@@ -212,12 +176,6 @@ def subsets_within(
     masks = np.zeros_like(found)
     masks[:, order] = found
     return masks, proven
-
-
-def _by_draw(masks: Masks, ends: Int[np.ndarray, " draws"]) -> MasksByDraw:
-    """The masks of every draw, from those of all and their number up to each."""
-    bounds = [0, *ends.tolist()]
-    return [masks[start:end] for start, end in pairwise(bounds)]
 
 
 def _where_set(max_terms: int | None) -> dict[str, int]:

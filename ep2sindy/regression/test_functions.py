@@ -127,7 +127,7 @@ class Bumps:
         windows = self._even_windows(lines @ x, grid[1] - grid[0])
         middle = grid[(windows.first + windows.last) // 2]
         kept = windows.taken(one_about_each(t, middle))
-        mean, slope = (weights @ lines for weights in kept.matrices())
+        mean, slope = kept.mean @ lines, kept.slope @ lines
         mean.sort_indices()
         slope.sort_indices()
         return Windows.of_matrices(mean, slope)

@@ -138,9 +138,9 @@ class Weak:
         test = np.concatenate([part.test for part in parts])
         windows = Windows.joined([part.windows for part in parts])
         n_segments = np.cumsum([0, *(run.segment[-1] + 1 for run in runs)])
-        target = windows.slopes(np.concatenate([run.run.states[:, state] for run in runs]))
+        target = windows.slope @ np.concatenate([run.run.states[:, state] for run in runs])
         return RegressionRows(
-            theta=windows.means(np.concatenate([run.terms for run in runs])),
+            theta=windows.mean @ np.concatenate([run.terms for run in runs]),
             target=target[:, None],
             library=library,
             equations=(name,),

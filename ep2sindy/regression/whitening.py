@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg.lapack import dpbtrf, dtbtrs
+from scipy.sparse import csr_array
 
 from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
-from ep2sindy.regression.window_kernels import (
-    banded_covariance,
-    linearise,
-    spread_windows,
-    sum_windows,
-)
+from ep2sindy.regression.window_kernels import banded_covariance
 
 # Largest correction of a sample, in standard deviations of its noise; with a wrong model the
 # corrections would otherwise grow without limit.
@@ -140,26 +137,47 @@ def _following(
 
 
 class _Sums(NamedTuple):
-    """Some scaled terms and their derivatives, as sums of products: arguments of `linearise`.
+    """Some scaled terms and their derivatives, as sums of products.
 
     kept: (library terms,), mask of the terms. products: library of the products, of which the rows
-    of `table` are used.
+    of `table` are used. shares: (kept, products), of the terms, then of their derivatives by each
+    variable.
     """
 
     kept: Bool[np.ndarray, " terms"]
     products: Library
     table: Int[np.ndarray, "products factors"]
-    entries: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    shares: Sequence[csr_array]
 
     @staticmethod
     def of(problem: RegressionRows, kept: Bool[np.ndarray, " terms"]) -> _Sums:
         products, shares = problem.library.derivatives
         shares = shares[kept] / problem.theta_scale[kept, None, None]
         used = shares.any(axis=(0, 1))
-        shares = shares[:, :, used]
-        term, column, product = np.nonzero(shares)
-        entries = term, column - 1, product, shares[term, column, product]
-        return _Sums(kept, products, products.table[used], entries)
+        parts = [csr_array(share) for share in shares[:, :, used].transpose(1, 0, 2)]
+        return _Sums(kept, products, products.table[used], parts)
+
+    def linearise(
+        self,
+        x: Float[np.ndarray, "variables samples"],
+        departure: Float[np.ndarray, "variables samples"],
+        coef: Float[np.ndarray, " kept"],
+    ) -> tuple[Float[np.ndarray, "two kept samples"], Float[np.ndarray, "variables samples"]]:
+        """Terms at x, terms moved by a departure along their derivatives, and slopes of the model.
+
+        The slopes are those of the sum of coef times term, by each variable.
+        """
+        columns = self.products.with_functions(np.vstack([x, np.ones(x.shape[1])]), axis=0)
+        values = columns[self.table[:, 0]]
+        for factor in self.table.T[1:]:
+            values *= columns[factor]
+        own, *derivatives = self.shares
+        terms, sensitivity = np.stack([own @ values] * 2), np.empty(x.shape)
+        for v, share in enumerate(derivatives):
+            slopes = share @ values
+            terms[1] += slopes * departure[v]
+            sensitivity[v] = coef @ slopes
+        return terms, sensitivity
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,25 +216,15 @@ class _Linearised:
         rows, library = problem.noisy, problem.library
         assert rows is not None
         (values, _, noise_std), n, n_samples = rows.columns, len(library.variables), x.shape[1]
-        columns = np.ones((n + 1, n_samples))
-        columns[:n] = x[:n]
-        departure = values[:n] - x[:n]
-        terms, sensitivity = np.empty((2, len(coef), n_samples)), np.zeros(x.shape)
-        linearise(
-            sums.products.with_functions(columns, axis=0), sums.table, *sums.entries,
-            departure, coef, terms, sensitivity[:n],
-        )  # fmt: skip
+        sensitivity = np.zeros(x.shape)
+        terms, sensitivity[:n] = sums.linearise(x[:n], values[:n] - x[:n], coef)
         if noisy and library.functions:
             terms -= (_lift(problem, x[:n].T) / problem.theta_scale).T[sums.kept]
         sensitivity *= noise_std
         target_scale = float(problem.target_scale[0])
         factor = _banded_cholesky(_covariance(rows, sensitivity, target_scale))
-        windows = rows.windows
-        white = np.empty((2 * len(coef) + 1, len(windows.first)))
-        flat = terms.reshape(2 * len(coef), n_samples)
-        sum_windows(windows.starts, windows.first, windows.mean, flat, white[:-1])
-        white[-1] = rows.target / target_scale
-        white = _solve(factor, white.T)
+        means = rows.windows.mean @ terms.reshape(2 * len(coef), n_samples).T
+        white = _solve(factor, np.column_stack([means, rows.target / target_scale]))
         theta, drifted, target = white[:, : len(coef)], white[:, len(coef) : -1], white[:, -1]
         return _Linearised(x, coef, theta, drifted, target, sensitivity, factor, target_scale, rows)
 
@@ -245,12 +253,10 @@ class _Linearised:
     def correct(self, coef: Float[np.ndarray, " terms"]) -> Float[np.ndarray, "variables samples"]:
         """Samples minus their most likely noise."""
         weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
-        rows, windows = self.source, self.source.windows
+        rows = self.source
         values, _, noise_std = rows.columns
-        by_mean, by_slope = np.empty((2, values.shape[1]))
-        for weights, sums in ((windows.mean, by_mean), (windows.slope, by_slope)):
-            spread_windows(windows.starts, windows.first, weights, weighted, sums)
-        noise = by_mean * self.sensitivity
+        noise = (rows.windows.mean.T @ weighted) * self.sensitivity
+        by_slope = rows.windows.slope.T @ weighted
         noise[rows.state] -= by_slope / self.target_scale * noise_std[rows.state]
         np.clip(noise, -LARGEST_CORRECTION, LARGEST_CORRECTION, out=noise)
         return values - noise * noise_std
@@ -288,9 +294,9 @@ def _covariance(
     """Covariance of the rows by the samples' noise, from its diagonal downwards."""
     windows = rows.windows
     own, std = sensitivity[rows.state], rows.columns[2][rows.state] / target_scale
-    band = np.zeros((len(windows.first), windows.width))
+    band = np.zeros((len(windows), windows.width))
     banded_covariance(
-        windows.starts, windows.first, windows.mean, windows.slope,
+        windows.mean.indptr.astype(np.int64), windows.first, windows.mean.data, windows.slope.data,
         np.square(sensitivity).sum(axis=0), own * std, np.square(std), band,
     )  # fmt: skip
     return band.T

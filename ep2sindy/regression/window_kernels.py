@@ -1,4 +1,4 @@
-"""Compiled weak rows, whose windows are short stretches of neighbouring samples.
+"""Compiled covariance of weak rows, whose windows are short stretches of neighbouring samples.
 
 The windows of row i are mean[starts[i]:starts[i + 1]] and slope in the same places, over samples
 from first[i] on. Loops run over slices: with sums of indices in them they would stay scalar.
@@ -6,110 +6,7 @@ from first[i] on. Loops run over slices: with sums of indices in them they would
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import INNER_REORDERED, LOOPS, REORDERED, compiled
-
-PIECE = 512  # samples
-
-
-@compiled(**LOOPS)
-def band_width(first, last):
-    """Largest distance between two rows whose windows overlap, plus one."""
-    width, ordered = 1, True
-    for i in range(len(first) - 1):
-        ordered = ordered and first[i] <= first[i + 1]
-    for i in range(len(first)):
-        for j in range(i + width, len(first)):
-            if first[j] <= last[i] and first[i] <= last[j]:
-                width = j - i + 1
-            elif ordered:
-                break
-    return width
-
-
-def linearise(columns, table, term, variable, product, weight, departure, coef, terms, sensitivity):
-    """Write terms, terms moved along their derivatives, and the slopes of their sum, by sample.
-
-    columns: (columns, samples), of variables, ones, and functions. table: (products, factors), the
-    columns of each product. Entry e adds weight[e] times product[e] to the term term[e], or to its
-    derivative by a variable if variable[e] is not negative. departure: (variables, samples), of the
-    move. terms: (2, terms, samples), to be filled. sensitivity: (variables, samples), of the sum of
-    coef times term. The loops of products and of sums are fused over pieces of samples: terms of
-    all samples would not stay in the cache.
-    """
-    terms[:], sensitivity[:] = 0.0, 0.0
-    values = np.empty((len(table), PIECE))
-    _linearise(
-        columns, table, term, variable, product, weight, departure, coef, values, terms, sensitivity
-    )
-
-
-@compiled(**REORDERED)
-def _linearise(
-    columns, table, term, variable, product, weight, departure, coef, values, terms, sensitivity
-):
-    for begin in range(0, columns.shape[1], PIECE):
-        here = slice(begin, min(begin + PIECE, columns.shape[1]))
-        n = here.stop - begin
-        for m in range(len(table)):
-            value = values[m, :n]
-            _copy(columns[table[m, 0], here], value)
-            for k in range(1, table.shape[1]):
-                if table[m, k] != len(departure):
-                    _multiply(value, columns[table[m, k], here])
-        for e in range(len(term)):
-            value, t, v = values[product[e], :n], term[e], variable[e]
-            if v < 0:
-                _add(value, weight[e], terms[0, t, here])
-                _add(value, weight[e], terms[1, t, here])
-            else:
-                _add(value, weight[e] * coef[t], sensitivity[v, here])
-                _multiply_add(value, weight[e], departure[v, here], terms[1, t, here])
-
-
-@compiled(**INNER_REORDERED)
-def _copy(values, out):
-    for i in range(len(out)):
-        out[i] = values[i]
-
-
-@compiled(**INNER_REORDERED)
-def _multiply(value, factor):
-    for i in range(len(value)):
-        value[i] *= factor[i]
-
-
-@compiled(**INNER_REORDERED)
-def _add(value, weight, total):
-    for i in range(len(value)):
-        total[i] += weight * value[i]
-
-
-@compiled(**INNER_REORDERED)
-def _multiply_add(value, weight, factor, total):
-    for i in range(len(value)):
-        total[i] += weight * value[i] * factor[i]
-
-
-@compiled(**REORDERED)
-def sum_windows(starts, first, weights, columns, sums):
-    """Write the weighted sums of columns (columns, samples) over all windows: (columns, rows)."""
-    for i in range(len(first)):
-        window = weights[starts[i] : starts[i + 1]]
-        for c in range(len(columns)):
-            column, total = columns[c, first[i] : first[i] + len(window)], 0.0
-            for s in range(len(window)):
-                total += window[s] * column[s]
-            sums[c, i] = total
-
-
-@compiled(**REORDERED)
-def spread_windows(starts, first, weights, rows, samples):
-    """Write the sums over rows of their windows times `rows` (rows,), a transposed product."""
-    for s in range(len(samples)):
-        samples[s] = 0.0
-    for i in range(len(first)):
-        window = weights[starts[i] : starts[i + 1]]
-        _add(window, rows[i], samples[first[i] : first[i] + len(window)])
+from ep2sindy.runtime.compilation import INNER_REORDERED, REORDERED, compiled
 
 
 @compiled(**INNER_REORDERED)

@@ -16,6 +16,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
+from ep2sindy.regression.gram_kernels import fit_masks
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
 from ep2sindy.selection.systems import Systems, TrialSystem, broken_demands
@@ -116,14 +117,11 @@ def _ranked(
     target: Float[np.ndarray, " rows"],
 ) -> list[Support]:
     """The supports with their coefficients, smallest sizes first, of a size by their residual."""
-    xx, xy = columns.T @ columns, columns.T @ target
-    ranked = []
-    for mask in masks:
-        own = np.flatnonzero(mask)
-        values = np.linalg.lstsq(xx[np.ix_(own, own)], xy[own], rcond=None)[0]
-        ranked.append((len(own), -float(xy[own] @ values), own.tolist(), values))
-    ranked.sort(key=lambda each: each[:3])
-    return [(np.array(own), values) for _, _, own, values in ranked]
+    xy = columns.T @ target
+    coef = fit_masks(columns.T @ columns, xy, masks)
+    order = np.lexsort([*~masks.T[::-1], -coef @ xy, masks.sum(axis=1)])
+    independent = order[np.isfinite(coef[order]).all(axis=1)]
+    return [(np.flatnonzero(masks[k]), coef[k, masks[k]]) for k in independent]
 
 
 def _first_of_each_size(supports: Sequence[Support], depth: int) -> list[Support]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import comb, log
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,24 +20,6 @@ FLOOR = 1e-6
 
 # Rounds of weighting the rows by the covariance under the leading candidate.
 MAX_ROUNDS = 5
-
-
-class Fits(NamedTuple):
-    """Candidates of one equation, fitted to rows whose noise is not known.
-
-    terms: of each candidate. errors: 1 - R2 as in `ParetoFront.errors`. squares: sums of squares
-    of the residuals of the training rows, for a target of unit norm. n_rows: for training.
-    """
-
-    library: Library
-    terms: Sequence[Sequence[str]]
-    errors: Float[np.ndarray, " candidates"]
-    squares: Float[np.ndarray, " candidates"]
-    n_rows: int
-
-    @property
-    def sizes(self) -> Float[np.ndarray, " candidates"]:
-        return np.array([float(len(terms)) for terms in self.terms])
 
 
 @dataclass(frozen=True)
@@ -81,11 +63,35 @@ class EBIC:
         return replace(self, gamma=self.gamma / n_points)
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        return [_criterion(front, self._penalty, self.coarsening) for front in fronts]
+        return [self._score(front) for front in fronts]
 
-    def score(self, fits: Fits) -> Float[np.ndarray, " candidates"]:
-        """Scores of candidates from their fits alone."""
-        return _criterion_of(fits, self._penalty, self.coarsening)
+    def _score(self, front: ParetoFront) -> Float[np.ndarray, " candidates"]:
+        """Scores of all candidates, with rows that are weighted where their noise is known.
+
+        The weights depend on the model. Those of the leading candidate serve all, and are updated
+        until the leader stays the same.
+        """
+        problem = front.rows
+        masks = np.array([np.isin(problem.term_names, c.terms) for c in front.candidates])
+        equation = problem.equations.index(front.equation)
+        theta, target = problem.train_theta, problem.train_target(equation)
+        n_rows, leader = float(len(target)), -1
+        n_effective = (
+            n_rows if self.coarsening is None else n_rows / (1.0 + n_rows / self.coarsening)
+        )
+        penalties = np.array(
+            [self._penalty(c.terms, n_effective, problem.library) for c in front.candidates]
+        )
+        for _ in range(MAX_ROUNDS):
+            squares, coef = _fits(theta, target, masks)
+            squares = np.maximum(squares, FLOOR * (target @ target))
+            scores = n_effective * np.log(squares / n_rows) + penalties
+            if problem.noisy is None or int(np.argmin(scores)) == leader:
+                break
+            leader = int(np.argmin(scores))
+            white = whitened_rows(problem, masks[leader], coef[leader])
+            theta, target = white.theta, white.target
+        return scores
 
     def _penalty(self, terms: Sequence[str], n_rows: float, library: Library) -> float:
         return len(terms) * log(n_rows) + 2.0 * self.gamma * log_supports(library, terms)
@@ -96,44 +102,6 @@ def log_supports(library: Library, terms: Sequence[str]) -> float:
     degrees = library.degrees
     highest = max((degrees[library.index(name)] for name in terms), default=0)
     return log(comb(int((degrees <= highest).sum()), len(terms)))
-
-
-Penalty = Callable[[Sequence[str], float, Library], float]
-
-
-def _criterion(
-    front: ParetoFront, penalty: Penalty, coarsening: float | None = None
-) -> Float[np.ndarray, " candidates"]:
-    """The criterion of every candidate, its rows weighted where their noise is known.
-
-    The weights depend on the model. Those of the leading candidate serve all, and are updated until
-    the leader stays the same.
-    """
-    problem = front.rows
-    masks = np.array([np.isin(problem.term_names, c.terms) for c in front.candidates])
-    equation = problem.equations.index(front.equation)
-    theta, target = problem.train_theta, problem.train_target(equation)
-    terms, leader = [candidate.terms for candidate in front.candidates], -1
-    for _ in range(MAX_ROUNDS):
-        squares, coef = _fits(theta, target, masks)
-        fits = Fits(problem.library, terms, front.errors, squares, len(target))
-        scores = _criterion_of(fits, penalty, coarsening, FLOOR * (target @ target))
-        if problem.noisy is None or int(np.argmin(scores)) == leader:
-            break
-        leader = int(np.argmin(scores))
-        white = whitened_rows(problem, masks[leader], coef[leader])
-        theta, target = white.theta, white.target
-    return scores
-
-
-def _criterion_of(
-    fits: Fits, penalty: Penalty, coarsening: float | None = None, floor: float = FLOOR
-) -> Float[np.ndarray, " candidates"]:
-    """n log(RSS / n) + penalty of every candidate. floor: of RSS; the default is for norm 1."""
-    n_rows = float(fits.n_rows)
-    n_effective = n_rows if coarsening is None else n_rows / (1.0 + n_rows / coarsening)
-    penalties = np.array([penalty(terms, n_effective, fits.library) for terms in fits.terms])
-    return n_effective * np.log(np.maximum(fits.squares, floor) / n_rows) + penalties
 
 
 def _fits(
@@ -202,20 +170,11 @@ class Knee:
         return "d_log" if self.scale == "log" else "d_pareto"
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        pairs = [(front, front.rows.library) for front in fronts]
-        return [self._score(front.errors, front.sizes, len(library)) for front, library in pairs]
+        return [self._score(front) for front in fronts]
 
-    def score(self, fits: Fits) -> Float[np.ndarray, " candidates"]:
-        """Scores of candidates from their fits alone."""
-        return self._score(fits.errors, fits.sizes, len(fits.library))
-
-    def _score(
-        self,
-        errors: Float[np.ndarray, " candidates"],
-        sizes: Float[np.ndarray, " candidates"],
-        n_terms: int,
-    ) -> Float[np.ndarray, " candidates"]:
-        norm = float(n_terms) if self.n_norm == "library" else float(sizes.max()) + 1.0
+    def _score(self, front: ParetoFront) -> Float[np.ndarray, " candidates"]:
+        errors, sizes, library = front.errors, front.sizes, front.rows.library
+        norm = float(len(library) if self.n_norm == "library" else sizes.max() + 1.0)
         if self.scale == "linear":
             return np.hypot(errors, sizes / norm)
         height = np.log(np.maximum(errors, FLOOR))

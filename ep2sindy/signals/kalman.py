@@ -8,10 +8,10 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.numbers import least_beside_grid, zero_to_one
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.values import read_only
-from ep2sindy.signals.kernels import likelihood, likelihoods, smooth
+from ep2sindy.signals.wiener import WienerProcess
 
 # The range extends from a memory of about 200 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
@@ -19,7 +19,7 @@ LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
 # Finer than data can determine: over 1000 samples the most likely ratio scatters by 0.03 or more.
 LOG10_RATIO_TOLERANCE = 0.01
 
-# Three samples start the filter; at least two more are needed to tell noise from signal.
+# Three samples determine a parabola; at least two more are needed to tell noise from signal.
 MIN_SAMPLES = 5
 
 
@@ -80,19 +80,17 @@ class KalmanSmoother:
         Raises ValueError for fewer than five samples.
         """
         steps, step_s = _unit_steps(t, values)
-        columns = np.ascontiguousarray(values.T)  # the kernels read one after the other
-        spread = columns.max(axis=1) - columns.min(axis=1)
-        columns = (columns - columns[:, :1]) / zero_to_one(spread)[:, None]
-        signal, slope = np.empty((2, *values.shape))
-        noise_std, log10_ratio = np.empty(len(columns)), self._ratios(steps, columns.T, step_s)
-        for j, (column, ratio) in enumerate(
-            zip(columns, (10.0**log10_ratio).tolist(), strict=True)
-        ):
-            signal[:, j : j + 1], slope[:, j : j + 1] = smooth(steps, column[:, None], ratio)
-            noise_std[j] = np.sqrt(likelihood(steps, column, ratio)[1])
+        process, spread = WienerProcess.at(steps), values.max(axis=0) - values.min(axis=0)
+        columns = (values - values[0]) / zero_to_one(spread)
+        signal, noise_std = np.empty(values.shape), np.empty(len(spread))
+        log10_ratio = self._ratios(process, columns, step_s)
+        for j, ratio in enumerate((10.0**log10_ratio).tolist()):
+            column = columns[:, j : j + 1]
+            signal[:, j : j + 1] = process.signal(column, ratio)
+            noise_std[j] = np.sqrt(process.likelihood(column, ratio)[1][0])
         return KalmanEstimate(
             smoothed=values[0] + spread * signal,
-            derivative=spread * slope / step_s,
+            derivative=spread * process.slope(signal) / step_s,
             noise_std=spread * noise_std,
             log10_ratio=log10_ratio,
         )
@@ -109,13 +107,13 @@ class KalmanSmoother:
         """Raises ValueError for fewer than five samples."""
         return self.estimate(t, values).derivative
 
-    def _ratios(self, steps: np.ndarray, values: np.ndarray, step_s: float) -> np.ndarray:
+    def _ratios(self, process: WienerProcess, values: np.ndarray, step_s: float) -> np.ndarray:
         if self.log10_ratio is not None:
             return np.full(values.shape[1], self.log10_ratio)
         bounds = ratio_bounds(
             self.finest_s, self.coarsest_s, step_s, (LOG10_RATIO_MIN, LOG10_RATIO_MAX)
         )
-        return most_likely_ratios(steps, values, *bounds)
+        return most_likely_ratios(process, values, *bounds)
 
 
 def ratio_bounds(
@@ -134,37 +132,30 @@ def ratio_bounds(
 
 
 def most_likely_ratios(
-    steps: Float[np.ndarray, " steps"],
+    process: WienerProcess,
     values: Float[np.ndarray, "samples columns"],
     lowest: float = LOG10_RATIO_MIN,
     highest: float = LOG10_RATIO_MAX,
 ) -> Float[np.ndarray, " columns"]:
-    """log10 of the noise ratio of greatest likelihood for each column, within bounds.
-
-    The likelihood may be flat or have several maxima: a grid of whole decades finds the
-    highest one, and a bounded search between its neighbours refines it.
-    """
-    from scipy.optimize import minimize_scalar  # imported only when the ratio is estimated
-
+    """log10 of the noise ratio of greatest likelihood for each column, within bounds."""
+    if not values.shape[1]:
+        return np.empty(0)  # LAPACK takes no empty right-hand sides
     decades = np.append(np.arange(lowest, highest, 1.0), highest)
-    on_grid = -likelihoods(steps, np.ascontiguousarray(values), 10.0**decades)
-    ratios = decades[on_grid.argmin(axis=1)]
-    columns = np.ascontiguousarray(values.T)
-    for j, (column, best) in enumerate(zip(columns, on_grid.argmin(axis=1).tolist(), strict=True)):
-        found = minimize_scalar(
-            partial(_misfit, steps, column),
-            bounds=(decades[max(best - 1, 0)], decades[min(best + 1, len(decades) - 1)]),
-            method="bounded",
-            options={"xatol": LOG10_RATIO_TOLERANCE},
+    on_grid = np.stack([-process.likelihood(values, 10.0**decade)[0] for decade in decades])
+    ratios = np.empty(values.shape[1])
+    for j, misfits in enumerate(on_grid.T):
+        column = values[:, j : j + 1]
+        ratios[j] = least_beside_grid(
+            partial(_misfit, process, column),
+            decades,
+            misfits,
+            tolerance=LOG10_RATIO_TOLERANCE,
         )
-        # The bounded search never tries the bounds themselves, so the grid point may be better.
-        if found.fun < on_grid[j, best]:
-            ratios[j] = found.x
     return ratios
 
 
-def _misfit(steps: np.ndarray, column: np.ndarray, log10_ratio: float) -> float:
-    return -likelihood(steps, column, 10.0**log10_ratio)[0]
+def _misfit(process: WienerProcess, column: np.ndarray, log10_ratio: float) -> float:
+    return -float(process.likelihood(column, 10.0**log10_ratio)[0][0])
 
 
 def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> None:

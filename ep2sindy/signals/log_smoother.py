@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 from scipy.linalg import cholesky_banded, solveh_banded
-from scipy.optimize import minimize_scalar
 
+from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.kalman import check_memory_bounds, ratio_bounds
+from ep2sindy.signals.wiener import third_differences
 
 # Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
 # time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.
@@ -82,9 +83,9 @@ class LogSmoother:
         _check(t, x)
         step_s = (t[-1] - t[0]) / (len(t) - 1)
         mean = float(x.mean())
-        y, penalty = x / mean, _roughness(t / step_s)
+        y, penalty = x / mean, _roughness(np.diff(t) / step_s)
         limits = (LOG10_RATIO_MIN, LOG10_RATIO_MAX)
-        ratio, found = _most_likely(
+        ratio, found = _best_mode(
             y, penalty, *ratio_bounds(self.finest_s, self.coarsest_s, step_s, limits)
         )
         log = found.log + np.log(mean)
@@ -109,29 +110,28 @@ class _Mode:
     misfit: float
 
 
-def _most_likely(
+def _best_mode(
     y: np.ndarray, penalty: np.ndarray, lowest: float, highest: float
 ) -> tuple[float, _Mode]:
     """Ratio of greatest likelihood, and the mode of the posterior for it.
 
-    A grid of decades down from the highest ratio is followed by a bounded search around the best.
-    y: in units of its mean. Each search for a mode starts from the previous mode.
+    y: in units of its mean. The decades go down from the highest ratio, and each search for a mode
+    starts from the previous mode.
     """
     decades = np.append(np.arange(highest, lowest, -1.0), lowest)
     modes, log = [], np.log(np.maximum(y, FLOOR))
     for decade in decades:
         modes.append(_mode(y, penalty, decade, log))
         log = modes[-1].log
-    best = int(np.argmin([mode.misfit for mode in modes]))
-    search = minimize_scalar(
-        lambda ratio: _mode(y, penalty, ratio, modes[best].log).misfit,
-        bounds=(decades[min(best + 1, len(decades) - 1)], decades[max(best - 1, 0)]),
-        method="bounded",
-        options={"xatol": LOG10_RATIO_TOLERANCE},
+    misfits = np.array([mode.misfit for mode in modes])
+    start = modes[int(misfits.argmin())].log
+    ratio = least_beside_grid(
+        lambda ratio: _mode(y, penalty, ratio, start).misfit,
+        decades,
+        misfits,
+        tolerance=LOG10_RATIO_TOLERANCE,
     )
-    if search.fun < modes[best].misfit:
-        return float(search.x), _mode(y, penalty, search.x, modes[best].log)
-    return float(decades[best]), modes[best]
+    return ratio, _mode(y, penalty, ratio, start)
 
 
 def _mode(y: np.ndarray, penalty: np.ndarray, log10_ratio: float, log: np.ndarray) -> _Mode:
@@ -162,25 +162,20 @@ def _squares(y: np.ndarray, prior: np.ndarray, log: np.ndarray) -> float:
         return float(np.square(y - np.exp(log)).sum() + log @ _times(prior, log))
 
 
-def _roughness(t: np.ndarray) -> np.ndarray:
+def _roughness(steps: np.ndarray) -> np.ndarray:
     """Lower diagonals of the matrix of the integral of the squared third derivative.
 
     The matrix is a quadratic form of the samples. It is built from third divided differences, each
     weighted by a third of the span of its four samples.
 
-    t: (samples,) in mean steps. Returns (4, samples).
+    steps: (samples - 1,) in mean steps. Returns (4, samples).
     """
-    n = len(t)
-    four = np.stack([t[k : n - 3 + k] for k in range(4)])
-    weights = np.empty((4, n - 3))
-    for k in range(4):
-        others = np.delete(four, k, axis=0)
-        weights[k] = 6.0 / np.prod(four[k] - others, axis=0)
-    weights *= np.sqrt((four[3] - four[0]) / 3.0)
-    diagonals = np.zeros((4, n))
+    n = len(steps) - 2
+    weights = third_differences(steps) * np.sqrt((steps[:-2] + steps[1:-1] + steps[2:]) / 3.0)
+    diagonals = np.zeros((4, n + 3))
     for lower in range(4):
         for k in range(4 - lower):
-            diagonals[lower, k : n - 3 + k] += weights[k] * weights[k + lower]
+            diagonals[lower, k : k + n] += weights[k] * weights[k + lower]
     return diagonals
 
 

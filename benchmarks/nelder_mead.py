@@ -1,4 +1,4 @@
-"""Integral least squares without gradients, by the Nelder-Mead simplex."""
+"""Integral least squares as in the thesis, to compare with: Nelder-Mead and scipy's odeint."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CUBIC = np.arange(3, -1, -1)  # powers of a cubic, in the order of a window batc
 
 @dataclass(frozen=True)
 class NelderMead:
-    """Method of the thesis, for comparison: Nelder-Mead on the scalings, odeint per window.
+    """Method of `ep.refine` as in the thesis: Nelder-Mead on the scalings, odeint per window.
 
     Initial states must come from the data; they are too many for a simplex.
     Source: thesis II-F.
