@@ -9,11 +9,8 @@ from matplotlib.figure import Figure
 from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.figures.maps import (
     ABSENT,
-    COUNT_COLOURS,
     GAP,
     HALF,
-    SHARE_COLOURS,
-    SINK,
     coefficient_maps,
     quality_maps,
     regime_map,
@@ -150,17 +147,6 @@ def test_coefficients_fade_to_grey_with_r2_and_the_share_of_bootstraps(
     assert HALF in legend(coefficients)
 
 
-def test_points_over_one_axis_fade_as_maps_do() -> None:
-    for r, share in ((0, 0.25), (1, 1.0)):
-        figure = coefficient_maps(study().isel(r=r, drop=True))
-        panels = np.array(figure.axes).reshape(2, -1)
-        sink, none = panels[0, -1].collections[1], panels[1, 0].collections[0]
-        shade = np.array(to_rgba(ABSENT)) + 0.8 * share * np.subtract(SINK, to_rgba(ABSENT))
-        assert sink.get_facecolor() == pytest.approx(np.tile(shade, (4, 1)), abs=1e-6)
-        assert none.get_facecolor() == pytest.approx(np.tile(to_rgba(ABSENT), (2, 1)), abs=1e-6)
-        assert HALF in legend(figure)
-
-
 def test_without_bootstraps_r2_alone_fades() -> None:
     result = study()
     result["inclusion"] *= np.nan
@@ -169,13 +155,6 @@ def test_without_bootstraps_r2_alone_fades() -> None:
     assert np.array(alphas) == pytest.approx(
         np.repeat([0.8, 0.0], 3)[:, None, None] + np.zeros(16).reshape(4, 4)
     )
-
-
-def test_maps_have_the_proportions_of_the_thruster(coefficients: Figure, quality: Figure) -> None:
-    for figure in (coefficients, quality):
-        for ax, _ in maps(figure):
-            assert ax.get_aspect() == 1.0
-            assert ax.get_xlim() == pytest.approx((-0.05, 2.45))  # cm: half a cell around
 
 
 def test_the_channel_is_drawn_where_it_is_and_leaves_the_limits() -> None:
@@ -264,39 +243,6 @@ def test_quality_is_of_the_training_rows_where_none_are_held_out() -> None:
 
 def test_quality_maps_count_what_became_of_the_points(quality: Figure) -> None:
     assert legend(quality) == ["fitted (16)", "no plasma (4)"]
-
-
-def test_where_every_point_is_fitted_there_is_no_panel_for_it() -> None:
-    figure = quality_maps(study().isel(z=slice(0, 4)))
-    titles = {ax.get_title() for ax, _ in maps(figure)}
-    assert len(titles) == 4
-    assert "status of the points" not in titles
-    assert not figure.legends
-
-
-@pytest.mark.parametrize("cut", [{}, {"r": 1}], ids=str)
-def test_the_status_of_the_points_has_its_scale(cut: dict[str, int]) -> None:
-    figure = quality_maps(study().isel(cut, drop=True))
-    figure.canvas.draw()
-    (ax,) = (ax for ax in figure.axes if ax.get_title() == "status of the points")
-    assert any(label.get_visible() and label.get_text() for label in ax.get_xticklabels())
-
-
-def test_no_value_is_drawn_in_a_shade_near_white(regime: Figure) -> None:
-    for scale in (SHARE_COLOURS, COUNT_COLOURS):
-        assert scale(np.linspace(0.0, 1.0, 50))[:, :3].min(axis=1).max() < 0.8
-    (ax, _) = maps(regime)[1]
-    assert ax.collections[0].get_cmap() == SHARE_COLOURS
-
-
-@pytest.mark.parametrize(("cut", "ends"), [({"r": 1}, (-0.05, 2.45)), ({"z": 1}, (3.383, 5.117))])
-def test_over_one_axis_every_panel_ends_with_the_outermost_cells(
-    cut: dict[str, int], ends: tuple[float, float]
-) -> None:
-    result = study().isel(cut, drop=True)
-    figures = coefficient_maps(result), quality_maps(result), regime_map(grouped(result))
-    for ax in (ax for figure in figures for ax in figure.axes):
-        assert ax.get_xlim() == pytest.approx(ends, abs=1e-3)
 
 
 @pytest.mark.parametrize("cut", [{"r": 1}, {"z": 1}, {"z": [1], "r": [1]}, {"r": [1]}], ids=str)

@@ -25,21 +25,13 @@ ROOT = Path(__file__).resolve().parents[1]
         (["exp=breathing"], "'exp=breathing' adds to the config, which needs a plus: write +exp="),
         (["breathing"], "must be KEY=VALUE, such as +exp=discover or seed=1: 'breathing' came; +e"),
         (["inspct", "run.csv"], "'inspct' came; near it is the command inspect, which stands fi"),
-        (["+exp=discover", "search=joined"], "no choice of search 'joined'; near it is search=jo"),
         (
             ["+exp=discover", "data=recogn"],
             "near it is data=recognised; there are file, recog",
         ),
         (["+exp=discover", "serch=joint"], "unknown key 'serch'; near it is search; there are"),
-        (["+exp=discover", "~serch"], "unknown key 'serch'; near it is search; there are"),
-        (["+exp=discover", "+serch=joint"], "unknown keys ['serch']; near it is search; there"),
         (["+exp=discover", "search.alphaa=3"], "unknown key 'search.alphaa'; search has align, c"),
-        (
-            ["+exp=weak", "search.max_trms=3"],
-            "near it is search.max_terms; search has gamma, max",
-        ),
         (["+exp=discover", "max_terms=3"], "unknown key 'max_terms'; near it is search.max_terms"),
-        (["+exp=breathing", "data.voltge=3"], "near it is data.operating_point.voltage; data has"),
         (["+exp=breathing", "seed.x=3"], "unknown key 'seed.x': seed is 0, and has no keys"),
         (
             ["+exp=discover", "data=file", "data.variables.x.name=x"],
@@ -52,9 +44,6 @@ ROOT = Path(__file__).resolve().parents[1]
         (["+exp=breathing", "prepare={a: b}"], "another kind of value there: Cannot merge"),
         (["+exp=discover", "exclude={x: [x^2]}"], "must stand in double quotes inside single ones"),
         (["+exp=discover", "--confg", "job"], "unknown option '--confg'; near it are --cfg, --con"),
-        (["+exp=discover", "--cfg", "jbo"], "options must be those of --help: argument --cfg"),
-        (["-m", "+exp=breathin,breathing"], "there is no experiment 'breathin'; near it is"),
-        (["+exp=breathin", "serch=joint"], "there is no experiment 'breathin'; near it is"),
         (["+exp=discover", "serch=joint", "sede=1"], "unknown key 'serch'; --cfg job shows those"),
     ],
 )

@@ -139,11 +139,6 @@ def test_intervals_follow_the_covariance() -> None:
         replace(law(), covariance=None).intervals()
 
 
-def test_the_text_names_every_coefficient() -> None:
-    assert law().text().splitlines()[3].startswith("y: x = ")
-    assert "OperatingLaw of 4 coefficients in ['a', 'b'], 12 numbers, 9 points" in repr(law())
-
-
 def test_points_left_out_live_by_the_law_of_the_others() -> None:
     functions = fit().functions(1)
     for found in (leave_one_out(fit(), functions), leave_one_out(fit(), functions, start=law())):
@@ -202,12 +197,6 @@ def test_a_record_must_hold_six_periods() -> None:
     still = replace(run, states=1.0 + 1e-3 * np.random.default_rng(0).normal(size=run.states.shape))
     with pytest.raises(ValueError, match="its record has no period"):
         OperatingRecord.of({"a": 1.0, "b": 0.0}, still)
-
-
-def test_a_cycle_is_no_status() -> None:
-    record = records()[0]
-    with pytest.raises(ValueError, match=r"status must be text, .*: a Cycle came; .*\.of\("):
-        OperatingRecord(record.parameters, record.run, record.cycle)  # as in version 0.2
 
 
 def test_a_fit_needs_terms_of_every_state_and_no_constraint() -> None:

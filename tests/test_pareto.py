@@ -75,13 +75,6 @@ def test_a_size_whose_best_does_not_beat_smaller_ones_is_left_out() -> None:
     assert front_order(sizes, errors, depth=2) == [2, 1, 3, 4]
 
 
-def test_a_front_without_depth_is_refused() -> None:
-    problem = exact_problem(damped_oscillator())
-    supports = pooled_supports(problem, BestSubset(), Bootstraps(n=0), rng=np.random.default_rng(0))
-    with pytest.raises(ValueError, match="depth must be a whole number, one or more: 0 came"):
-        pareto_front(problem, supports[0], depth=0)
-
-
 def test_r2_takes_the_data_as_truth() -> None:
     truth = np.array([0.0, 1.0, 2.0, 3.0])
     prediction = np.array([truth, np.full(4, 1.5), np.zeros(4)])

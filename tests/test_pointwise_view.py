@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from ep2sindy.discovery.regimes import find_regimes
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import draw
-from ep2sindy.report.screen import WIDTH, Screen
+from ep2sindy.report.screen import Screen
 from ep2sindy.studies.pointwise import Outcome
 
 TERMS = ["1", "n_n", "n_i*u_iz"]
@@ -109,41 +109,10 @@ def test_medians_come_with_their_spread_and_the_share_of_points(
         assert "terms that act, with medians over the regime's points that have them" in said
 
 
-def test_an_equation_in_which_no_term_acts_is_zero(found: Outcome, tmp_path: Path) -> None:
-    assert "\nn_i' = 0\n" in printed(found, tmp_path)
-    assert "<mo>=</mo><mrow><mn>0</mn></mrow></mrow></math>" in page(found)
-
-
-def test_the_table_of_regimes_fits_the_log(tmp_path: Path) -> None:
-    result = study()
-    result["coef"][1, 0, 0] = [-1.23e22, -3.45e22, -4.57e22]
-    result = result.assign_coords(term=["1", "n_n", "n_i*n_n*R_ion"])
-    lines = printed(outcome(result), tmp_path).splitlines()
-    assert max(map(len, lines)) <= WIDTH
-    assert any("-4.21e+22 │ -1.94e+22 │ m^-3 s^-1" in line for line in lines)
-
-
 def test_points_of_low_confidence_are_counted(found: Outcome, tmp_path: Path) -> None:
     for said in (printed(found, tmp_path), page(found)):
         assert "3 regimes; confidence below 0.5 at 9% of points" in said
         assert "Regime 1: 3 points, confidence 0.67, below 0.5 at 33%" in said
-
-
-def test_the_page_says_that_a_regime_need_not_be_connected(found: Outcome) -> None:
-    assert "need not be connected" in page(found)
-
-
-@pytest.mark.parametrize(
-    ("cut", "own", "other"),
-    [({}, "Grey: the term is not in", "No mark:"), ({"r": 1}, "No mark:", "Grey:")],
-    ids=str,
-)
-def test_a_caption_describes_the_figure_over_the_axes(
-    cut: dict[str, int], own: str, other: str
-) -> None:
-    html = page(outcome(study().isel(cut, drop=True)))
-    assert own in html
-    assert other not in html
 
 
 def test_a_study_without_any_term_has_no_table_of_them() -> None:

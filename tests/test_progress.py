@@ -1,12 +1,8 @@
 """Stages of long work: who is told of them, how bars look, and that results know nothing of it."""
 
-import fcntl
 import inspect
 import io
-import os
-import struct
 import sys
-import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -153,28 +149,6 @@ def test_a_terminal_sees_label_count_and_unit_and_then_nothing(
         advance(3)
     assert terminal.getvalue().endswith("\r")
     assert not terminal.getvalue().split("\r")[-2].strip()
-
-
-@pytest.mark.parametrize("columns", [0, 100])
-def test_a_terminal_that_does_not_know_its_size_sees_bars(
-    columns: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Such as one of a container, which reports no rows."""
-    reader, terminal = os.openpty()
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 0, columns, 0, 0))
-    with os.fdopen(reader, "rb", buffering=0) as shown, os.fdopen(terminal, "w") as stream:
-        monkeypatch.setattr(sys, "stderr", stream)
-        with Bars().stage(3, "system", "refined"):
-            stream.write("end\n")  # there is something to read in any case
-            stream.flush()
-        assert b"| 0/3 system [" in shown.read(4096)
-
-
-def test_a_stage_that_cannot_be_counted_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    with Bars().stage(None, "", "free runs"):
-        assert terminal.getvalue().strip() == "free runs ..."
 
 
 def test_true_means_bars_and_a_function_is_told() -> None:

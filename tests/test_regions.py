@@ -83,26 +83,3 @@ def test_noise_is_a_share_of_the_rms_of_every_point() -> None:
     assert share == pytest.approx(np.full(share.shape, 0.05), rel=5 * 0.016)
     assert noisy.field["n_i"].attrs == made.field["n_i"].attrs
     check_field(noisy.field)
-
-
-def test_no_noise_changes_nothing() -> None:
-    made = small()
-    assert made.noisy(0.0, rng=np.random.default_rng(0)).field.equals(made.field)
-
-
-@pytest.mark.parametrize(
-    "settings", [{"n_z": 1}, {"n_samples": 1}, {"transition": 0.0}, {"dt_s": 0.0}]
-)
-def test_a_field_that_cannot_be_is_refused(settings: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="a field of three regions needs"):
-        three_regions(**{"n_samples": 10, **settings})  # type: ignore[arg-type]
-
-
-def test_two_regions_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"\['anode', 'exit'\]"):
-        three_regions({name: REGIONS[name] for name in ("anode", "exit")})
-
-
-def test_negative_noise_is_refused() -> None:
-    with pytest.raises(ValueError, match="noise must be zero or more: -0.1"):
-        small().noisy(-0.1, rng=np.random.default_rng(0))

@@ -10,7 +10,7 @@ from ep2sindy.figures.series import (
     spectrum_figure,
     trajectory_figure,
 )
-from ep2sindy.figures.style import OFF_SCALE, STOPS, find_exits, frame_limits
+from ep2sindy.figures.style import OFF_SCALE, find_exits, frame_limits
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.free_run import free_run
 from ep2sindy.model.model import SparseModel
@@ -63,14 +63,6 @@ def test_phase_portraits_leave_no_empty_panel(
     assert [ax.get_title().partition("\n")[0] for ax in figure.axes] == list(models)
     labelled = [ax for ax in figure.axes if ax.get_xlabel()]
     assert len(labelled) == n_columns  # the lowest of every column
-
-
-def test_lines_end_with_the_duration(oscillation: Trajectory) -> None:
-    figure = trajectory_figure(oscillation, rollouts(oscillation, 3), duration_s=5.0)
-    lines = [line for ax in figure.axes for line in ax.lines if len(line.get_xdata()) > 1]  # type: ignore[arg-type]
-    ends = [line.get_xdata()[-1] for line in lines]  # type: ignore[index]
-    assert max(ends) <= 5.0
-    assert min(ends) > 5.0 - 2 * oscillation.dt_s
 
 
 def test_right_hand_sides_stand_in_the_order_of_the_data(oscillation: Trajectory) -> None:
@@ -160,17 +152,6 @@ def test_times_of_a_run_count_from_its_start(oscillation: Trajectory) -> None:
     assert {ax.get_xlabel() for ax in figure.axes} == {"time since noon (µs)"}
     data = figure.axes[0].lines[0].get_xdata()
     assert data == pytest.approx(oscillation.t[oscillation.t <= 20.0])  # type: ignore[comparison-overlap]
-
-
-def test_a_run_that_stops_inside_a_panel_is_marked_there(oscillation: Trajectory) -> None:
-    stopped = rolled(oscillation.t[:100], 1.2 * oscillation.states[:100], diverged=True)
-    figure = trajectory_figure(oscillation, {"model": stopped}, duration_s=20.0)
-    for ax, end in zip(figure.axes, 1.2 * oscillation.states[99], strict=True):
-        (cross,) = [line for line in ax.lines if line.get_label() == f"_{STOPS}"]
-        assert cross.get_xydata().tolist() == [[oscillation.t[99], end]]  # type: ignore[union-attr]
-    early = trajectory_figure(oscillation, {"model": stopped}, duration_s=2.0)
-    labels = [text.get_text() for text in early.legends[0].get_texts()]
-    assert labels == ["data"]  # it has not stopped yet
 
 
 def test_one_state_has_no_phase_portrait(oscillation: Trajectory) -> None:

@@ -84,16 +84,6 @@ def test_whole_numbers_of_numpy_are_taken_and_kept_as_they_are_written() -> None
     assert ep.polynomial(["x"], degree=two).names == ("1", "x", "x^2")
 
 
-def test_a_split_holds_out_what_it_says_or_is_refused() -> None:
-    for fraction in (1.0, 2.0, -0.1, float("nan")):
-        with pytest.raises(ValueError, match=r"test_fraction must lie in \[0, 1\): "):
-            ep.RandomSplit(fraction)
-        with pytest.raises(ValueError, match=r"test_fraction must lie in \[0, 1\): "):
-            ep.BlockSplit(fraction)
-    with pytest.raises(ValueError, match="n_blocks must be a whole number, one or more: 0 came"):
-        ep.BlockSplit(n_blocks=0)
-
-
 WRONG_KINDS = [
     (lambda: ep.WeightedWeak(weak=ep.Differential()), "weak must be a Weak, such as ep.Weak"),
     (lambda: ep.Weak(smoother=None), r"smoother must be a Smoother, such as ep.signals.Kalman"),

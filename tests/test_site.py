@@ -51,15 +51,6 @@ def test_a_docstring_becomes_paragraphs_and_a_table(text: str, expected: str) ->
     assert markdown_of(text, {"t", "x"}) == expected.replace("TABLE", table)
 
 
-def test_bars_do_not_end_a_cell() -> None:
-    markdown = pytest.importorskip("markdown", reason="the site's tools come with the extra `docs`")
-    docstrings = run_path(str(ROOT / "docs" / "docstrings.py"))
-    text = docstrings["markdown_of"]("t: |x| or `a | b`, <i>.", {"t"})
-    cells = re.findall("<td>(.*)</td>", markdown.markdown(text, extensions=["tables"]))
-    assert cells == ["<code>t</code>", "|x| or <code>a | b</code>, &lt;i&gt;."]
-    assert docstrings["first_sentence"]("The norm\n|x|. More.\n\nx: in m.") == r"The norm \|x\|."
-
-
 def test_the_index_says_of_every_name_what_it_is() -> None:
     pytest.importorskip("mkdocs", reason="the site's tools come with the extra `docs`")
     site = run_path(str(ROOT / "docs" / "site.py"))

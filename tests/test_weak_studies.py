@@ -21,7 +21,7 @@ from ep2sindy.runtime.parallel import Serial
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies import frontier as frontiers
 from ep2sindy.studies import weak_windows
-from ep2sindy.studies.weak import Setting, boxes_grid, fit_settings, fit_terms
+from ep2sindy.studies.weak import Setting, boxes_grid, fit_settings
 from ep2sindy.studies.weak_windows import (
     coefficient_error,
     true_library,
@@ -90,23 +90,6 @@ def test_without_noise_smooth_windows_find_the_coefficients() -> None:
             system, system.trajectory(), setting, rng=np.random.default_rng(0)
         )
         assert error < 1e-8  # the bump falls to 1e-10 at its edge; the integration has 1e-10
-
-
-def test_windows_of_two_points_are_the_differential_form() -> None:
-    run = sampled().trajectory(noise=0.01, rng=np.random.default_rng(0))
-    found = fit_terms(
-        [run], true_library(lotka_volterra()), TERMS, boxes(500, 2), rng=np.random.default_rng(1)
-    )
-    rng = np.random.default_rng(1)
-    x, y = run.states.T
-    columns = {"x": np.stack([x, x * y], axis=1), "y": np.stack([y, x * y], axis=1)}
-    for state, theta in columns.items():
-        first = Boxes(n_windows=500, n_points=2).windows(run.t, x, rng=rng).first
-        values = run.columns([state])[:, 0]
-        quotient = (values[first + 1] - values[first]) / run.dt_s
-        means = 0.5 * (theta[first] + theta[first + 1])
-        coef = dict(zip(TERMS[state], np.linalg.lstsq(means, quotient)[0], strict=True))
-        assert found[state][0].coef_by_term == pytest.approx(coef, rel=1e-9)
 
 
 def test_more_and_longer_windows_bear_more_noise() -> None:
