@@ -86,14 +86,6 @@ def test_a_free_run_is_drawn_over_its_record_whatever_their_order() -> None:
     assert model.get_ydata() == pytest.approx(data.get_ydata(), abs=1e-5)
 
 
-def test_a_free_run_that_diverges_leaves_the_panels_as_the_data_are() -> None:
-    away = model_of({"x": {"x": 5.0}, "y": {"y": 5.0}})
-    figure = ep.plot(ep.free_run(away, record()))
-    labels(figure)
-    low, high = figure.axes[0].get_ylim()
-    assert high - low < 3.0 * np.ptp(record().states[:, 0])
-
-
 def test_a_cycle_is_drawn_closed_with_runs_that_reach_it() -> None:
     cycle = ep.limit_cycle(oscillator(3.0, 0.4), np.array([2.0, 0.0]), period_s=2.1)
     assert cycle is not None

@@ -11,8 +11,9 @@ from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import draw
 from ep2sindy.report.screen import Screen
 from ep2sindy.studies.pointwise import Outcome
+from tests.models import point_study
 
-TERMS = ["1", "n_n", "n_i*u_iz"]
+TERMS = {"1": "m^-3 s^-1", "n_n": "s^-1", "n_i*u_iz": "m^-1"}
 
 
 def study() -> xr.Dataset:
@@ -27,32 +28,12 @@ def study() -> xr.Dataset:
     coef[1, 0, 1] = 1e23
     coef[1, 1, 3:], weight[1, 1, 3:] = 3e4, 1.0
     coef[1, 0, 5:7], weight[1, 0, 5:7], weight[1, 1, 5:7] = 1e20, 0.05, 0.95
-    status = np.zeros(12, dtype=np.int8)
-    status[-1] = 1
-    valid = np.where(status == 0, 1.0, np.nan)
     draws = np.stack([weight] * 2)
     draws[:, 1, :, 0] = [0.0, 1.0, 0.0]  # the bootstraps put this point into the other regime
-    dims = ("equation", "term", "z", "r")
-    on_grid = {name: (v * valid).reshape(*v.shape[:-1], 4, 3) for name, v in (
-        ("coef", coef), ("weight", weight), ("inclusion", np.abs(weight)), ("weight_draws", draws),
-        ("n_terms", (coef != 0.0).sum(axis=1)),
-    )}  # fmt: skip
-    return xr.Dataset(
-        {
-            **{name: (dims, on_grid[name]) for name in ("coef", "weight", "inclusion")},
-            "weight_draws": (("draw", *dims), on_grid["weight_draws"]),
-            "n_terms": (("equation", "z", "r"), on_grid["n_terms"]),
-            "status": (("z", "r"), status.reshape(4, 3)),
-        },
-        coords={
-            "equation": ["n_i", "n_n"],
-            "term": TERMS,
-            "coef_units": (dims[:2], [["m^-3 s^-1", "s^-1", "m^-1"]] * 2),
-            "z": np.linspace(0.0, 0.03, 4),
-            "r": np.linspace(0.04, 0.05, 3),
-        },
-        attrs={"no_fit": ""},
-    )
+    coef, weight, draws = (v.reshape(*v.shape[:-1], 4, 3) for v in (coef, weight, draws))
+    lost = np.zeros((4, 3), dtype=bool)
+    lost[-1, -1] = True
+    return point_study(coef, weight, lost, terms=TERMS, share=np.abs(weight), draws=draws)
 
 
 def outcome(result: xr.Dataset, *, max_regimes: int = 4) -> Outcome:
@@ -81,14 +62,6 @@ def test_equations_without_terms_are_counted(found: Outcome, tmp_path: Path) -> 
     assert found.summary()["no_terms"] == {"n_i": 2}
     for text in (printed(found, tmp_path), page(found)):
         assert "11 fitted, 1 no plasma; no term in n_i' at 2" in text
-
-
-@pytest.mark.parametrize(("most", "limited"), [(1, True), (8, False)])
-def test_as_many_regimes_as_allowed_is_said(most: int, limited: bool, tmp_path: Path) -> None:
-    found = outcome(study(), max_regimes=most)
-    assert found.summary()["at_limit"] is limited
-    for text in (printed(found, tmp_path), page(found)):
-        assert ("as many as max_regimes allows" in text) == limited
 
 
 def test_medians_come_with_their_spread_and_the_share_of_points(

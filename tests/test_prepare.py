@@ -77,18 +77,8 @@ GAP = RAMP.assign(I_d=RAMP["I_d"].where(np.arange(N) != 70))
         (crop, RAMP, {"start_s": 0.01}, r"0.01 to 0.001999 s leaves 0 of 2000, .* 0 to 0.001999"),
         *((decimate, RAMP, {"factor": n}, f"{n} came with 2000 samples") for n in (0, -2, 2000)),
         (low_pass, RAMP, {"cutoff_Hz": 5e5}, "half the sampling rate, 500000 Hz: 500000 came"),
-        (
-            low_pass,
-            RAMP.isel(time=slice(15)),
-            {"cutoff_Hz": 1e5},
-            "of order 4 needs more than 15 samples: 15 came",
-        ),
-        (
-            low_pass,
-            RAMP.isel(time=np.r_[0:70, 71:90]),
-            {"cutoff_Hz": 1e5},
-            r"t\[70\] - t\[69\] = 2e-06 s, the mean is",
-        ),
+        (low_pass, RAMP.isel(time=slice(15)), {"cutoff_Hz": 1e5}, "of order 4 needs more than 15"),
+        (low_pass, RAMP.isel(time=np.r_[0:70, 71:90]), {"cutoff_Hz": 1e5}, r"t\[70\] - t\[69\] ="),
         (low_pass, GAP, {"cutoff_Hz": 1e5}, "I_d = nan at time = 7e-05 s"),
     ],
 )

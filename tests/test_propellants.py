@@ -173,7 +173,6 @@ def test_a_table_over_the_mean_energy_is_the_same_gas(tmp_path):
         ("T_e_eV,ionization,excitation\n1,0,0\n2,0,0\n", {}, r"must have the columns T_e_eV or"),
         (HEADER + "1,0,0,1e-13\n2,,0,1e-13\n", {}, r"4 numbers in every row: row 2 .*fill the gap"),
         (HEADER + "2,0,0,1e-13\n1,0,0,1e-13\n", {}, r"T_e_eV must increase: 1 follows 2"),
-        (HEADER + ROWS, {"mass_u": -1.0}, r"PropellantTable\.mass must be finite and positive"),
         (HEADER + ROWS, {"second_ionization_eV": 21.0}, r"needs both its column and second_ioni"),
         (
             "T_e_eV,ionization,excitation,momentum,second_ionization\n1,0,0,0,0\n9,0,0,0,1e-14\n",
@@ -218,12 +217,9 @@ def test_a_run_beyond_the_table_says_how_far_it_got():
 
 
 def test_a_charge_needs_its_rates():
-    for charges, gas in ((2, "argon"), (3, "argon")):
-        made = ep.thruster.propellant(gas)
-        with pytest.raises(
-            ValueError, match=rf"charge_states {charges} needs .* argon has .* to 1"
-        ):
-            ep.thruster.Thruster(charge_states=charges, propellant=made)
+    argon = ep.thruster.propellant("argon")
+    with pytest.raises(ValueError, match=r"charge_states 2 needs .* argon has .* to 1"):
+        ep.thruster.Thruster(charge_states=2, propellant=argon)
     with pytest.raises(
         ValueError, match=r"charge_states 2 needs rates .* XenonFits has them up to"
     ):

@@ -11,9 +11,9 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ep2sindy.figures.style import hover
-from ep2sindy.report.about import About, settings_used
+from ep2sindy.report.about import settings_used
 from ep2sindy.report.document import Equation, Picture, Section, Table, Text
-from ep2sindy.report.page import equation_mathml, page_html, powers_html
+from ep2sindy.report.page import page_html, powers_html
 from ep2sindy.report.picture import draw
 from ep2sindy.report.screen import WIDTH, Screen, rich_table
 from ep2sindy.report.tensorboard import Board
@@ -55,13 +55,6 @@ def test_a_screen_shows_what_fits_a_screen(log: str) -> None:
     for text in ("long", "n_n", "Only a picture", "caption"):
         assert text not in log
     assert max(map(len, log.splitlines())) <= WIDTH
-
-
-def test_numbers_read_alike_on_screen_and_page(log: str) -> None:
-    page = page_html("a study", SECTIONS, FIGURES)
-    for cells in (("2", "-"), ("1", "0.5")):
-        assert all(f'<td class="number">{cell}</td>' in page for cell in cells)
-        assert any(all(cell in line for cell in cells) for line in log.splitlines())
 
 
 @pytest.mark.parametrize("width", [50, 80, WIDTH])
@@ -107,29 +100,6 @@ def test_powers_are_raised_in_all_texts(text: str, html: str) -> None:
     assert powers_html(text) == html
 
 
-def test_a_line_may_break_between_two_terms_of_an_equation() -> None:
-    html = equation_mathml(Equation("n_i", {"n_i": -2.62e5, "n_i*n_n": 5.48e-14, "R": 1.0}))
-    first, *others = [f"<math{part}" for part in html.split("<math")[1:]]
-    assert "<mo>=</mo><mrow><mo>−</mo><mn>2.62</mn>" in first
-    assert [term.count("<mo>+</mo>") for term in (first, *others)] == [0, 1, 1]
-    assert "<mn>1</mn>" not in others[-1]  # a factor of one is not written
-    law = equation_mathml(Equation("L_m", {"1": 1.0}, rate=False))
-    assert "<mi>t</mi>" not in law
-    assert law.endswith("<mn>1</mn></mrow></mrow></math>")
-    assert "<mn>0</mn>" in equation_mathml(Equation("x", {}))
-
-
-def test_the_data_stand_below_the_title_and_nowhere_else() -> None:
-    said = ["simulation: oscillating", "data: a.nc; 1200 samples", "note: 1e-3"]
-    provenance = {"command": [], "commit": "", "seed": 0, "versions": {}}
-    about = About("To see.", {}, said, [], provenance, "")
-    page = page_html("a study", [], {}, about)
-    assert page.count("data: a.nc; 1200 samples") == 1
-    assert page.index("data: a.nc") < page.index("simulation: oscillating")
-    assert (about.data, about.notes) == (said[1], [said[0], said[2]])
-    assert About("", {}, ["none"], [], {}, "").data == ""
-
-
 def _hovering(text: str) -> Figure:
     figure = Figure(figsize=(4.0, 3.0))
     (line,) = figure.subplots().plot([0.0, 1.0], "o")
@@ -171,21 +141,16 @@ def test_a_template_of_ones_own_is_given_all(tmp_path: Path) -> None:
 
 
 def test_settings_read_in_words() -> None:
-    zone = {"_target_": "ep2sindy.Zone", "z": None, "r": None}
     variables = {"x": {"name": "X", "unit": "1"}, "y": {"name": None, "unit": "m"}}
     settings = {
-        "search": {"_target_": "ep2sindy.BestSubset", "max_terms": 4, "n_best": None},
-        "data": {"path": "a.csv", "variables": variables},
-        "trajectory": {"_target_": "ep2sindy.data.ZoneAverage", "zone": zone, "states": ["x"]},
+        "data": {"path": "a.csv", "variables": variables, "channel_m": None},
+        "trajectory": {"_target_": "ep2sindy.data.ZoneAverage", "states": ["x"]},
         "rollout_s": 4.0e-3,
-        "thesis": {"x": 1.0},
-        "depth": None,
         "other": 3,
     }
     assert settings_used(settings, set(settings) - {"other"}) == {
         "data": "path a.csv, variables (x (name X, unit 1))",
         "time series": "ZoneAverage (states x)",
-        "search": "BestSubset (max_terms 4)",
         "rollout s": "0.004",
     }
 

@@ -1,11 +1,9 @@
 import numpy as np
 import pytest
 
+import ep2sindy as ep
 from ep2sindy.regression import bootstraps
 from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
-from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.systems.systems import lorenz
 
 
 @pytest.mark.parametrize("block", [0, 31])
@@ -15,8 +13,8 @@ def test_a_block_must_fit(block: int) -> None:
 
 
 def test_bootstraps_draw_neighbours_together() -> None:
-    system = lorenz()
-    (problem,) = Differential().assemble(
+    system = ep.lorenz()
+    (problem,) = ep.Differential().assemble(
         [system.trajectory()], system.model.library, rng=np.random.default_rng(0)
     )
     terms = np.ones(len(system.model.library), dtype=np.bool_)
@@ -31,19 +29,19 @@ def test_bootstraps_draw_neighbours_together() -> None:
 def test_weights_of_a_long_record_are_held_for_some_draws_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    system = lorenz()
-    (problem,) = Differential().assemble(
+    system = ep.lorenz()
+    (problem,) = ep.Differential().assemble(
         [system.trajectory().window(0, 400)], system.model.library, rng=np.random.default_rng(0)
     )
     terms, held = np.ones(len(system.model.library), dtype=np.bool_), []
     together = Bootstraps(n=7).draw(problem, terms, np.random.default_rng(0))
-    resampled_sums = RegressionRows.resampled_sums
+    resampled_sums = ep.regression.RegressionRows.resampled_sums
 
-    def tell(problem: RegressionRows, weights: np.ndarray) -> np.ndarray:
+    def tell(problem: ep.regression.RegressionRows, weights: np.ndarray) -> np.ndarray:
         held.append(weights.size)
         return resampled_sums(problem, weights)
 
-    monkeypatch.setattr(RegressionRows, "resampled_sums", tell)
+    monkeypatch.setattr(ep.regression.RegressionRows, "resampled_sums", tell)
     monkeypatch.setattr(bootstraps, "MOST_WEIGHTS", 2 * problem.n_train)
     in_parts = Bootstraps(n=7).draw(problem, terms, np.random.default_rng(0))
     assert max(held) <= 2 * problem.n_train
@@ -52,9 +50,9 @@ def test_weights_of_a_long_record_are_held_for_some_draws_at_once(
 
 
 def test_blocks_never_cross_trajectories() -> None:
-    system = lorenz()
+    system = ep.lorenz()
     run = system.trajectory()
-    (problem,) = Differential().assemble(
+    (problem,) = ep.Differential().assemble(
         [run, run], system.model.library, rng=np.random.default_rng(0)
     )
     terms = np.ones(len(system.model.library), dtype=np.bool_)

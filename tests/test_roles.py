@@ -86,15 +86,14 @@ def record() -> ep.Trajectory:
     return balance(np.linspace(0.0, 40.0, 2001))
 
 
-def recipe(**changes) -> ep.Regression:
-    search = ep.BestSubset(max_terms=4, n_best=60)
-    return ep.Regression(ep.Differential(), search, ep.FreeRunScore(), depth=6, **changes)
+def refined(max_terms: int) -> ep.Regression:
+    """A search whose systems are refined and judged whole."""
+    search = ep.BestSubset(max_terms=max_terms, n_best=60)
+    return ep.Regression(search=search, selection=ep.RefinedScore(), depth=6)
 
 
 def test_a_search_under_roles_finds_the_truth_and_conserves(record):
-    found = ep.discover(record, LIBRARY, ep.Regression(
-        search=ep.BestSubset(max_terms=4, n_best=60), selection=ep.RefinedScore(), depth=6
-    ), roles=ROLES)  # fmt: skip
+    found = ep.discover(record, LIBRARY, refined(4), roles=ROLES)
     assert found.model.terms("n_i") == pytest.approx({"n_i": -A, "n_n": S, "n_i*n_n": R}, rel=1e-3)
     neutrals = {"1": M, "n_n": -S - B, "n_i*n_n": -R}
     assert found.model.terms("n_n") == pytest.approx(neutrals, rel=1e-3)
@@ -109,9 +108,7 @@ def test_a_search_under_roles_finds_the_truth_and_conserves(record):
 
 def test_an_inflow_may_be_found(record):
     roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "free"})
-    method = ep.Regression(
-        search=ep.BestSubset(max_terms=5, n_best=60), selection=ep.RefinedScore(), depth=6
-    )
+    method = refined(5)
     found = ep.discover(record, LIBRARY, method, roles=roles)
     assert found.model.terms("n_n")["1"] == pytest.approx(M, rel=1e-3)
 
@@ -141,9 +138,7 @@ def test_mass_action_takes_terms_that_contain_what_they_lower():
 
 
 def test_a_search_by_mass_action_proposes_positive_processes_alone(record):
-    method = ep.Regression(
-        search=ep.BestSubset(max_terms=4, n_best=60), selection=ep.RefinedScore(), depth=6
-    )
+    method = refined(4)
     found = ep.discover(record, LIBRARY, method, roles=MASS_ACTION)
     assert found.model.terms("n_i") == pytest.approx({"n_i": -A, "n_n": S, "n_i*n_n": R}, rel=1e-3)
     rows = ep.Differential().assemble([record], LIBRARY, rng=np.random.default_rng(0))
@@ -168,9 +163,7 @@ def test_what_is_told_is_kept_beside_what_is_found(record):
         inflow={"n_n": "known"}, nonnegative=True,
     )  # fmt: skip
     assert roles.open == ["n_n out", "n_i out", "n_n in"]
-    method = ep.Regression(
-        search=ep.BestSubset(max_terms=3, n_best=60), selection=ep.RefinedScore(), depth=6
-    )
+    method = refined(3)
     found = ep.discover(record, LIBRARY, method, roles=roles.with_known(told))
     assert {(p.role, p.term) for p in found.constraint.processes} == {
         ("n_n to n_i", "n_n"), ("n_n to n_i", "n_i*n_n")
@@ -213,13 +206,8 @@ def test_bad_roles_say_what_must_hold(make, message):
         ({"method": ep.TrajectorySearch(selection=ep.FreeRunScore())}, "keeps roles by likelihood"),
         ({"method": ep.TrajectorySearch(), "hidden": ["g"]}, "roles need samples of every state"),
         ({"method": ep.Regression()}, "a rule must judge whole systems"),
-        ({"method": recipe(), "relations": ["n_n: 1 == 2"]}, "give roles alone"),
-        (
-            {"method": ep.Regression(
-                search=ep.BestSubset(max_terms=1), selection=ep.RefinedScore()
-            )},
-            "plays all of the roles",
-        ),
+        ({"method": refined(4), "relations": ["n_n: 1 == 2"]}, "give roles alone"),
+        ({"method": refined(1)}, "plays all of the roles"),
     ],
 )  # fmt: skip
 def test_roles_that_cannot_be_kept_are_refused(record, options, message):

@@ -26,31 +26,6 @@ def test_every_public_name_stands_on_one_page_of_the_reference() -> None:
     assert all(pages)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),  # `TABLE` stands for the head of a table
-    [
-        (
-            "Sum a*b*c.\n\nt: in s. x: of `a*b`,\nat t.\nRaises ValueError for less.\n\n>>> 1\n1",
-            "Sum a\\*b\\*c.\n\nTABLE\n| `t` | in s. |\n| `x` | of `a*b`, at t. |"
-            "\n\nRaises ValueError for less.\n\n```pycon\n>>> 1\n1\n```",
-        ),
-        (  # a name at the end of a line; names together; a sentence with a colon is no name
-            "Sum.\n\nt: in s. x:\nof t, so: large. x, t: both.",
-            "Sum.\n\nTABLE\n| `t` | in s. |\n| `x` | of t, so: large. |\n| `x`, `t` | both. |",
-        ),
-        (  # where what continues is indented, the rest is a paragraph
-            "Sum.\n\nt: in s,\n    at x.\nValues are read\nwhen they are used.",
-            "Sum.\n\nTABLE\n| `t` | in s, at x. |\n\nValues are read when they are used.",
-        ),
-    ],
-)
-def test_a_docstring_becomes_paragraphs_and_a_table(text: str, expected: str) -> None:
-    pytest.importorskip("griffe", reason="the site's tools come with the extra `docs`")
-    markdown_of = run_path(str(ROOT / "docs" / "docstrings.py"))["markdown_of"]
-    table = "| name | meaning |\n|---|---|"
-    assert markdown_of(text, {"t", "x"}) == expected.replace("TABLE", table)
-
-
 def test_the_index_says_of_every_name_what_it_is() -> None:
     pytest.importorskip("mkdocs", reason="the site's tools come with the extra `docs`")
     site = run_path(str(ROOT / "docs" / "site.py"))

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.landmark import landmark_thruster, read_landmark_rates
+from benchmarks.landmark import landmark_thruster
 from ep2sindy.thruster.axial.heavy_kernels import heavy_step
 from ep2sindy.thruster.axial.model import build_model, cell_faces, lengths_and_centres
 from ep2sindy.thruster.axial.settings import to_json
@@ -163,13 +163,6 @@ def test_bad_parameters_say_what_must_hold(build, message):
 def test_bad_settings_say_what_must_hold(settings, message):
     with pytest.raises(ValueError, match=message):
         simulate(Thruster(), NOMINAL, progress=False, **settings)
-
-
-def test_rate_table_with_a_missing_column_is_refused(tmp_path):
-    path = tmp_path / "rates.csv"
-    path.write_text("energy,ionization,loss\n1,1e-20,1e-19\n2,1e-18\n")
-    with pytest.raises(ValueError, match="every row must hold three numbers"):
-        read_landmark_rates(path)
 
 
 def test_six_operating_points():
