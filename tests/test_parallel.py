@@ -255,9 +255,9 @@ WORK = {"waiting": ("", "signal.pause()"), "computing": (COMPILED.strip(), COMPU
     ("work", "name"),
     [
         ("waiting", "SIGTERM"),
+        ("waiting", "SIGKILL"),
         pytest.param("waiting", "SIGHUP", marks=pytest.mark.slow),
-        pytest.param("computing", "SIGTERM", marks=pytest.mark.slow),
-        ("computing", "SIGKILL"),
+        pytest.param("computing", "SIGKILL", marks=pytest.mark.slow),
     ],
 )
 def test_workers_end_with_their_run(tmp_path: Path, name: str, work: str) -> None:

@@ -123,6 +123,7 @@ def test_blocks_do_not_show_in_the_result(block_points: int, noisy_bytes: dict[s
     assert bytes_of(result) == noisy_bytes
 
 
+@pytest.mark.slow  # two processes import the package
 def test_processes_give_the_same_bits(
     noisy_bytes: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
