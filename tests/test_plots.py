@@ -67,14 +67,6 @@ def test_a_discovery_is_drawn_with_its_selected_candidates(
     assert star.get_xdata() == found.chosen["x"].n_terms
 
 
-def test_a_front_that_no_rule_has_scored_marks_no_candidate() -> None:
-    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
-    front = ep.discover(run, method=ep.Regression()).fronts["x"]
-    (ax,) = ep.plot(front.with_scores(np.full(len(front.candidates), np.nan))).axes
-    assert "selected" not in [line.get_label() for line in ax.lines]
-    assert ax.get_title() == r"$\dot{x}$"
-
-
 def test_a_free_run_is_drawn_over_its_record_whatever_their_order() -> None:
     run = record()
     turned = replace(run, states=run.states[:, ::-1], state_names=["y", "x"])

@@ -91,6 +91,7 @@ def test_what_a_library_lacks_is_no_push(noise: float) -> None:
     assert not found.explains
 
 
+@pytest.mark.slow  # an equation without one of its states is told so in the fast suite
 def test_an_equation_that_lacks_no_term_is_told_from_one_that_does() -> None:
     """x' lacks x^3, and the linear y' is right."""
     run = VAN_DER_POL.trajectory(noise=0.05, rng=0)

@@ -26,19 +26,6 @@ def test_every_public_name_stands_on_one_page_of_the_reference() -> None:
     assert all(pages)
 
 
-def test_the_index_says_of_every_name_what_it_is() -> None:
-    pytest.importorskip("mkdocs", reason="the site's tools come with the extra `docs`")
-    site = run_path(str(ROOT / "docs" / "site.py"))
-    lines = site["_contents"]().splitlines()
-    rows = {
-        row[1]: row[2] for line in lines if (row := re.match(r"\| .*\]\[(.*)\] \| (.*) \|$", line))
-    }
-    assert set(rows) == set(dotted_names())
-    assert not [name for name, text in rows.items() if len(text) < 10]
-    assert rows["ep2sindy.discover"] == "Find sparse equations for every state of the runs."
-    assert rows["ep2sindy.refine"].startswith("Fit the free coefficients")  # overloaded
-
-
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Its address."""

@@ -46,7 +46,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 DAMAGED = {
     "bytes": b"\xff\xfe\x00\x01" * 100, "a quote": b'"' + b"x" * 200_000,
-    "nested": b"[" * 100_000, "cut": b'{"states": [', 
+    "nested": b"[" * 100_000, "cut": b'{"states": [',
 }  # fmt: skip
 
 

@@ -178,9 +178,9 @@ PLAIN = {"x": ep.Variable("x", "1")}
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("scale_factor", 0.0), 
+        ("scale_factor", 0.0),
         ("scale_factor", "two"), ("scale_factor", np.array([1.0, 2.0])),
-        ("add_offset", np.nan), 
+        ("add_offset", np.nan),
     ],
 )  # fmt: skip
 def test_packing_that_leaves_no_numbers_is_refused_with_its_attribute(
