@@ -1,8 +1,9 @@
-"""Models and rows of a few numbers, for any test."""
+"""Models, rows and pointwise studies of a few numbers, for any test."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import xarray as xr
 
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
@@ -28,3 +29,41 @@ def plain_rows(
     library = terms if isinstance(terms, Library) else named_terms(terms, terms)
     n = len(theta)
     return RegressionRows(theta, target, library, equations, np.arange(n), np.zeros(n, dtype=bool))
+
+
+def point_study(
+    coef: np.ndarray,
+    weight: np.ndarray,
+    lost: np.ndarray,
+    *,
+    terms: Mapping[str, str],
+    equations: Sequence[str] = ("n_i", "n_n"),
+    share: np.ndarray | None = None,
+    draws: np.ndarray | None = None,
+) -> xr.Dataset:
+    """What a pointwise study finds.
+
+    coef, weight, share: (equation, term, z, r); share: of the bootstraps that have a term.
+    lost: (z, r), points without plasma. terms: with the units of their coefficients.
+    draws: (draw, equation, term, z, r), weights of bootstraps; without them two agree with all.
+    """
+    dims = ("draw", "equation", "term", "z", "r")
+    found = {
+        "coef": coef,
+        "weight": weight,
+        "inclusion": np.ones_like(weight) if share is None else share,
+        "weight_draws": np.stack([weight] * 2) if draws is None else draws,
+    }
+    held = xr.DataArray(~lost, dims=dims[3:])
+    flags = {"flag_values": [0, 1], "flag_meanings": "fitted no_plasma"}
+    arrays = {name: xr.DataArray(v, dims=dims[-v.ndim :]).where(held) for name, v in found.items()}
+    arrays["n_terms"] = (arrays["coef"] != 0.0).sum("term").where(held)
+    arrays["status"] = xr.where(held, 0, 1).astype(np.int8).assign_attrs(flags)
+    coords = {
+        "equation": list(equations),
+        "term": list(terms),
+        "coef_units": (dims[1:3], [list(terms.values())] * len(equations)),
+        "z": ("z", np.linspace(0.002, 0.022, lost.shape[0]), {"units": "m"}),
+        "r": ("r", np.linspace(0.036, 0.049, lost.shape[1]), {"units": "m"}),
+    }
+    return xr.Dataset(arrays, coords=coords, attrs={"no_fit": ""})

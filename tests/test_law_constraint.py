@@ -6,36 +6,26 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.library import polynomial
-from ep2sindy.library.relations import constraint
-from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.model import SparseModel, coef_matrix
+import ep2sindy as ep
 from ep2sindy.operating.constraint import Known, law_constraint
 from ep2sindy.operating.fit import SETTINGS, OperatingFit, leave_one_out, operating_fit
-from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.operating.records import OperatingRecord
-from ep2sindy.refinement.law import refine_law
+from tests.test_operating_law import GRID, LIBRARY, SHORT, STATES, STRUCTURE
 
-STATES = ("x", "y")
-LIBRARY = polynomial(STATES, degree=3)
-STRUCTURE = {"x": ["x", "y", "x^3"], "y": ["x"]}
 # What leaves x enters y, and the growth of x is known; its square is beyond a law of degree one.
 RELATIONS = ["x: y == -1 * y: x"]
 KNOWN = {"x": {"x": {"1": 0.7, "a^2": 0.2}}}
 EXACT = ("x: y == -1 * y: x", "x: x == 0.7 + 0.2 * a^2")
-GRID = [{"a": a, "b": b} for a in (0.5, 1.0, 1.5) for b in (0.0, 0.5, 1.0)]
 BETWEEN = {"a": 0.8, "b": 0.3}
 
 
-def model_at(a: float, b: float) -> SparseModel:
+def model_at(a: float, b: float) -> ep.SparseModel:
     turn = 1.0 + 0.2 * a + 0.1 * b
     terms = [{"x": 0.7 + 0.2 * a**2, "y": -turn, "x^3": -0.4 + 0.1 * b}, {"x": turn}]
-    return SparseModel(LIBRARY, STATES, coef_matrix(LIBRARY, terms))
+    return ep.SparseModel(LIBRARY, STATES, ep.coef_matrix(LIBRARY, terms))
 
 
 @cache
-def records() -> tuple[OperatingRecord, ...]:
+def records() -> tuple[ep.operating.OperatingRecord, ...]:
     t = np.arange(0.0, 50.0, 0.1)
     rng = np.random.default_rng(0)
     found = []
@@ -43,7 +33,7 @@ def records() -> tuple[OperatingRecord, ...]:
         states = model_at(**point).simulate(np.append(0.0, 40.0 + t), [1.0, 0.0]).states[1:]
         # A little noise: relations hold where the data do not obey them by themselves.
         states = states + 1e-3 * rng.normal(size=states.shape)
-        found.append(OperatingRecord.of(point, Trajectory(t, states, STATES)))
+        found.append(ep.operating.OperatingRecord.of(point, ep.Trajectory(t, states, STATES)))
     return tuple(found)
 
 
@@ -51,20 +41,20 @@ def records() -> tuple[OperatingRecord, ...]:
 def fit() -> OperatingFit:
     return operating_fit(
         records(), LIBRARY, STRUCTURE, relations=RELATIONS, known=KNOWN,
-        settings=replace(SETTINGS, n_windows=3, periods=1.0),
+        settings=SHORT,
     )  # fmt: skip
 
 
 @cache
-def tied() -> OperatingLaw:
+def tied() -> ep.operating.OperatingLaw:
     return fit().tied(fit().functions(1))[0]
 
 
-def laws() -> list[OperatingLaw]:
+def laws() -> list[ep.operating.OperatingLaw]:
     return [fit().weighted(fit().functions(1)), tied()]
 
 
-def check_exact(model: SparseModel, a: float) -> None:
+def check_exact(model: ep.SparseModel, a: float) -> None:
     assert model.terms("x")["y"] == -model.terms("y")["x"]
     assert model.terms("x")["x"] == pytest.approx(0.7 + 0.2 * a**2, rel=1e-15)
 
@@ -110,11 +100,11 @@ def test_a_known_number_has_no_interval_and_a_shared_one_has_the_same_twice() ->
 def test_points_left_out_live_by_laws_under_relations() -> None:
     functions = fit().functions(1)
     for found in (leave_one_out(fit(), functions), leave_one_out(fit(), functions, start=tied())):
-        assert [each.run.verdict for each in found] == [Verdict.LIVES] * 9
+        assert [each.run.verdict for each in found] == [ep.Verdict.LIVES] * 9
 
 
 def test_a_file_and_the_text_hold_the_relations() -> None:
-    again = OperatingLaw.from_json(tied().to_json())
+    again = ep.operating.OperatingLaw.from_json(tied().to_json())
     np.testing.assert_array_equal(again.coef, tied().coef)
     assert again.provenance["exact"] == "; ".join(EXACT)
     lines = tied().text().splitlines()
@@ -126,7 +116,7 @@ def test_a_file_and_the_text_hold_the_relations() -> None:
 def test_without_known_values_relations_are_the_same_everywhere() -> None:
     alone = operating_fit(
         records(), LIBRARY, STRUCTURE, relations=[*RELATIONS, "x: x^3 == -0.3"],
-        settings=replace(SETTINGS, n_windows=3, periods=1.0),
+        settings=SHORT,
     )  # fmt: skip
     assert alone.n_free == 2
     law = alone.weighted(alone.functions(1))
@@ -140,13 +130,7 @@ def test_without_known_values_relations_are_the_same_everywhere() -> None:
         (["x: y == -1 * y: y"], {}, "'y' is not in the support of 'y'"),
         (["x: x == 1"], KNOWN, r"relation 'x: x == 0.7 \+ 0.2 \* a\^2' contradicts"),
         ([], {"x": {"x": {"c": 1.0}}}, r"x: x must be a sum of functions of \['a', 'b'\]"),
-        ([], {"x": {"x": {"a": np.nan}}}, "the numbers of a relation must be finite"),
-        ([], {"z": {"x": {"a": 1.0}}}, "unknown state 'z'"),
-        (
-            ["x: x == 1", "x: x^3 == -1", "y: x == 1", "x: y == -1"],
-            {},
-            "a law needs a free coefficient",
-        ),
+        (["x: x == 1", "x: x^3 == -1", "y: x == 1", "x: y == -1"], {}, "a law needs a free"),
         ([], {"x": {"x": {"b": 1.0}}}, r"must be finite and not zero.* \[0.0\] came at .*'b': 0"),
     ],
 )
@@ -164,10 +148,10 @@ def test_constraints_of_the_points_of_a_law_must_be_alike() -> None:
     models = [model_at(a, 0.0) for a in (0.5, 1.0, 1.5)]
     runs = [[record.run] for record in records()[::3]]
     basis = np.ones((3, 1))
-    other = [*own[:2], constraint(LIBRARY, STRUCTURE)]
+    other = [*own[:2], ep.constraint(LIBRARY, STRUCTURE)]
     for wrong, message in ((own[:2], "2 came"), (other, "3 came, not alike")):
         with pytest.raises(ValueError, match=f"one constraint for each of its 3 points.*{message}"):
-            refine_law(models, runs, basis, constraints=wrong, seed=0)
+            ep.refinement.refine_law(models, runs, basis, constraints=wrong, seed=0)
     settings = replace(SETTINGS, constraint=own[0])
     with pytest.raises(ValueError, match="one for all in the settings"):
-        refine_law(models, runs, basis, settings, constraints=own, seed=0)
+        ep.refinement.refine_law(models, runs, basis, settings, constraints=own, seed=0)

@@ -185,31 +185,6 @@ def test_files_and_functions_stay_short() -> None:
     assert not long, "\n".join(long)
 
 
-# Values that are not ours, by module: of these it may be asked what they have.
-FOREIGN = {
-    "app.schema": "a callable of a user's own, which may be compiled and have no name",
-    "app.runner": "a module of a user's own, which may be a package of experiments",
-    "runtime.compilation": "kernels of numba, which has no public way to its cache",
-    "runtime.files": "an error of any kind, which may say what the system said",
-    "systems.collection": "systems of another package",
-    "trust.interruption": "os and signal, which have less on Windows",
-    "trust.user_code": "whatever a user marked for configs",
-}
-
-
-def test_nothing_is_dug_out_of_values_of_ours() -> None:
-    """A settings value is passed: nobody asks a neighbour whether it has one by some name."""
-    dug = []
-    for module, path in PATHS.items():
-        for node in ast.walk(tree(path)):
-            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name)):
-                continue
-            asks = node.func.id == "hasattr" or (node.func.id == "getattr" and len(node.args) == 3)
-            if asks and module not in FOREIGN:
-                dug.append(f"{module}, line {node.lineno}: {ast.unparse(node)}; pass the value")
-    assert not dug, "\n".join(dug)
-
-
 def test_a_class_name_stands_once() -> None:
     """But for the two that every study has."""
     names = Counter(

@@ -15,8 +15,8 @@ ROWS = ep.Regression(ep.Differential(), bootstraps=ep.Bootstraps(n=0))
 
 
 def record(noise: float) -> ep.Trajectory:
-    """A Van der Pol oscillator over twenty periods; noise in shares of each state's RMS."""
-    van_der_pol = replace(ep.systems.van_der_pol(), duration_s=180.0, rate_Hz=10.0)
+    """A Van der Pol oscillator over twelve periods; noise in shares of each state's RMS."""
+    van_der_pol = replace(ep.systems.van_der_pol(), duration_s=120.0, rate_Hz=10.0)
     run = van_der_pol.trajectory(noise=noise, rng=1)
     return run.window(200, run.n_samples)
 

@@ -27,9 +27,7 @@ def test_magnetic_field_peaks_at_the_exit():
         ("z_m,B_T", 1.0, 1.0, {}),
         ("z_mm,B_mT", 1e3, 1e3, {}),
         ("axial position (cm), Br [G]", 1e2, 1e4, {}),
-        ("z,B", 1.0, 1.0, {}),
         ("", 1.0, 1.0, {}),
-        ("", 1e3, 1e4, {"z_unit": "mm", "B_unit": "G"}),
         ("z,B", 1e2, 1e3, {"z_unit": "cm", "B_unit": "mT"}),
     ],
 )
@@ -81,15 +79,10 @@ def test_a_field_that_ends_short_of_the_domain_is_refused(tmp_path):
     ("text", "given", "message"),
     [
         ("z_m,B_T\n0,0.01\n0.01,\n0.02,0.01\n", {}, r"row 2 below the header .*fill the gap"),
-        ("z_m,B_T\n0,0.01\n0.01,nan\n", {}, r"2 numbers in every row: row 2"),
         ("z_m,B_T\n0,0.01\n0,0.02\n", {}, r"distance must increase: -0\.025 follows -0\.025"),
-        ("z_m,B_T\n0,0.01\n0.03,0.02\n0.02,0.01\n", {}, r"must increase: -0\.005 follows 0\.005"),
         ("0,50\n0.05,200\n", {}, r"no unit and reaches 200, too much for T; .* B_unit=G or mT"),
-        ("0,0.01\n50,0.02\n", {}, r"position has no unit and spans 50, .* z_unit=mm or cm"),
         ("z_inch,B_T\n0,0.01\n2,0.02\n", {}, r"position must be in one of .* 'inch' came"),
-        ("0,0.01\n0.05,0.02\n", {"B_unit": "Oe"}, r"field must be in one of .* 'Oe' came"),
         ("z_m,B_T\n0,50\n0.05,200\n", {}, r"MagneticFieldTable\.B must be in T"),
-        ("z_m,B_T,x\n0,0.01,1\n1,0.02,1\n", {}, r"must have two columns, .* it has 3"),
         ("z_m,B_T\n", {}, r"must have two rows or more"),
     ],
 )

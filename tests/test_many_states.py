@@ -3,15 +3,11 @@
 import numpy as np
 import pytest
 
+import ep2sindy as ep
 from benchmarks.many_states import cases, record, starts
-from ep2sindy.library.relations import constraint
-from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.problem import RefinementSettings
-from ep2sindy.refinement.refine import refine
-from ep2sindy.systems.systems import lotka_volterra
 
-PREY = lotka_volterra()
+PREY = ep.lotka_volterra()
 
 
 @pytest.mark.parametrize("number", [0, 2, 4])
@@ -19,8 +15,8 @@ def test_true_terms_that_are_off_come_back(number: int) -> None:
     case = cases()[number]
     run = record(case)
     truth = case.truth
-    for found in refine(
-        starts(case, run)[:3], [[run]] * 3, RefinementSettings(n_windows=10), seed=0
+    for found in ep.refine(
+        starts(case, run)[:3], [[run]] * 3, ep.RefinementSettings(n_windows=10), seed=0
     ):
         assert found.status == "converged"
         assert not found.message
@@ -31,22 +27,27 @@ def test_true_terms_that_are_off_come_back(number: int) -> None:
         assert (np.abs(off) < 5.0 * np.sqrt(np.diag(covariance))).all()
 
 
-@pytest.mark.parametrize("number", [5, 7])
-def test_models_that_miss_hidden_states_follow_what_they_can(number: int) -> None:
-    """Most of these ended without a finite trajectory before steps were damped."""
-    case = cases()[number]
+@pytest.fixture(scope="module")
+def lacking() -> tuple[list[ep.SparseModel], ep.Trajectory]:
+    """Starts of models that miss hidden states, and the record."""
+    case = cases()[7]
     run = record(case)
-    settings = RefinementSettings(n_windows=10, n_reweights=0)
-    for found in refine(starts(case, run)[:3], [[run]] * 3, settings, seed=0):
+    return starts(case, run), run
+
+
+def test_models_that_miss_hidden_states_follow_what_they_can(lacking) -> None:
+    """Most of these ended without a finite trajectory before steps were damped."""
+    models, run = lacking
+    settings = ep.RefinementSettings(n_windows=5, n_reweights=0)
+    for found in ep.refine(models[:3], [[run]] * 3, settings, seed=0):
         assert found.status not in ("non_finite", "flat")
 
 
-def test_a_failure_says_where() -> None:
-    case = cases()[7]
-    run = record(case)
+def test_a_failure_says_where(lacking) -> None:
+    models, run = lacking
     method = MultipleShooting(first_memory=1000, max_iter=1)
-    settings = RefinementSettings(n_windows=5, method=method, n_reweights=0)
-    found = refine(starts(case, run)[1], [run], settings, periods=8.0, seed=0)
+    settings = ep.RefinementSettings(n_windows=5, method=method, n_reweights=0)
+    found = ep.refine(models[1], [run], settings, periods=8.0, seed=0)
     assert found.status in ("non_finite", "flat", "max_iter")
     assert "the longest memory without gaps was 1 of " in found.message
     assert " of trajectory 0, " in found.message
@@ -54,18 +55,18 @@ def test_a_failure_says_where() -> None:
 
 def test_every_model_of_a_list_keeps_its_own_constraint() -> None:
     run, truth = PREY.trajectory(), PREY.model
-    model = SparseModel(truth.library, truth.states, 1.1 * truth.coef)
+    model = ep.SparseModel(truth.library, truth.states, 1.1 * truth.coef)
     support = {state: tuple(model.terms(state)) for state in model.states}
     (term, *_), row = support["x"], model.library.index(support["x"][0])
-    known = [constraint(model.library, support, [f"x: {term} == {v}"]) for v in (0.7, 0.6)]
-    settings = RefinementSettings(window=60, n_windows=6)
-    together = refine([model] * 3, [[run]] * 3, settings, constraints=[*known, None], seed=0)
+    known = [ep.constraint(model.library, support, [f"x: {term} == {v}"]) for v in (0.7, 0.6)]
+    settings = ep.RefinementSettings(window=60, n_windows=6)
+    together = ep.refine([model] * 3, [[run]] * 3, settings, constraints=[*known, None], seed=0)
     held = [found.model.coef[row, 0] for found in together[:2]]
     np.testing.assert_allclose(held, [0.7, 0.6], rtol=1e-12)
     np.testing.assert_allclose(together[2].model.coef, truth.coef, rtol=1e-5, atol=1e-12)
-    alone = refine([model], [[run]], settings, constraint=known[0], seed=0)[0]
+    alone = ep.refine([model], [[run]], settings, constraint=known[0], seed=0)[0]
     np.testing.assert_allclose(together[0].model.coef, alone.model.coef, rtol=1e-8)
     with pytest.raises(ValueError, match=r"one entry per model.* 2 came for 3 models$"):
-        refine([model] * 3, [[run]] * 3, constraints=known, seed=0)
+        ep.refine([model] * 3, [[run]] * 3, constraints=known, seed=0)
     with pytest.raises(ValueError, match="beside a common one; leave out one$"):
-        refine([model] * 2, [[run]] * 2, constraint=known[0], constraints=known, seed=0)
+        ep.refine([model] * 2, [[run]] * 2, constraint=known[0], constraints=known, seed=0)

@@ -9,18 +9,16 @@ from matplotlib.figure import Figure
 from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.figures.maps import (
     ABSENT,
-    COUNT_COLOURS,
     GAP,
     HALF,
-    SHARE_COLOURS,
-    SINK,
     coefficient_maps,
     quality_maps,
     regime_map,
 )
 from ep2sindy.thruster.parameters import Thruster
+from tests.models import point_study
 
-TERMS = ["1", "n_n", "n_i*u_iz"]
+TERMS = {"1": "m^-3 s^-1", "n_n": "s^-1", "n_i*u_iz": "m^-1"}
 
 
 def study() -> xr.Dataset:
@@ -28,41 +26,18 @@ def study() -> xr.Dataset:
 
     n_i' = -40 n_i u_iz; n_n' = 10^22..10^24 at z < 1 cm, 3e4 n_n beyond.
     """
-    z, r = np.linspace(0.002, 0.022, 5), np.linspace(0.036, 0.049, 4)
     coef, weight = np.zeros((2, 2, 3, 5, 4))
     share = np.ones((2, 3, 5, 4))
     share[0, 2, :, 0] = 0.25  # of the bootstraps have n_i*u_iz at the inner wall
     coef[0, 2], weight[0, 2] = -40.0, -1.0
     coef[1, 0, :2], weight[1, 0, :2] = np.logspace(22, 24, 8).reshape(2, 4), 1.0
     coef[1, 1, 2:], weight[1, 1, 2:] = 3e4, 1.0
-    status = np.zeros((5, 4), dtype=np.int8)
-    status[-1] = 1
-    masked = np.where(status == 0, 1.0, np.nan)
-    dims = ("equation", "term", "z", "r")
-    units = [["m^-3 s^-1", "s^-1", "m^-1"]] * 2
-    flags = {
-        "flag_values": [0, 1, 2, 3, 4],
-        "flag_meanings": "fitted no_plasma missing_samples too_little_variation no_fit",
-    }
-    return xr.Dataset(
-        {
-            "coef": (dims, coef * masked),
-            "weight": (dims, weight * masked),
-            "inclusion": (dims, share * masked),
-            "weight_draws": (("draw", *dims), np.stack([weight * masked] * 3)),
-            "r2_train": (("equation", "z", "r"), 0.9 * np.stack([masked] * 2)),
-            "r2_test": (("equation", "z", "r"), np.stack([0.8 * masked, -3.0 * masked])),
-            "n_terms": (("equation", "z", "r"), np.stack([masked] * 2)),
-            "status": (("z", "r"), status, flags),
-        },
-        coords={
-            "equation": ["n_i", "n_n"],
-            "term": TERMS,
-            "coef_units": (dims[:2], units),
-            "z": ("z", z, {"units": "m"}),
-            "r": ("r", r, {"units": "m"}),
-        },
-    )
+    lost = np.zeros((5, 4), dtype=bool)
+    lost[-1] = True
+    result = point_study(coef, weight, lost, terms=TERMS, share=share)
+    one = 0.0 * result["n_terms"] + 1.0
+    r2 = xr.DataArray([0.8, -3.0], dims="equation")
+    return result.assign(r2_train=0.9 * one, r2_test=r2 * one)
 
 
 def grouped(result: xr.Dataset) -> Regimes:
@@ -150,17 +125,6 @@ def test_coefficients_fade_to_grey_with_r2_and_the_share_of_bootstraps(
     assert HALF in legend(coefficients)
 
 
-def test_points_over_one_axis_fade_as_maps_do() -> None:
-    for r, share in ((0, 0.25), (1, 1.0)):
-        figure = coefficient_maps(study().isel(r=r, drop=True))
-        panels = np.array(figure.axes).reshape(2, -1)
-        sink, none = panels[0, -1].collections[1], panels[1, 0].collections[0]
-        shade = np.array(to_rgba(ABSENT)) + 0.8 * share * np.subtract(SINK, to_rgba(ABSENT))
-        assert sink.get_facecolor() == pytest.approx(np.tile(shade, (4, 1)), abs=1e-6)
-        assert none.get_facecolor() == pytest.approx(np.tile(to_rgba(ABSENT), (2, 1)), abs=1e-6)
-        assert HALF in legend(figure)
-
-
 def test_without_bootstraps_r2_alone_fades() -> None:
     result = study()
     result["inclusion"] *= np.nan
@@ -169,13 +133,6 @@ def test_without_bootstraps_r2_alone_fades() -> None:
     assert np.array(alphas) == pytest.approx(
         np.repeat([0.8, 0.0], 3)[:, None, None] + np.zeros(16).reshape(4, 4)
     )
-
-
-def test_maps_have_the_proportions_of_the_thruster(coefficients: Figure, quality: Figure) -> None:
-    for figure in (coefficients, quality):
-        for ax, _ in maps(figure):
-            assert ax.get_aspect() == 1.0
-            assert ax.get_xlim() == pytest.approx((-0.05, 2.45))  # cm: half a cell around
 
 
 def test_the_channel_is_drawn_where_it_is_and_leaves_the_limits() -> None:
@@ -233,22 +190,6 @@ def test_a_regime_map_shows_labels_and_leaves_invalid_points_blank() -> None:
     assert confidence.compressed().tolist() == pytest.approx([1.0] * 16, abs=0.01)
 
 
-def test_a_regime_map_gives_every_regime_its_terms(regime: Figure) -> None:
-    entries = legend(regime)
-    assert len(entries) == 2
-    assert [entry.partition(":")[0] for entry in entries] == ["0, 8 points", "1, 8 points"]
-    assert all(r"$\dot{n}_{i}$: $n_{i} \, u_{iz}$;" in entry for entry in entries)
-    assert any(entry.endswith(r"$\dot{n}_{n}$: $n_{n}$") for entry in entries)
-    assert regime.legends[0].get_title().get_text() == "terms that act in each regime"
-
-
-def test_an_equation_without_terms_reads_zero() -> None:
-    result = study()
-    for name in ("coef", "weight", "weight_draws"):
-        result[name].loc[{"equation": "n_i"}] *= 0.0
-    assert all(r"$\dot{n}_{i}$: 0;" in entry for entry in legend(regime_map(grouped(result))))
-
-
 def test_r2_below_zero_is_drawn_as_zero(quality: Figure) -> None:
     drawn = {ax.get_title(): values for ax, values in maps(quality)}
     assert (drawn[r"$\dot{n}_{i}$: $R^2$, held-out"].compressed() == 0.8).all()
@@ -260,43 +201,6 @@ def test_quality_is_of_the_training_rows_where_none_are_held_out() -> None:
     result["r2_test"] *= np.nan
     drawn = {ax.get_title(): values for ax, values in maps(quality_maps(result))}
     assert (drawn[r"$\dot{n}_{n}$: $R^2$, training"].compressed() == 0.9).all()
-
-
-def test_quality_maps_count_what_became_of_the_points(quality: Figure) -> None:
-    assert legend(quality) == ["fitted (16)", "no plasma (4)"]
-
-
-def test_where_every_point_is_fitted_there_is_no_panel_for_it() -> None:
-    figure = quality_maps(study().isel(z=slice(0, 4)))
-    titles = {ax.get_title() for ax, _ in maps(figure)}
-    assert len(titles) == 4
-    assert "status of the points" not in titles
-    assert not figure.legends
-
-
-@pytest.mark.parametrize("cut", [{}, {"r": 1}], ids=str)
-def test_the_status_of_the_points_has_its_scale(cut: dict[str, int]) -> None:
-    figure = quality_maps(study().isel(cut, drop=True))
-    figure.canvas.draw()
-    (ax,) = (ax for ax in figure.axes if ax.get_title() == "status of the points")
-    assert any(label.get_visible() and label.get_text() for label in ax.get_xticklabels())
-
-
-def test_no_value_is_drawn_in_a_shade_near_white(regime: Figure) -> None:
-    for scale in (SHARE_COLOURS, COUNT_COLOURS):
-        assert scale(np.linspace(0.0, 1.0, 50))[:, :3].min(axis=1).max() < 0.8
-    (ax, _) = maps(regime)[1]
-    assert ax.collections[0].get_cmap() == SHARE_COLOURS
-
-
-@pytest.mark.parametrize(("cut", "ends"), [({"r": 1}, (-0.05, 2.45)), ({"z": 1}, (3.383, 5.117))])
-def test_over_one_axis_every_panel_ends_with_the_outermost_cells(
-    cut: dict[str, int], ends: tuple[float, float]
-) -> None:
-    result = study().isel(cut, drop=True)
-    figures = coefficient_maps(result), quality_maps(result), regime_map(grouped(result))
-    for ax in (ax for figure in figures for ax in figure.axes):
-        assert ax.get_xlim() == pytest.approx(ends, abs=1e-3)
 
 
 @pytest.mark.parametrize("cut", [{"r": 1}, {"z": 1}, {"z": [1], "r": [1]}, {"r": [1]}], ids=str)

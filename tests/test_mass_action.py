@@ -5,6 +5,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.model.mass_action import BOUNDED, NONNEGATIVE, consequences
+from tests.models import model_of
 
 D = {
     "n_i": {"n_i^2*n_n": 1.62e-32, "n_i*n_n^2": 3.12e-33, "n_i": -3.64e5, "n_i^2": -8.45e-14},
@@ -21,13 +22,6 @@ SIR = {  # births, no deaths: the recovered grow without end
 UNEQUAL = {"a": {"1": 1.0, "a": -1.0}, "b": {"a": 2.0, "b": -3.0}}
 GROWING = {"prey": {"prey": 1.0, "prey*fox": -1.0}, "fox": {"prey*fox": 1.0, "fox": -1.0}}
 SATURATED = {"a": {"1": 1.0, "a": -1.0, "a*b": -1.0}, "b": {"a*b": 1.0, "b": -1.0, "b^2": 0.5}}
-
-
-def model_of(terms: dict[str, dict[str, float]]) -> ep.SparseModel:
-    states = list(terms)
-    library = ep.polynomial(states, degree=3)
-    coef = ep.coef_matrix(library, list(terms.values()))
-    return ep.SparseModel(library, states, coef, dict.fromkeys(states, "1"))
 
 
 @pytest.mark.parametrize(

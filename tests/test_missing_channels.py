@@ -83,11 +83,7 @@ def test_complete_samples_and_windows_keep_what_is_missing() -> None:
 @pytest.mark.parametrize(
     ("missing", "message"),
     [
-        (np.zeros((5, 2)), r"missing must be a mask of the states, .*float64 of shape \(5, 2\)"),
-        (
-            np.zeros((5, 1), dtype=bool),
-            r"bool of shape \(5, 1\) came with states of shape \(",
-        ),
+        (np.zeros((5, 1), dtype=bool), r"bool of shape \(5, 1\) came with states of shape \("),
         (np.tile([True, False], (5, 1)), r"every state needs samples: all of \['x'\] are missing"),
     ],
 )
@@ -114,7 +110,7 @@ def test_a_regression_needs_two_complete_samples() -> None:
 
 def test_an_equation_that_is_closed_holds_beside_one_that_is_not() -> None:
     """Lorenz without z: x' = 10 (y - x) needs no z, and y' does."""
-    run = LORENZ.trajectory(noise=0.05, rng=0)
+    run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 1500)
     two = ep.Trajectory(run.t, run.states[:, :2], ["x", "y"])
     found = ep.estimate(two, ep.polynomial(["x", "y"], degree=2))
     assert found.holds == ("x",)
@@ -130,9 +126,9 @@ def problem_of(run: ep.Trajectory, degree: int = 2):
 
 def test_a_single_state_that_swings_lacks_another() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
-    one = ep.Trajectory(run.t, run.states[:, :1], ["x"])
+    one = ep.Trajectory(run.t[::3], run.states[::3, :1], ["x"])
     assert missing_state(problem_of(one)).startswith("x passes the same values up and down")
-    found = ep.estimate(one, ep.polynomial(["x"], degree=3))
+    found = ep.estimate(one, ep.polynomial(["x"], degree=2))
     assert "A state is missing for certain: x passes the same" in found.misfit
     assert "Name a hidden state (hidden=[...])" in found.misfit
 

@@ -1,6 +1,5 @@
 """Mistakes on the command line end in our words, with the nearest name."""
 
-import re
 from pathlib import Path
 
 import pytest
@@ -25,26 +24,12 @@ ROOT = Path(__file__).resolve().parents[1]
         (["exp=breathing"], "'exp=breathing' adds to the config, which needs a plus: write +exp="),
         (["breathing"], "must be KEY=VALUE, such as +exp=discover or seed=1: 'breathing' came; +e"),
         (["inspct", "run.csv"], "'inspct' came; near it is the command inspect, which stands fi"),
-        (["+exp=discover", "search=joined"], "no choice of search 'joined'; near it is search=jo"),
-        (
-            ["+exp=discover", "data=recogn"],
-            "near it is data=recognised; there are file, recog",
-        ),
+        (["+exp=discover", "data=recogn"], "near it is data=recognised; there are file, recog"),
         (["+exp=discover", "serch=joint"], "unknown key 'serch'; near it is search; there are"),
-        (["+exp=discover", "~serch"], "unknown key 'serch'; near it is search; there are"),
-        (["+exp=discover", "+serch=joint"], "unknown keys ['serch']; near it is search; there"),
         (["+exp=discover", "search.alphaa=3"], "unknown key 'search.alphaa'; search has align, c"),
-        (
-            ["+exp=weak", "search.max_trms=3"],
-            "near it is search.max_terms; search has gamma, max",
-        ),
         (["+exp=discover", "max_terms=3"], "unknown key 'max_terms'; near it is search.max_terms"),
-        (["+exp=breathing", "data.voltge=3"], "near it is data.operating_point.voltage; data has"),
         (["+exp=breathing", "seed.x=3"], "unknown key 'seed.x': seed is 0, and has no keys"),
-        (
-            ["+exp=discover", "data=file", "data.variables.x.name=x"],
-            "a new one, where any may stand, takes a plus: +data.variables.x.name",
-        ),
+        (["+exp=discover", "data=file", "data.variables.x.name=x"], "a new one, where any may"),
         (
             ["+exp=discover", "search=best_subset", "bootstraps=none", "bootstraps.block=3"],
             "'bootstraps.block' is left to its default here: a plus sets it, +bootstraps.block=VAL",
@@ -52,9 +37,6 @@ ROOT = Path(__file__).resolve().parents[1]
         (["+exp=breathing", "prepare={a: b}"], "another kind of value there: Cannot merge"),
         (["+exp=discover", "exclude={x: [x^2]}"], "must stand in double quotes inside single ones"),
         (["+exp=discover", "--confg", "job"], "unknown option '--confg'; near it are --cfg, --con"),
-        (["+exp=discover", "--cfg", "jbo"], "options must be those of --help: argument --cfg"),
-        (["-m", "+exp=breathin,breathing"], "there is no experiment 'breathin'; near it is"),
-        (["+exp=breathin", "serch=joint"], "there is no experiment 'breathin'; near it is"),
         (["+exp=discover", "serch=joint", "sede=1"], "unknown key 'serch'; --cfg job shows those"),
     ],
 )
@@ -89,7 +71,7 @@ def test_a_group_that_an_experiment_does_not_use_may_be_set() -> None:
     assert study_of(study_class(config.study), config)
 
 
-# Settings with which each step of the table in docs/data.md is called, on a small field.
+# Settings with which each step of a preparation is called, on a small field.
 STEPS = {
     "crop": "start_s: 1.0e-5, stop_s: 1.0e-4",
     "low_pass": "cutoff_Hz: 1.0e5, order: 2",
@@ -107,27 +89,15 @@ STEPS = {
 }
 
 
-def steps_of_the_page() -> dict[str, list[str]]:
-    """Every step that the table of docs/data.md names, with its arguments."""
-    page = (ROOT / "docs" / "data.md").read_text("utf-8")
-    table = page.partition("## Preparation")[2].partition("## Zones")[0]
-    return {
-        name: re.findall(r"(\w+)(?:=|,|$)", arguments)
-        for name, arguments in re.findall(r"^\| `(\w+)\((.*?)\)` \|", table, re.M)
-    }
-
-
-def test_the_page_names_every_step() -> None:
-    assert set(steps_of_the_page()) == set(STEPS) == {*dir(ep.prepare), "ionization_rate"}
+def test_every_step_is_called_here() -> None:
+    assert set(STEPS) == {*dir(ep.prepare), "ionization_rate"}
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_a_step_that_the_page_names_is_composed_and_called(name: str) -> None:
+def test_a_step_that_a_config_names_is_composed_and_called(name: str) -> None:
     room = "thruster" if name == "ionization_rate" else "prepare"
     text = f"prepare=[{{_target_: ep2sindy.{room}.{name}, {STEPS[name]}}}]"
     step = bind_step(plain(composed("+exp=breathing", mend(text)).prepare[0]), "prepare[0]")
-    arguments = steps_of_the_page()[name]
-    assert set(step.keywords) <= set(arguments)
     field = three_regions(n_z=6, n_r=5, n_samples=64).field
     if "T_e_eV" not in field:
         field = field.assign(T_e_eV=(10.0 + 0.0 * field["n_i"]).assign_attrs(units="eV"))

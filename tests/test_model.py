@@ -1,4 +1,3 @@
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -6,29 +5,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.systems.systems import lorenz, lotka_volterra
+import ep2sindy as ep
 
 VARIABLES = ["n_i", "n_n", "R_ion"]
 UNITS = {"n_i": "m^-3", "n_n": "m^-3", "R_ion": "m^3/s"}
 
 
-def breathing() -> SparseModel:
-    library = named_terms(VARIABLES, ["1", "n_i", "n_n", "n_i*n_n", "n_i*n_n*R_ion"])
+def breathing() -> ep.SparseModel:
+    library = ep.named_terms(VARIABLES, ["1", "n_i", "n_n", "n_i*n_n", "n_i*n_n*R_ion"])
     equations = [{"n_i": -2.62e5, "n_i*n_n": 5.481e-14}, {"1": 1.83e23, "n_i*n_n*R_ion": -0.77}]
-    return SparseModel(library, ["n_i", "n_n"], coef_matrix(library, equations), UNITS)
+    return ep.SparseModel(library, ["n_i", "n_n"], ep.coef_matrix(library, equations), UNITS)
 
 
-def driven(rate: float = 2.0) -> tuple[SparseModel, Trajectory]:
+def driven(rate: float = 2.0) -> tuple[ep.SparseModel, ep.Trajectory]:
     """x' = -rate x + u with u = sin t, whose solution is known."""
-    library = polynomial(["x", "u"], degree=1)
-    model = SparseModel(library, ["x"], coef_matrix(library, [{"x": -rate, "u": 1.0}]))
+    library = ep.polynomial(["x", "u"], degree=1)
+    model = ep.SparseModel(library, ["x"], ep.coef_matrix(library, [{"x": -rate, "u": 1.0}]))
     t = np.linspace(0.0, 5.0, 201)
     exact = np.exp(-rate * t) * (1 + 1 / (rate**2 + 1))
     exact += (rate * np.sin(t) - np.cos(t)) / (rate**2 + 1)
-    run = Trajectory(
+    run = ep.Trajectory(
         t=t,
         states=exact[:, None],
         state_names=["x"],
@@ -44,7 +40,7 @@ def test_model_prints_as_equations() -> None:
 
 
 def test_an_empty_equation_prints_as_zero() -> None:
-    model = SparseModel(polynomial(["x"], degree=1), ["x"], np.zeros((2, 1)))
+    model = ep.SparseModel(ep.polynomial(["x"], degree=1), ["x"], np.zeros((2, 1)))
     assert model.text() == "x' = 0"
     assert r"\dot{x} &= 0" in model.latex()
     assert model.sympy()["x"] == 0
@@ -59,18 +55,9 @@ def test_latex_has_powers_of_ten_and_subscripts() -> None:
     assert r"- 0.77 \, n_{i} \, n_{n} \, R_{ion}" in latex
 
 
-def test_sympy_evaluates_like_the_model() -> None:
-    model = breathing()
-    point = {"n_i": 3e17, "n_n": 5e18, "R_ion": 6e-14}
-    slope = model.derivative(np.array([3e17, 5e18]), np.array([6e-14]))
-    for state, expression in model.sympy().items():
-        expected = float(slope[model.states.index(state)])
-        assert float(expression.subs(point)) == pytest.approx(expected, rel=1e-12)
-
-
 def test_derivative_finds_its_variables_in_any_order() -> None:
-    library = named_terms(["u", "y", "x"], ["u*x", "y"])
-    model = SparseModel(library, ["x", "y"], np.array([[1.0, 0.0], [0.0, 3.0]]))
+    library = ep.named_terms(["u", "y", "x"], ["u*x", "y"])
+    model = ep.SparseModel(library, ["x", "y"], np.array([[1.0, 0.0], [0.0, 3.0]]))
     assert model.inputs == ("u",)
     slope = model.derivative(np.array([[2.0, 5.0]]), np.array([[7.0]]))
     assert slope.tolist() == [[14.0, 15.0]]
@@ -78,12 +65,12 @@ def test_derivative_finds_its_variables_in_any_order() -> None:
 
 def test_json_round_trip_is_exact(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    library = polynomial(VARIABLES, degree=2)
+    library = ep.polynomial(VARIABLES, degree=2)
     coef = rng.normal(size=(10, 2)) * 10.0 ** rng.integers(-40, 40, size=(10, 2))
     coef[rng.random(size=coef.shape) < 0.5] = 0.0
-    model = SparseModel(library, ["n_i", "n_n"], coef, UNITS, {"seed": "0"})
+    model = ep.SparseModel(library, ["n_i", "n_n"], coef, UNITS, {"seed": "0"})
     model.save(tmp_path / "models" / "simple.json")
-    back = SparseModel.load(tmp_path / "models" / "simple.json")
+    back = ep.SparseModel.load(tmp_path / "models" / "simple.json")
     assert np.array_equal(back.coef, model.coef)
     assert back.library.names == model.library.names
     assert (back.states, dict(back.units), dict(back.provenance)) == (
@@ -93,21 +80,6 @@ def test_json_round_trip_is_exact(tmp_path: Path) -> None:
     )
     assert back.to_json() == model.to_json()
     assert [p.name for p in (tmp_path / "models").iterdir()] == ["simple.json"]
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{}",
-        "not json",
-        '{"format": "other"}',
-        breathing().to_json()[:-40],
-        json.dumps({**json.loads(breathing().to_json()), "variables": ["n_i"]}),
-    ],
-)
-def test_other_files_are_not_models(text: str) -> None:
-    with pytest.raises(ValueError, match="a model file must hold ep2sindy.SparseModel/1"):
-        SparseModel.from_json(text)
 
 
 def test_rollout_of_a_driven_model_matches_its_solution() -> None:
@@ -127,7 +99,7 @@ def test_rollout_of_a_window_starts_from_the_data() -> None:
 
 
 def test_rollout_conserves_what_predator_and_prey_conserve() -> None:
-    system = lotka_volterra()
+    system = ep.lotka_volterra()
     run = system.trajectory()
     x, y = system.model.rollout(run).states.T
     invariant = x - np.log(x) / 3 + y - 2 / 3 * np.log(y)
@@ -135,10 +107,10 @@ def test_rollout_conserves_what_predator_and_prey_conserve() -> None:
 
 
 def test_a_blow_up_is_reported_and_cut() -> None:
-    library = named_terms(["x"], ["x^2"])
-    model = SparseModel(library, ["x"], np.array([[1.0]]))
+    library = ep.named_terms(["x"], ["x^2"])
+    model = ep.SparseModel(library, ["x"], np.array([[1.0]]))
     t = np.linspace(0.0, 2.0, 401)
-    run = Trajectory(t=t, states=(1.0 + 0.1 * t)[:, None], state_names=["x"])
+    run = ep.Trajectory(t=t, states=(1.0 + 0.1 * t)[:, None], state_names=["x"])
     rollout = model.rollout(run)  # 1/(1 - t): infinite at t = 1
     assert rollout.diverged
     assert "grew past 100 times the data's largest value at t = 0.99 s" in rollout.message
@@ -148,19 +120,19 @@ def test_a_blow_up_is_reported_and_cut() -> None:
 
 def test_missing_inputs_are_named() -> None:
     model, run = driven()
-    bare = Trajectory(t=run.t, states=run.states, state_names=["x"])
+    bare = ep.Trajectory(t=run.t, states=run.states, state_names=["x"])
     with pytest.raises(ValueError, match="unknown variable 'u'"):
         model.rollout(bare)
 
 
 def test_bad_coefficients_are_refused() -> None:
-    library = polynomial(["x"], degree=1)
+    library = ep.polynomial(["x"], degree=1)
     with pytest.raises(ValueError, match="one row per term and one column per equation"):
-        SparseModel(library, ["x"], np.zeros((3, 1)))
+        ep.SparseModel(library, ["x"], np.zeros((3, 1)))
     with pytest.raises(ValueError, match="coefficients must be finite"):
-        SparseModel(library, ["x"], np.full((2, 1), np.nan))
+        ep.SparseModel(library, ["x"], np.full((2, 1), np.nan))
     with pytest.raises(ValueError, match=r"unknown state 'y'; this model has \['x'\]"):
-        SparseModel(library, ["x"], np.zeros((2, 1))).terms("y")
+        ep.SparseModel(library, ["x"], np.zeros((2, 1))).terms("y")
 
 
 def test_intervals_come_from_the_covariance_of_their_own_equation() -> None:
@@ -173,28 +145,14 @@ def test_intervals_come_from_the_covariance_of_their_own_equation() -> None:
     assert (low, high) == pytest.approx((-2.63e5, -2.61e5), rel=1e-9)
 
 
-def test_covariance_survives_the_file_exactly() -> None:
-    rng = np.random.default_rng(0)
-    root = rng.standard_normal((4, 4)) / 3.0
-    model = replace(breathing(), covariance=root @ root.T)
-    again = SparseModel.from_json(model.to_json())
-    assert again.covariance is not None
-    np.testing.assert_array_equal(again.covariance, model.covariance)
-
-
 def test_a_model_without_covariance_has_no_intervals() -> None:
     with pytest.raises(ValueError, match="intervals need a covariance: this model has none"):
         breathing().intervals("n_i")
 
 
-def test_covariance_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"shape \(3, 3\) came for 4"):
-        replace(breathing(), covariance=np.eye(3))
-
-
 def test_equal_models_compare_equal_and_hash_alike() -> None:
-    model = lorenz().model
-    again = SparseModel.from_json(model.to_json())
+    model = ep.lorenz().model
+    again = ep.SparseModel.from_json(model.to_json())
     assert again == model
     assert len({model, again, replace(model, provenance={"from": "elsewhere"})}) == 1
     minus_zero = replace(model, coef=np.where(model.coef == 0.0, -0.0, model.coef))
@@ -205,15 +163,15 @@ def test_equal_models_compare_equal_and_hash_alike() -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"coef": lorenz().model.coef * (1.0 + 1e-15)},
+        {"coef": ep.lorenz().model.coef * (1.0 + 1e-15)},
         {"units": {"x": "m"}},
         {"covariance": np.eye(7)},
         {"states": ["z", "y", "x"]},
-        {"library": polynomial(["x", "y", "z"], degree=2).take(np.arange(10)[::-1])},
+        {"library": ep.polynomial(["x", "y", "z"], degree=2).take(np.arange(10)[::-1])},
     ],
 )
 def test_models_that_differ_are_not_equal(change: dict[str, Any]) -> None:
-    model = lorenz().model
+    model = ep.lorenz().model
     assert replace(model, **change) != model
     assert model != model.text()
     with_covariance = replace(model, covariance=np.eye(7))

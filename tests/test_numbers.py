@@ -1,6 +1,5 @@
 """What is taken as samples and times: one meaning is converted, the rest is refused."""
 
-import subprocess
 import sys
 
 import numpy as np
@@ -10,17 +9,12 @@ import pytest
 from ep2sindy.data.gaps import MissingSamples
 from ep2sindy.data.numbers import check_magnitude, column_norms, real_numbers, rounding_s, seconds
 from ep2sindy.data.runs import trajectories_of
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.regression.test_functions import is_even
 from ep2sindy.signals.spectrum import is_uniform
 
-X = np.sin(np.arange(8.0))
-
-
-@pytest.mark.parametrize("unit", ["ns", "us", "ms", "s"])
-def test_dates_are_seconds_from_the_first(unit: str) -> None:
-    dates = np.datetime64("2024-02-28T23:59:58", unit) + np.arange(0, 8, 2).astype("m8[s]")
-    np.testing.assert_array_equal(seconds(dates), [0, 2, 4, 6])
-    np.testing.assert_array_equal(seconds(dates - dates[0]), [0, 2, 4, 6])
+T = np.arange(8.0)
+X = np.sin(T)
 
 
 def test_dates_of_tables_and_arrays_are_seconds() -> None:
@@ -41,7 +35,6 @@ def test_a_time_that_is_no_date_is_missing() -> None:
         (X + 0j, "complex128 came; give real and imaginary parts"),
         (X > 0, "bool came; give 0.0 and 1.0"),
         (["1", "2"], "<U1 came; convert them first"),
-        (np.array([1.0, None]), "object came"),
         (np.array(["2024"], dtype="M8[Y]"), "datetime64"),
     ],
 )
@@ -88,29 +81,19 @@ def test_epoch_seconds_are_even_but_for_their_rounding() -> None:
     assert not is_even(t)
 
 
-def test_a_trajectory_refuses_them_without_type_checks_too() -> None:
-    """As users have it: under `make types` jaxtyping would refuse them first."""
-    lines = [
-        "import numpy as np",
-        "from ep2sindy import Trajectory",
-        "x = np.arange(4.0)[:, None]",
-        "dates = np.datetime64('2024-01-01', 'ms') + np.arange(4)",
-        "print(Trajectory(dates, x, ['x']).t.tolist())",
-        "for t, s in ((x[:, 0], x + 1j), (['0', '1', '2', '3'], x), (x[:, 0], x > 1),",
-        "             (x[:, 0], 1e-300 * x)):",
-        "    try: Trajectory(t, s, ['x'])",
-        "    except ValueError as error: print(str(error)[:30])",
-    ]
-    done = subprocess.run(
-        [sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.splitlines() == [
-        "[0.0, 0.001, 0.002, 0.003]",
-        "states must hold real numbers:",
-        "t must hold real numbers: <U1 ",
-        "states must hold real numbers:",
-        "a variable must be of a size w",
-    ]
+@pytest.mark.skipif("tests.checked" in sys.modules, reason="jaxtyping refuses them first")
+@pytest.mark.parametrize(
+    ("t", "states", "message"),
+    [
+        (T, X + 1j, "states must hold real numbers"),
+        (list("01234567"), X, "t must hold real numbers: <U1"),
+        (T, X > 0.5, "states must hold real numbers"),
+        (T, 1e-300 * X, "a variable must be of a size"),
+    ],
+)
+def test_a_trajectory_refuses_them(t: object, states: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Trajectory(t, states[:, None], ["x"])
 
 
 def test_norms_of_columns_neither_overflow_nor_vanish() -> None:

@@ -6,21 +6,18 @@ import torch
 from torch import nn
 from torchdiffeq import odeint
 
-from ep2sindy.library.library import named_terms
-from ep2sindy.library.relations import constraint
-from ep2sindy.model.model import SparseModel, coef_matrix
+import ep2sindy as ep
 from ep2sindy.refinement.ode import ODE, Drive, augment
 from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
-from ep2sindy.systems.systems import lotka_volterra
 
 SCALE = np.array([2.0, 3.0])
 
 
-def driven_model() -> SparseModel:
+def driven_model() -> ep.SparseModel:
     """x' = -x u + 3, y' = x^2 y - y: powers, a constant and an input."""
-    library = named_terms(["u", "x", "y"], ["1", "y", "u*x", "x^2*y"])
+    library = ep.named_terms(["u", "x", "y"], ["1", "y", "u*x", "x^2*y"])
     equations = [{"1": 3.0, "u*x": -1.0}, {"y": -1.0, "x^2*y": 0.4}]
-    return SparseModel(library, ["x", "y"], coef_matrix(library, equations))
+    return ep.SparseModel(library, ["x", "y"], ep.coef_matrix(library, equations))
 
 
 def constant_drive(value: float, n_batch: int, *, step: float = 1.0) -> Drive:
@@ -41,8 +38,8 @@ def test_rate_is_the_models_in_scaled_states_and_time() -> None:
 
 
 def test_relations_hold_to_rounding_for_any_scaling() -> None:
-    model = lotka_volterra().model
-    relations = constraint(
+    model = ep.lotka_volterra().model
+    relations = ep.constraint(
         model.library,
         {s: tuple(model.terms(s)) for s in model.states},
         ["x: x*y == -1 * y: x*y", "y: y == -0.5"],
@@ -78,8 +75,8 @@ def test_tangents_agree_with_autograd() -> None:
 @pytest.mark.parametrize("step", [RungeKutta(), RungeKutta(2), HermiteSimpson()])
 def test_steps_are_of_order_four(step: RungeKutta | HermiteSimpson) -> None:
     """x' = -x from one: the end of a step against exp(-h)."""
-    library = named_terms(["x"], ["x"])
-    model = SparseModel(library, ["x"], np.array([[-1.0]]))
+    library = ep.named_terms(["x"], ["x"])
+    model = ep.SparseModel(library, ["x"], np.array([[-1.0]]))
     errors = []
     for h in (0.2, 0.1):
         ode = ODE(model, scale=np.ones(1), step_s=h)
@@ -99,8 +96,8 @@ def test_input_beyond_its_last_sample_is_refused() -> None:
 
 def test_cubic_inputs_drive_torchdiffeq_exactly() -> None:
     """x' = u with u a cubic: rk4 integrates it exactly, over two segments."""
-    library = named_terms(["x", "u"], ["u"])
-    ode = ODE(SparseModel(library, ["x"], np.array([[1.0]])), scale=np.ones(2), step_s=1.0)
+    library = ep.named_terms(["x", "u"], ["u"])
+    ode = ODE(ep.SparseModel(library, ["x"], np.array([[1.0]])), scale=np.ones(2), step_s=1.0)
     shifted = [[1.0, -2.0, 0.5, 3.0], [1.0, 1.0, -0.5, 2.5]]  # t^3 - 2 t^2 + t/2 + 3, about 0 and 1
     inputs = torch.tensor(shifted, dtype=torch.float64).view(2, 4, 1, 1, 1)
     ode.drive = Drive(torch.ones((2, 1, 1), dtype=torch.float64), inputs)
@@ -116,7 +113,7 @@ class Constant(nn.Module):
 
 
 def test_correction_adds_to_the_rate_and_has_no_tangents() -> None:
-    model = lotka_volterra().model
+    model = ep.lotka_volterra().model
     plain = ODE(model, scale=SCALE, step_s=0.1)
     extended = ODE(model, scale=SCALE, step_s=0.1, correction=Constant())
     x = torch.ones((1, 2), dtype=torch.float64)
@@ -127,13 +124,13 @@ def test_correction_adds_to_the_rate_and_has_no_tangents() -> None:
 
 
 def test_bad_models_are_refused() -> None:
-    model = lotka_volterra().model
+    model = ep.lotka_volterra().model
     empty = replace(model, coef=np.zeros_like(model.coef))
     with pytest.raises(ValueError, match="at least one term"):
         ODE(empty, scale=SCALE, step_s=0.1)
-    narrow = constraint(model.library, {"x": ("x",), "y": ("y", "x*y")})
+    narrow = ep.constraint(model.library, {"x": ("x",), "y": ("y", "x*y")})
     with pytest.raises(ValueError, match=r"must cover every term .*\('x', 'x\*y'\)"):
         ODE(model, scale=SCALE, step_s=0.1, constraint=narrow)
-    wide = constraint(model.library, {"x": ("x", "x^2", "x*y"), "y": ("y", "x*y")})
+    wide = ep.constraint(model.library, {"x": ("x", "x^2", "x*y"), "y": ("y", "x*y")})
     with pytest.raises(ValueError, match=r"free coefficient must start away from zero.*x\^2"):
         ODE(model, scale=SCALE, step_s=0.1, constraint=wide)

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ep2sindy.library.library import polynomial
+import ep2sindy as ep
 from ep2sindy.model.fixed_point import eigenvalues, fixed_point
 from ep2sindy.operating.choice import (
     StructureCase,
@@ -15,20 +15,16 @@ from ep2sindy.operating.choice import (
     choose,
     try_structures,
 )
-from ep2sindy.operating.fit import SETTINGS
-from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import Fate, law_map
-from ep2sindy.operating.records import OperatingRecord
 from tests.models import model_of
-from tests.test_operating_law import LIBRARY, STATES, STRUCTURE, recorded, records
+from tests.test_operating_law import LIBRARY, SHORT, STATES, STRUCTURE, recorded, records
 from tests.test_stability import HOPF
 
 ONES = np.ones(2)
-SHORT = replace(SETTINGS, n_windows=3, periods=1.0)
 
 
 @cache
-def line() -> tuple[OperatingRecord, ...]:
+def line() -> tuple[ep.operating.OperatingRecord, ...]:
     """Records of the known family along one parameter."""
     values = (0.5, 0.75, 1.0, 1.25, 1.5)
     return tuple(replace(recorded(a, 0.0), parameters={"a": a}) for a in values)
@@ -42,12 +38,12 @@ def tries() -> list[StructureTrial]:
     return try_structures(line(), cases, [1, 2], settings=SHORT)
 
 
-def hopf() -> OperatingLaw:
+def hopf() -> ep.operating.OperatingLaw:
     """r' = r (a - r^2), phase' = 1: a cycle of radius sqrt(a) and period 2 pi where a > 0."""
     pairs = tuple((state, term) for state, terms in HOPF.items() for term in terms)
     coef = np.array([[0.0, 1.0] if s == t else [HOPF[s][t], 0.0] for s, t in pairs])
-    return OperatingLaw(
-        functions=polynomial(["a"], degree=1),
+    return ep.operating.OperatingLaw(
+        functions=ep.polynomial(["a"], degree=1),
         library=model_of(HOPF).library,
         states=("x", "y"),
         coefficients=pairs,
@@ -108,7 +104,7 @@ def test_the_structure_and_degree_of_a_known_family_are_chosen() -> None:
 
 
 def test_candidates_are_the_best_supports_of_every_size() -> None:
-    found = candidate_structures(records(), polynomial(STATES, degree=3), max_terms=3)
+    found = candidate_structures(records(), ep.polynomial(STATES, degree=3), max_terms=3)
     assert len(found) == 4
     assert {len(each.structure["x"]) for each in found} == {2, 3}
     assert any(set(each.structure["x"]) == {"x", "y", "x^3"} for each in found)

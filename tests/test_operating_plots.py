@@ -69,17 +69,6 @@ def test_points_left_out_are_drawn_at_any_frequency(scale: float, unit: str) -> 
     assert min(box.width for box in boxes) > 200
 
 
-def test_points_that_are_all_near_leave_the_panels_their_size() -> None:
-    figure = left_out_figure(left_out(1.0).iloc[:2])
-    drawn(figure)
-    assert min(ax.get_window_extent().width for ax in figure.axes) > 200
-
-
-def test_two_cycles_left_out_are_told_apart() -> None:
-    both = pd.concat([left_out(1.0).assign(branch=name) for name in ("strong", "weak")])
-    assert {"strong cycle", "weak cycle", "outside them"} <= set(drawn(left_out_figure(both)))
-
-
 def test_a_map_shows_every_point_and_the_cycle_that_it_is_not_of() -> None:
     figure = cycle_figure(GRID, POINTS, FITTED, branch="strong", parameters=["a", "b"], labels={})
     assert {"record", "not oscillating", "record of another cycle"} <= set(drawn(figure))
@@ -93,16 +82,6 @@ def test_points_on_a_line_have_no_area() -> None:
     figure = cycle_figure(GRID, POINTS, flat, branch="strong", parameters=["a", "b"], labels={})
     outline = np.unique(figure.axes[0].lines[0].get_xydata(), axis=0)
     np.testing.assert_array_equal(outline, flat[[0, 2]])
-
-
-def test_the_legend_of_a_map_names_the_boundaries_that_are_drawn() -> None:
-    alive = GRID.assign(fate="oscillates")
-    stable, ends = "its fixed point turns stable", "the model's cycle ends"
-    for rows, there in ((GRID, {ends, stable}), (alive, {stable})):
-        figure = cycle_figure(
-            rows, POINTS, FITTED, branch="strong", parameters=["a", "b"], labels={}
-        )
-        assert {stable, ends} & set(drawn(figure)) == there
 
 
 def test_one_parameter_has_a_line_that_ends_with_the_cycle() -> None:

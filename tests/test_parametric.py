@@ -5,11 +5,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.method import Regression
-from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.library.relations import constraint
-from ep2sindy.model.model import SparseModel, coef_matrix
+import ep2sindy as ep
 from ep2sindy.operating.point_fits import (
     Case,
     PointStudy,
@@ -31,25 +27,20 @@ from ep2sindy.operating.quantity_law import laws, power_law_r2, trends
 from ep2sindy.operating.records import OperatingRecord
 from ep2sindy.regression.bootstraps import moving_block_counts
 from ep2sindy.regression.constrained import constrained_fit
-from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.weak import Weak
-from ep2sindy.runtime.parallel import Loky, Serial
-from ep2sindy.selection.criteria import Knee
+from ep2sindy.runtime.parallel import Serial
 from ep2sindy.signals.oscillation import oscillation
 from ep2sindy.signals.smoothers import NoSmoothing
 from tests.models import plain_rows
 
-LIBRARY = named_terms(["x", "y", "R", "u"], ["1", "x*u", "x*y*R"])
+LIBRARY = ep.named_terms(["x", "y", "R", "u"], ["1", "x*u", "x*y*R"])
 TERMS = {"x": ["x*u", "x*y*R"], "y": ["1", "x*y*R"]}
 SHARED = "x: x*y*R == -1 * y: x*y*R"
 UNITS = {"x": "m^-3", "y": "m^-3", "R": "m^3/s", "u": "m/s"}
 LENGTH, INJECTED = Quantity("x: x*u", -1.0, -1), Quantity("y: 1")
 CASES = {
     "free": Case(
-        constraint(LIBRARY, TERMS),
+        ep.constraint(LIBRARY, TERMS),
         {
             "L": LENGTH,
             "g": INJECTED,
@@ -58,28 +49,32 @@ CASES = {
         },
     ),
     "constrained": Case(
-        constraint(LIBRARY, TERMS, [SHARED]),
+        ep.constraint(LIBRARY, TERMS, [SHARED]),
         {"L": LENGTH, "g": INJECTED, "eps": Quantity("x: x*y*R")},
     ),
 }
-SEARCHED = polynomial(["x", "y", "R", "u"], degree=2, products=["x*y*R"])
+SEARCHED = ep.polynomial(["x", "y", "R", "u"], degree=2, products=["x*y*R"])
 
 
 def study(*, weak: bool = True) -> PointStudy:
-    every = RandomSplit(0.0)
-    rows = Weak(split=every) if weak else Differential(NoSmoothing(), split=every)
+    every = ep.RandomSplit(0.0)
+    rows = ep.Weak(split=every) if weak else ep.Differential(NoSmoothing(), split=every)
     return PointStudy(
         library=LIBRARY,
         cases=CASES,
         bootstrap=TimeBootstrap(n_draws=60, periods=1.0),
         refining=Refining(n_windows=10, periods=0.5, max_iter=50),
         searched=SEARCHED,
-        method=Regression(rows, BestSubset(max_terms=3), selection=Knee(n_norm="max_terms")),
+        method=ep.Regression(
+            rows, ep.BestSubset(max_terms=3), selection=ep.Knee(n_norm="max_terms")
+        ),
         formulation=rows,
     )
 
 
-def forced(*, L: float, g: float, eps: float, dt: float = 0.01, periods: float = 20) -> Trajectory:
+def forced(
+    *, L: float, g: float, eps: float, dt: float = 0.01, periods: float = 20
+) -> ep.Trajectory:
     """x' = -x u / L + eps x y R, y' = g - eps x y R, R and u waves of period one."""
     t = np.arange(0.0, periods, dt)
 
@@ -93,7 +88,7 @@ def forced(*, L: float, g: float, eps: float, dt: float = 0.01, periods: float =
     whole = solve_ivp(
         slope, (-20.0, t[-1]), [g * L, 1 / (L * eps)], t_eval=t, rtol=1e-10, atol=1e-12
     )
-    return Trajectory(
+    return ep.Trajectory(
         t=t,
         states=whole.y.T,
         state_names=["x", "y"],
@@ -156,7 +151,7 @@ def test_quantities_of_every_point_come_back(results: list[PointResult]) -> None
 def test_one_search_over_all_points_leaves_out_those_that_do_not_oscillate(
     points: list[OperatingRecord], results: list[PointResult]
 ) -> None:
-    law, rng = polynomial(["V"], degree=1), np.random.default_rng(0)
+    law, rng = ep.polynomial(["V"], degree=1), np.random.default_rng(0)
     plane = [replace(p, parameters={"V": p.parameters["V"]}) for p in points]
     joint = search_shared(plane, results, study(), law, rng=rng)
     assert joint is not None
@@ -178,7 +173,7 @@ def test_one_search_over_all_points_leaves_out_those_that_do_not_oscillate(
 def test_a_joint_search_says_why_it_ties_nothing(
     points: list[OperatingRecord], results: list[PointResult]
 ) -> None:
-    law = polynomial(["V", "m"], degree=2)
+    law = ep.polynomial(["V", "m"], degree=2)
     joint = search_shared(points, results, study(), law, rng=np.random.default_rng(0))
     assert joint is not None
     assert joint.tied is None
@@ -188,10 +183,10 @@ def test_a_joint_search_says_why_it_ties_nothing(
 def test_there_is_no_joint_search_of_one_point_or_without_best_subsets(
     points: list[OperatingRecord], results: list[PointResult]
 ) -> None:
-    law, rng = polynomial(["V", "m"], degree=1), np.random.default_rng(0)
+    law, rng = ep.polynomial(["V", "m"], degree=1), np.random.default_rng(0)
     alone = [points[0], points[3]], [results[0], results[3]]
     assert search_shared(*alone, study(), law, rng=rng) is None
-    lasso = replace(study(), method=replace(study().method, search=AdaptiveLasso()))
+    lasso = replace(study(), method=replace(study().method, search=ep.AdaptiveLasso()))
     assert search_shared(points, results, lasso, law, rng=rng) is None
 
 
@@ -226,7 +221,7 @@ def test_a_point_that_does_not_oscillate_is_kept_and_left_out(
     assert (found.status, found.fits, found.searched) == ("steady", {}, None)
     assert found.spread["x"] < 0.01
     assert trends([found], along="V", at={}).empty
-    assert laws([found], polynomial(["V", "m"], degree=1)) == {}
+    assert laws([found], ep.polynomial(["V", "m"], degree=1)) == {}
     along_m = trends(results, along="m", at={})
     assert set(along_m["n_points"]) == {3}
 
@@ -237,15 +232,6 @@ def test_a_point_does_not_depend_on_the_others(
     (alone,) = results_of(points[:1], study())
     for fit, fitted in alone.fits.items():
         assert fitted.estimates == results[0].fits[fit].estimates
-
-
-@pytest.mark.slow
-def test_workers_change_nothing(points: list[OperatingRecord], results: list[PointResult]) -> None:
-    found = fit_points(points, study(), workers=Loky(2), rng=np.random.default_rng(0))
-    for k, result in enumerate(results):
-        assert {fit: dict(found[k].fits[fit].estimates) for fit in found[k].fits} == {
-            fit: dict(result.fits[fit].estimates) for fit in result.fits
-        }
 
 
 def test_a_point_that_differs_in_its_variables_is_named(points: list[OperatingRecord]) -> None:
@@ -280,7 +266,7 @@ def test_draws_are_least_squares_on_repeated_rows() -> None:
     run = forced(**TRUTHS[0])
     rng = np.random.default_rng(1)
     noisy = replace(run, states=run.states * (1 + 0.01 * rng.normal(size=run.states.shape)))
-    problems = Differential(split=RandomSplit(0.25)).assemble([noisy], LIBRARY, rng=rng)
+    problems = ep.Differential(split=ep.RandomSplit(0.25)).assemble([noisy], LIBRARY, rng=rng)
     relations = CASES["constrained"].constraint
     model = constrained_fit(problems, relations)
     settings = {"block": 40, "n_draws": 7}
@@ -312,18 +298,12 @@ def test_draws_are_least_squares_on_repeated_rows() -> None:
     np.testing.assert_allclose(found.mean(axis=0), fit, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(case, id=name, marks=pytest.mark.slow if name == "constrained" else ())
-        for name, case in CASES.items()
-    ],
-)
-def test_draws_of_whitened_rows_spread_as_their_covariance_says(case: Case) -> None:
+def test_draws_of_whitened_rows_spread_as_their_covariance_says() -> None:
+    case = CASES["free"]
     run, rng = forced(**TRUTHS[0]), np.random.default_rng(0)
     noise = 0.03 * run.states.std(axis=0) * rng.normal(size=run.states.shape)
     noisy = replace(run, states=run.states + noise)
-    problems = Weak(split=RandomSplit(0.0)).assemble([noisy], LIBRARY, rng=rng)
+    problems = ep.Weak(split=ep.RandomSplit(0.0)).assemble([noisy], LIBRARY, rng=rng)
     model = constrained_fit(problems, case.constraint)
     draws = resample_coefficients(problems, case.constraint, model, block=1, n_draws=500, rng=rng)
     assert model.covariance is not None
@@ -344,8 +324,8 @@ def correlated_problem(rng: np.random.Generator, *, n_rows: int, memory: int) ->
 
 def coverage(*, block: int, n_seeds: int) -> float:
     """Share of 95 % intervals that hold the true coefficient."""
-    library = named_terms(["a", "b"], ["a", "b"])
-    relations = constraint(library, {"z": ["a", "b"]})
+    library = ep.named_terms(["a", "b"], ["a", "b"])
+    relations = ep.constraint(library, {"z": ["a", "b"]})
     quantities = {"p": Quantity("z: a"), "q": Quantity("z: b", -1.0)}
     inside = []
     for rng in np.random.default_rng(0).spawn(n_seeds):
@@ -361,11 +341,11 @@ def coverage(*, block: int, n_seeds: int) -> float:
 
 
 def test_intervals_hold_the_truth_where_rows_are_alike() -> None:
-    # 200 intervals: two standard deviations of a share of 0.95 are 0.03; blocks that keep most of
+    # 100 intervals: two standard deviations of a share of 0.95 are 0.04; blocks that keep most of
     # the memory, and are few, cost some more.
-    assert 0.88 < coverage(block=20, n_seeds=100) < 0.99
+    assert 0.88 < coverage(block=20, n_seeds=50) < 0.99
     # Row by row the variance is some 3.4 times too small: 0.95 becomes 0.7.
-    assert coverage(block=1, n_seeds=100) < 0.8
+    assert coverage(block=1, n_seeds=50) < 0.8
 
 
 def test_a_quantity_is_a_coefficient_or_its_reciprocal() -> None:
@@ -376,9 +356,9 @@ def test_a_quantity_is_a_coefficient_or_its_reciprocal() -> None:
     assert units == ["m", "m^-3 s^-1", "1", "1"]
 
 
-def model_of(covariance: np.ndarray | None = None) -> SparseModel:
-    coef = coef_matrix(LIBRARY, [{"x*u": -40.0, "x*y*R": 0.8}, {"1": 2.0, "x*y*R": -0.6}])
-    return SparseModel(LIBRARY, ["x", "y"], coef, UNITS, {}, covariance)
+def model_of(covariance: np.ndarray | None = None) -> ep.SparseModel:
+    coef = ep.coef_matrix(LIBRARY, [{"x*u": -40.0, "x*y*R": 0.8}, {"1": 2.0, "x*y*R": -0.6}])
+    return ep.SparseModel(LIBRARY, ["x", "y"], coef, UNITS, {}, covariance)
 
 
 def test_intervals_are_carried_from_coefficients_to_quantities() -> None:
@@ -437,7 +417,7 @@ def test_r2_says_whether_points_lie_on_a_power_law() -> None:
 
 
 def test_laws_are_made_from_fits_that_came_to_their_end() -> None:
-    library = polynomial(["V", "m"], degree=1)
+    library = ep.polynomial(["V", "m"], degree=1)
     results = [power_law(V, m) for V, m in ((200, 5), (300, 2), (300, 6), (400, 5))]
     law = laws(results, library, max_terms=2)["free"]["L"]
     assert len(law.terms) <= 2
@@ -451,14 +431,8 @@ def test_laws_are_made_from_fits_that_came_to_their_end() -> None:
     ("make", "message"),
     [
         (lambda: Quantity("x"), "a quantity needs a coefficient such as 'n_i: n_i*u_iz': 'x'"),
-        (lambda: Quantity("x: x", factor=0.0), "factor=0.0, power=1 came"),
-        (lambda: Quantity("x: x", power=2), "the power 1 or -1"),
         (lambda: TimeBootstrap(n_draws=10, periods=1.0), "40 draws or more"),
-        (lambda: TimeBootstrap(n_draws=60, periods=0.0), "blocks some length"),
-        (
-            lambda: Refining(n_windows=1, periods=0.5, max_iter=50),
-            "two windows and iterations or more",
-        ),
+        (lambda: Refining(n_windows=1, periods=0.5, max_iter=50), "two windows and iterations or"),
         (lambda: OperatingRecord({"V": 1.0}, None), "V=1 oscillates: it needs its trajectory"),
         (
             lambda: replace(
@@ -483,19 +457,13 @@ def test_a_record_of_few_blocks_is_refused(points: list[OperatingRecord]) -> Non
         results_of(points[:1], how)
 
 
-@pytest.mark.parametrize(
-    ("samples_per_period", "missed"),
-    [(25, 0.012), pytest.param(50, 0.0028, marks=pytest.mark.slow)],
-)
-def test_smoothing_biases_least_squares_and_not_refinements(
-    samples_per_period: int, missed: float
-) -> None:
-    run = forced(**TRUTHS[0], dt=1.0 / samples_per_period, periods=20)
-    form = Differential(split=RandomSplit(0.0))
+def test_smoothing_biases_least_squares_and_not_refinements() -> None:
+    run = forced(**TRUTHS[0], dt=1.0 / 25, periods=20)
+    form = ep.Differential(split=ep.RandomSplit(0.0))
     smoothed = replace(study(), method=replace(study().method, formulation=form), formulation=form)
     (result,) = results_of([OperatingRecord({"V": 1.0}, run)], smoothed)
     for name, value in TRUTHS[0].items():
         fitted, refined = (result.fits[f"constrained{end}"].estimates for end in ("", "_refined"))
-        assert abs(fitted[name].value / value - 1.0) == pytest.approx(missed, rel=0.15)
+        assert abs(fitted[name].value / value - 1.0) == pytest.approx(0.012, rel=0.15)
         assert not fitted[name].low < value < fitted[name].high
         assert refined[name].value == pytest.approx(value, rel=1e-5)

@@ -67,14 +67,6 @@ def test_a_discovery_is_drawn_with_its_selected_candidates(
     assert star.get_xdata() == found.chosen["x"].n_terms
 
 
-def test_a_front_that_no_rule_has_scored_marks_no_candidate() -> None:
-    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
-    front = ep.discover(run, method=ep.Regression()).fronts["x"]
-    (ax,) = ep.plot(front.with_scores(np.full(len(front.candidates), np.nan))).axes
-    assert "selected" not in [line.get_label() for line in ax.lines]
-    assert ax.get_title() == r"$\dot{x}$"
-
-
 def test_a_free_run_is_drawn_over_its_record_whatever_their_order() -> None:
     run = record()
     turned = replace(run, states=run.states[:, ::-1], state_names=["y", "x"])
@@ -84,14 +76,6 @@ def test_a_free_run_is_drawn_over_its_record_whatever_their_order() -> None:
     n = len(data.get_ydata())
     assert np.array_equal(data.get_ydata(), run.states[:n, 0])
     assert model.get_ydata() == pytest.approx(data.get_ydata(), abs=1e-5)
-
-
-def test_a_free_run_that_diverges_leaves_the_panels_as_the_data_are() -> None:
-    away = model_of({"x": {"x": 5.0}, "y": {"y": 5.0}})
-    figure = ep.plot(ep.free_run(away, record()))
-    labels(figure)
-    low, high = figure.axes[0].get_ylim()
-    assert high - low < 3.0 * np.ptp(record().states[:, 0])
 
 
 def test_a_cycle_is_drawn_closed_with_runs_that_reach_it() -> None:

@@ -1,32 +1,18 @@
-import os
-import signal
-
 import numpy as np
 import pytest
 import xarray as xr
 
+import ep2sindy as ep
 from ep2sindy.data.prepare import gradient
-from ep2sindy.data.sampling import point_samples
-from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.point_search import PointSearch
-from ep2sindy.discovery.pointwise import STATUSES, blocks_of, pointwise
-from ep2sindy.library.library import named_terms
-from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.test_functions import Bumps
-from ep2sindy.regression.weak import Weak
+from ep2sindy.discovery.pointwise import STATUSES, blocks_of
 from ep2sindy.runtime import parallel
-from ep2sindy.runtime.parallel import Dask, Loky, Serial
-from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.refined import RefinedScore
+from ep2sindy.runtime.parallel import Loky, Serial
 from ep2sindy.signals.smoothers import NoSmoothing
 
 T = np.linspace(0.0, 2.0, 201)
 Z, R = np.array([0.01, 0.02, 0.03, 0.04]), np.array([0.035, 0.04, 0.05])
-LIBRARY = named_terms(["x", "u", "w"], ["1", "x", "u", "w", "u*w"])
+LIBRARY = ep.named_terms(["x", "u", "w"], ["1", "x", "u", "w", "u*w"])
 
 
 def parabolas(z: np.ndarray = Z, r: np.ndarray = R) -> xr.Dataset:
@@ -54,13 +40,13 @@ def searching(**changes: object) -> PointSearch:
     settings = {
         "states": ["x"],
         "library": LIBRARY,
-        "formulation": Differential(),
-        "search": BestSubset(max_terms=4),
-        "bootstraps": Bootstraps(n=8, n_culled=0, block=10),
-        "selection": EBIC(),
+        "formulation": ep.Differential(),
+        "search": ep.BestSubset(max_terms=4),
+        "bootstraps": ep.Bootstraps(n=8, n_culled=0, block=10),
+        "selection": ep.EBIC(),
     } | changes
     names = ("formulation", "search", "bootstraps", "selection")
-    recipe = Regression(**{name: settings.pop(name) for name in names})
+    recipe = ep.Regression(**{name: settings.pop(name) for name in names})
     return PointSearch(method=recipe, **settings)
 
 
@@ -71,13 +57,13 @@ def bytes_of(result: xr.Dataset) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def exact() -> xr.Dataset:
     """Without noise; looked at, never changed."""
-    return pointwise(parabolas(), searching(), workers=Serial())
+    return ep.pointwise(parabolas(), searching(), workers=Serial())
 
 
 @pytest.fixture(scope="module")
 def noisy_bytes() -> dict[str, bytes]:
     """With noise, on one process, in blocks of a line."""
-    return bytes_of(pointwise(noisy(), searching(), workers=Serial(), block_points=4))
+    return bytes_of(ep.pointwise(noisy(), searching(), workers=Serial(), block_points=4))
 
 
 def test_every_point_gets_its_own_exact_equation(exact: xr.Dataset) -> None:
@@ -95,22 +81,26 @@ def test_every_point_gets_its_own_exact_equation(exact: xr.Dataset) -> None:
 
 
 def test_weights_are_shares_of_the_root_mean_square() -> None:
-    found = searching(formulation=Differential(split=RandomSplit(test_fraction=0.0)))
-    result = pointwise(parabolas(), found, workers=Serial()).isel(z=1, r=2, equation=0)
+    found = searching(formulation=ep.Differential(split=ep.RandomSplit(test_fraction=0.0)))
+    result = ep.pointwise(parabolas(), found, workers=Serial()).isel(z=1, r=2, equation=0)
     one, u = 1.0 + 100.0 * Z[1], -50.0 * R[2] * np.sqrt(np.square(T).mean())
     weight = result["weight"].sel(term=["1", "u"]).values
     np.testing.assert_allclose(weight, np.array([one, u]) / (one - u), rtol=1e-9)
     np.testing.assert_allclose(np.abs(result["weight"]).sum(), 1.0)
 
 
-@pytest.mark.parametrize("formulation", [Differential(), Weak()], ids=["differential", "weak"])
+@pytest.mark.parametrize(
+    "formulation", [ep.Differential(), ep.Weak()], ids=["differential", "weak"]
+)
 def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
-    draws = Bootstraps(n=8, n_culled=0)
-    search = searching(formulation=formulation, search=AdaptiveLasso(), bootstraps=draws)
+    draws = ep.Bootstraps(n=8, n_culled=0)
+    search = searching(formulation=formulation, search=ep.AdaptiveLasso(), bootstraps=draws)
     field = noisy()
-    result = pointwise(field, search, workers=Serial()).isel(z=2, r=1)
-    run = point_samples(field.isel(z=[2], r=[1]), z=Z[2], r=R[1], states=["x"], inputs=["u", "w"])
-    found = discover([run], LIBRARY, search.method, seed=search.seed)
+    result = ep.pointwise(field, search, workers=Serial()).isel(z=2, r=1)
+    run = ep.point_samples(
+        field.isel(z=[2], r=[1]), z=Z[2], r=R[1], states=["x"], inputs=["u", "w"]
+    )
+    found = ep.discover([run], LIBRARY, search.method, seed=search.seed)
     np.testing.assert_allclose(result["coef"].sel(equation="x"), found.model.coef[:, 0], rtol=1e-12)
     chosen = found.chosen["x"]
     assert result["r2_test"].item() == pytest.approx(chosen.r2_test)
@@ -122,49 +112,24 @@ def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
 def test_a_field_may_have_one_axis(axis: str, exact: xr.Dataset) -> None:
     other = "r" if axis == "z" else "z"
     line = parabolas().isel({other: 0}, drop=True)
-    result = pointwise(line, searching(), workers=Serial())
+    result = ep.pointwise(line, searching(), workers=Serial())
     assert result["status"].dims == (axis,)
     np.testing.assert_array_equal(result["coef"], exact["coef"].isel({other: 0}))
 
 
-def test_a_grid_may_be_one_point() -> None:
-    result = pointwise(parabolas(Z[:1], R[:1]), searching(), workers=Serial())
-    assert result["coef"].sel(term="u").item() == pytest.approx(-50.0 * R[0])
-
-
 @pytest.mark.parametrize("block_points", [1, 5, 1000])
 def test_blocks_do_not_show_in_the_result(block_points: int, noisy_bytes: dict[str, bytes]) -> None:
-    result = pointwise(noisy(), searching(), workers=Serial(), block_points=block_points)
+    result = ep.pointwise(noisy(), searching(), workers=Serial(), block_points=block_points)
     assert bytes_of(result) == noisy_bytes
 
 
-@pytest.mark.parametrize("start_s", [-1.0, np.inf], ids=["processes", "too little for them"])
+@pytest.mark.slow  # two processes import the package
 def test_processes_give_the_same_bits(
-    start_s: float, noisy_bytes: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+    noisy_bytes: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(parallel, "START_S", start_s)
-    result = pointwise(noisy(), searching(), workers=Loky(n_jobs=2), block_points=2)
+    monkeypatch.setattr(parallel, "START_S", -1.0)  # as if they were started already
+    result = ep.pointwise(noisy(), searching(), workers=Loky(n_jobs=2), block_points=2)
     assert bytes_of(result) == noisy_bytes
-
-
-@pytest.mark.slow
-def test_a_cluster_gives_the_same_bits_even_if_a_worker_is_killed(
-    noisy_bytes: dict[str, bytes],
-) -> None:
-    from distributed import LocalCluster  # takes a second: not while tests are collected
-
-    at = {"host": "127.0.0.1", "dashboard_address": None}
-    with LocalCluster(n_workers=2, threads_per_worker=1, **at) as cluster:
-        pids = [worker.pid for worker in cluster.workers.values()]
-
-        def kill_one(_: int) -> None:
-            if pids:
-                os.kill(pids.pop(), signal.SIGKILL)
-                pids.clear()
-
-        workers = Dask(cluster.scheduler_address)
-        spread = pointwise(noisy(), searching(), workers=workers, block_points=1, progress=kill_one)
-    assert bytes_of(spread) == noisy_bytes
 
 
 def test_what_cannot_be_fitted_is_flagged_and_never_zero() -> None:
@@ -176,8 +141,8 @@ def test_what_cannot_be_fitted_is_flagged_and_never_zero() -> None:
     x[:, 1, 0] = 0.0
     x[:, 1, 1] = 1e60 * np.sin(T)  # finite, but not to the sixth
     field = field.assign(x=(field["x"].dims, x, field["x"].attrs))
-    library = named_terms(["x", "u", "w"], ["1", "x^6", "u"])
-    result = pointwise(field, searching(library=library), workers=Serial())
+    library = ep.named_terms(["x", "u", "w"], ["1", "x^6", "u"])
+    result = ep.pointwise(field, searching(library=library), workers=Serial())
     named = [[STATUSES[k] for k in row] for row in result["status"].values]
     assert named[0] == ["no_plasma", "missing_samples", "too_little_variation"]
     assert named[1] == ["too_little_variation", "no_fit", "fitted"]
@@ -190,7 +155,7 @@ def test_what_cannot_be_fitted_is_flagged_and_never_zero() -> None:
 def test_masked_inputs_mask_the_point() -> None:
     field = parabolas()
     field = field.assign(w=field["w"].where(field["z"] > 0.015).assign_attrs(units="1"))
-    status = pointwise(field, searching(), workers=Serial())["status"]
+    status = ep.pointwise(field, searching(), workers=Serial())["status"]
     assert (status.isel(z=0) == STATUSES.index("no_plasma")).all()
     assert (status.isel(z=slice(1, None)) == 0).all()
 
@@ -198,14 +163,14 @@ def test_masked_inputs_mask_the_point() -> None:
 def test_a_setting_that_fits_nowhere_is_an_error() -> None:
     short = parabolas().isel(time=slice(0, 8))
     with pytest.raises(ValueError, match="could be fitted: smoothing needs at least 11"):
-        pointwise(short, searching(), workers=Serial())
+        ep.pointwise(short, searching(), workers=Serial())
 
 
 def test_a_field_without_plasma_is_an_error() -> None:
     field = parabolas()
     empty = field.assign(x=field["x"].where(field["z"] > 1.0).assign_attrs(units="m^-3"))
     with pytest.raises(ValueError, match="fitted: of 12 points 12 with no plasma; see to the mask"):
-        pointwise(empty, searching(), workers=Serial())
+        ep.pointwise(empty, searching(), workers=Serial())
 
 
 def test_units_of_coefficients_follow_the_field(exact: xr.Dataset) -> None:
@@ -226,28 +191,32 @@ def test_blocks_cover_the_grid_once() -> None:
 def test_what_makes_no_sense_is_refused() -> None:
     field = parabolas()
     with pytest.raises(ValueError, match=r"unknown variables \['w'\]; this field has"):
-        pointwise(field.drop_vars("w"), searching(), workers=Serial())
+        ep.pointwise(field.drop_vars("w"), searching(), workers=Serial())
     with pytest.raises(ValueError, match="needs a grid: this field has time alone"):
-        pointwise(field.isel(z=0, r=0, drop=True), searching(), workers=Serial())
+        ep.pointwise(field.isel(z=0, r=0, drop=True), searching(), workers=Serial())
     with pytest.raises(ValueError, match="block_points=0 came"):
-        pointwise(field, searching(), workers=Serial(), block_points=0)
+        ep.pointwise(field, searching(), workers=Serial(), block_points=0)
     with pytest.raises(ValueError, match="needs bootstraps for its spread: n=0"):
-        searching(bootstraps=Bootstraps(n=0))
+        searching(bootstraps=ep.Bootstraps(n=0))
     with pytest.raises(ValueError, match=r"least_variation must lie in \[0, 1\)"):
         searching(least_variation=1.0)
     with pytest.raises(ValueError, match=r"states must depend on time: \['x'\] do not"):
-        pointwise(field.assign(x=field["x"].isel(time=0, drop=True)), searching(), workers=Serial())
+        ep.pointwise(
+            field.assign(x=field["x"].isel(time=0, drop=True)), searching(), workers=Serial()
+        )
 
 
 def test_rules_that_refine_all_equations_serve_every_point() -> None:
     field = parabolas(Z[:1], R[:1])
-    result = pointwise(field, searching(selection=RefinedScore()), workers=Serial())
+    result = ep.pointwise(field, searching(selection=ep.RefinedScore()), workers=Serial())
     assert result["n_terms"].item() == 2
 
 
 EXACT = [
-    Differential(smoother=NoSmoothing()),
-    Weak(Bumps(half_width_s=0.1), NoSmoothing(), smooth_library=False, errors_in_variables=False),
+    ep.Differential(smoother=NoSmoothing()),
+    ep.Weak(
+        ep.Bumps(half_width_s=0.1), NoSmoothing(), smooth_library=False, errors_in_variables=False
+    ),
 ]
 
 
@@ -258,9 +227,11 @@ def test_a_travelling_wave_has_its_speed_at_every_point(formulation: object) -> 
     axes = {"time": ("time", T, {"units": "s"}), "z": ("z", z)}
     field = xr.Dataset({"x": (("time", "z"), wave, {"units": "m^-3"})}, coords=axes)
     field = gradient(field, of="x", name="dx_dz")
-    library = named_terms(["x", "dx_dz"], ["1", "x", "dx_dz"])
-    found = searching(library=library, formulation=formulation, bootstraps=Bootstraps(n_culled=0))
-    result = pointwise(field, found, workers=Serial()).sel(equation="x")
+    library = ep.named_terms(["x", "dx_dz"], ["1", "x", "dx_dz"])
+    found = searching(
+        library=library, formulation=formulation, bootstraps=ep.Bootstraps(n_culled=0)
+    )
+    result = ep.pointwise(field, found, workers=Serial()).sel(equation="x")
     np.testing.assert_allclose(result["coef"].sel(term="dx_dz"), -speed, rtol=1e-8)
     assert (result["coef"].sel(term=["1", "x"]) == 0.0).all()
     assert result["coef_units"].sel(term="dx_dz").item() == "m s^-1"
@@ -285,19 +256,19 @@ def exchanging(noise: float) -> xr.Dataset:
 
 def sharing(**changes: object) -> PointSearch:
     settings = {"states": ["x", "y"], "formulation": EXACT[1], "relations": [SHARED]} | changes
-    library = named_terms(["x", "y", "u", "w"], ["u", "w"])
-    draws = Bootstraps(n=4, n_culled=0)
+    library = ep.named_terms(["x", "y", "u", "w"], ["u", "w"])
+    draws = ep.Bootstraps(n=4, n_culled=0)
     return searching(**{"library": library, "bootstraps": draws, **settings})
 
 
 def test_relations_tie_equations_at_every_point_and_in_every_draw() -> None:
-    exact = pointwise(exchanging(0.0), sharing(), workers=Serial())
+    exact = ep.pointwise(exchanging(0.0), sharing(), workers=Serial())
     expected = np.array([[2.0, -1.0], [-2.0, 3.0]])[:, :, None] + np.zeros(2)
     for name in ("coef", "coef_draws"):
         np.testing.assert_allclose(*np.broadcast_arrays(exact[name], expected), rtol=1e-6)
     np.testing.assert_allclose(exact["r2_test"], 1.0, rtol=1e-9)
     noisy, free = (
-        pointwise(exchanging(0.05), sharing(relations=tied), workers=Serial())
+        ep.pointwise(exchanging(0.05), sharing(relations=tied), workers=Serial())
         for tied in ([SHARED], [])
     )
     for name in ("coef", "coef_draws"):
@@ -311,16 +282,16 @@ def test_relations_tie_equations_at_every_point_and_in_every_draw() -> None:
 
 def test_a_draw_of_all_rows_is_the_fit_of_all_rows() -> None:
     """Blocks as long as the rows draw each of them once."""
-    whole = Bootstraps(n=2, n_culled=0, smallest=1.0, largest=1.0, block=len(T))
-    form = Differential(smoother=NoSmoothing(), split=RandomSplit(test_fraction=0.0))
+    whole = ep.Bootstraps(n=2, n_culled=0, smallest=1.0, largest=1.0, block=len(T))
+    form = ep.Differential(smoother=NoSmoothing(), split=ep.RandomSplit(test_fraction=0.0))
     search = sharing(formulation=form, bootstraps=whole)
-    result = pointwise(exchanging(0.05), search, workers=Serial())
+    result = ep.pointwise(exchanging(0.05), search, workers=Serial())
     same = np.broadcast_arrays(result["coef_draws"], result["coef"])
     np.testing.assert_allclose(*same, rtol=1e-9)
 
 
 def test_relations_that_cannot_hold_are_refused_at_once() -> None:
     with pytest.raises(ValueError, match="n_culled must be 0, 1 came"):
-        sharing(bootstraps=Bootstraps(n=4, n_culled=1))
+        sharing(bootstraps=ep.Bootstraps(n=4, n_culled=1))
     with pytest.raises(ValueError, match="'v'"):
         sharing(relations=["x: v == -1 * y: v"])

@@ -9,10 +9,11 @@ from matplotlib.figure import Figure
 from ep2sindy.discovery.regimes import find_regimes
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import draw
-from ep2sindy.report.screen import WIDTH, Screen
+from ep2sindy.report.screen import Screen
 from ep2sindy.studies.pointwise import Outcome
+from tests.models import point_study
 
-TERMS = ["1", "n_n", "n_i*u_iz"]
+TERMS = {"1": "m^-3 s^-1", "n_n": "s^-1", "n_i*u_iz": "m^-1"}
 
 
 def study() -> xr.Dataset:
@@ -27,32 +28,12 @@ def study() -> xr.Dataset:
     coef[1, 0, 1] = 1e23
     coef[1, 1, 3:], weight[1, 1, 3:] = 3e4, 1.0
     coef[1, 0, 5:7], weight[1, 0, 5:7], weight[1, 1, 5:7] = 1e20, 0.05, 0.95
-    status = np.zeros(12, dtype=np.int8)
-    status[-1] = 1
-    valid = np.where(status == 0, 1.0, np.nan)
     draws = np.stack([weight] * 2)
     draws[:, 1, :, 0] = [0.0, 1.0, 0.0]  # the bootstraps put this point into the other regime
-    dims = ("equation", "term", "z", "r")
-    on_grid = {name: (v * valid).reshape(*v.shape[:-1], 4, 3) for name, v in (
-        ("coef", coef), ("weight", weight), ("inclusion", np.abs(weight)), ("weight_draws", draws),
-        ("n_terms", (coef != 0.0).sum(axis=1)),
-    )}  # fmt: skip
-    return xr.Dataset(
-        {
-            **{name: (dims, on_grid[name]) for name in ("coef", "weight", "inclusion")},
-            "weight_draws": (("draw", *dims), on_grid["weight_draws"]),
-            "n_terms": (("equation", "z", "r"), on_grid["n_terms"]),
-            "status": (("z", "r"), status.reshape(4, 3)),
-        },
-        coords={
-            "equation": ["n_i", "n_n"],
-            "term": TERMS,
-            "coef_units": (dims[:2], [["m^-3 s^-1", "s^-1", "m^-1"]] * 2),
-            "z": np.linspace(0.0, 0.03, 4),
-            "r": np.linspace(0.04, 0.05, 3),
-        },
-        attrs={"no_fit": ""},
-    )
+    coef, weight, draws = (v.reshape(*v.shape[:-1], 4, 3) for v in (coef, weight, draws))
+    lost = np.zeros((4, 3), dtype=bool)
+    lost[-1, -1] = True
+    return point_study(coef, weight, lost, terms=TERMS, share=np.abs(weight), draws=draws)
 
 
 def outcome(result: xr.Dataset, *, max_regimes: int = 4) -> Outcome:
@@ -83,14 +64,6 @@ def test_equations_without_terms_are_counted(found: Outcome, tmp_path: Path) -> 
         assert "11 fitted, 1 no plasma; no term in n_i' at 2" in text
 
 
-@pytest.mark.parametrize(("most", "limited"), [(1, True), (8, False)])
-def test_as_many_regimes_as_allowed_is_said(most: int, limited: bool, tmp_path: Path) -> None:
-    found = outcome(study(), max_regimes=most)
-    assert found.summary()["at_limit"] is limited
-    for text in (printed(found, tmp_path), page(found)):
-        assert ("as many as max_regimes allows" in text) == limited
-
-
 def test_medians_come_with_their_spread_and_the_share_of_points(
     found: Outcome, tmp_path: Path
 ) -> None:
@@ -109,41 +82,10 @@ def test_medians_come_with_their_spread_and_the_share_of_points(
         assert "terms that act, with medians over the regime's points that have them" in said
 
 
-def test_an_equation_in_which_no_term_acts_is_zero(found: Outcome, tmp_path: Path) -> None:
-    assert "\nn_i' = 0\n" in printed(found, tmp_path)
-    assert "<mo>=</mo><mrow><mn>0</mn></mrow></mrow></math>" in page(found)
-
-
-def test_the_table_of_regimes_fits_the_log(tmp_path: Path) -> None:
-    result = study()
-    result["coef"][1, 0, 0] = [-1.23e22, -3.45e22, -4.57e22]
-    result = result.assign_coords(term=["1", "n_n", "n_i*n_n*R_ion"])
-    lines = printed(outcome(result), tmp_path).splitlines()
-    assert max(map(len, lines)) <= WIDTH
-    assert any("-4.21e+22 │ -1.94e+22 │ m^-3 s^-1" in line for line in lines)
-
-
 def test_points_of_low_confidence_are_counted(found: Outcome, tmp_path: Path) -> None:
     for said in (printed(found, tmp_path), page(found)):
         assert "3 regimes; confidence below 0.5 at 9% of points" in said
         assert "Regime 1: 3 points, confidence 0.67, below 0.5 at 33%" in said
-
-
-def test_the_page_says_that_a_regime_need_not_be_connected(found: Outcome) -> None:
-    assert "need not be connected" in page(found)
-
-
-@pytest.mark.parametrize(
-    ("cut", "own", "other"),
-    [({}, "Grey: the term is not in", "No mark:"), ({"r": 1}, "No mark:", "Grey:")],
-    ids=str,
-)
-def test_a_caption_describes_the_figure_over_the_axes(
-    cut: dict[str, int], own: str, other: str
-) -> None:
-    html = page(outcome(study().isel(cut, drop=True)))
-    assert own in html
-    assert other not in html
 
 
 def test_a_study_without_any_term_has_no_table_of_them() -> None:

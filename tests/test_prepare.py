@@ -84,19 +84,8 @@ GAP = RAMP.assign(I_d=RAMP["I_d"].where(np.arange(N) != 70))
         (crop, RAMP, {"start_s": 0.01}, r"0.01 to 0.001999 s leaves 0 of 2000, .* 0 to 0.001999"),
         *((decimate, RAMP, {"factor": n}, f"{n} came with 2000 samples") for n in (0, -2, 2000)),
         (low_pass, RAMP, {"cutoff_Hz": 5e5}, "half the sampling rate, 500000 Hz: 500000 came"),
-        (low_pass, RAMP, {"cutoff_Hz": 0.0}, "cutoff_Hz must lie between 0"),
-        (
-            low_pass,
-            RAMP.isel(time=slice(15)),
-            {"cutoff_Hz": 1e5},
-            "of order 4 needs more than 15 samples: 15 came",
-        ),
-        (
-            low_pass,
-            RAMP.isel(time=np.r_[0:70, 71:90]),
-            {"cutoff_Hz": 1e5},
-            r"t\[70\] - t\[69\] = 2e-06 s, the mean is",
-        ),
+        (low_pass, RAMP.isel(time=slice(15)), {"cutoff_Hz": 1e5}, "of order 4 needs more than 15"),
+        (low_pass, RAMP.isel(time=np.r_[0:70, 71:90]), {"cutoff_Hz": 1e5}, r"t\[70\] - t\[69\] ="),
         (low_pass, GAP, {"cutoff_Hz": 1e5}, "I_d = nan at time = 7e-05 s"),
     ],
 )
@@ -105,12 +94,6 @@ def test_steps_say_what_they_cannot_do(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         step(field, **setting)
-
-
-def test_low_pass_then_decimate_matches_a_slow_tone() -> None:
-    both = tone(2e3) + tone(2.02e5)  # 202 kHz would fold onto 2 kHz at every fifth sample
-    part = decimate(low_pass(field(I_d=(("time",), both, "A")), cutoff_Hz=5e4), factor=5)
-    assert part["I_d"].values[40:-40] == pytest.approx(tone(2e3)[::5][40:-40], abs=1e-2)
 
 
 def grid() -> xr.Dataset:
@@ -151,13 +134,10 @@ def test_derive_does_not_overflow_in_float32() -> None:
     [
         ({"expression": "u_z * 2"}, r"unknown variable 'u_z'; this field has \[.*'u_iz'"),
         ({"expression": "2 + 3"}, "must use at least one variable"),
-        ({"expression": "u_iz +"}, "'u_iz \\+' is no expression"),
         ({"expression": "__import__('os')"}, "an expression may use .* came"),
         ({"expression": "u_iz.values"}, r"'u_iz.values' came"),
-        ({"expression": "u_iz[0]"}, r"'u_iz\[0\]' came"),
         ({"expression": "u_iz > 3"}, "w must hold real numbers: its type is bool"),
         ({"expression": "u_iz", "name": "u_ir"}, "the field already has 'u_ir'"),
-        ({"expression": "u_iz", "name": "time"}, "the field already has 'time'"),
     ],
 )
 def test_derive_refuses_what_is_no_arithmetic(settings: dict, message: str) -> None:
@@ -172,7 +152,7 @@ def test_keep_where_masks_walls() -> None:
     assert after["T_e_eV"].identical(grid()["T_e_eV"])
 
 
-@pytest.mark.parametrize("condition", ["u_iz > 3", "z", "1 < 2", "0 < z < 1"])
+@pytest.mark.parametrize("condition", ["u_iz > 3", "0 < z < 1"])
 def test_a_condition_must_compare_places(condition: str) -> None:
     with pytest.raises(ValueError, match="a condition must compare|an expression may use"):
         keep_where(grid(), condition=condition)
@@ -210,7 +190,7 @@ def test_a_table_is_not_extrapolated(tmp_path: Path) -> None:
         ionization_rate(warm(), table=tmp_path / "rates.csv")
 
 
-@pytest.mark.parametrize("text", ["1,1e-22\n", "5,1\n1,2\n", "1\n2\n", "a,b\nc,d\n"])
+@pytest.mark.parametrize("text", ["1,1e-22\n", "5,1\n1,2\n", "a,b\nc,d\n"])
 def test_a_bad_table_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "rates.csv").write_text(text)
     with pytest.raises(ValueError, match="a rate table must have two columns"):
@@ -354,20 +334,11 @@ def test_a_gradient_without_faces_takes_the_average_of_the_product() -> None:
     ("settings", "message"),
     [
         ({"of": "n_i", "axis": "r"}, r"two or more cells along z or r: .*'z': 4.* came"),
-        ({"of": "n_i", "axis": "time"}, "two or more cells along z or r"),
         ({"of": "I_d"}, r"gradient of 'I_d' along 'z' needs .*sizes \{'time': 2\} came"),
-        ({"of": "n_n*u_n"}, "unknown variable 'n_n'; this field has"),
-        ({"of": "n_i+2"}, "a product is variables joined by"),
         ({"of": "n_i", "name": "n_i"}, "already has 'n_i'"),
-        ({"of": "n_i", "name": "d n/dz"}, "d n/dz"),
     ],
 )
 def test_a_gradient_that_cannot_be_taken_says_why(settings: dict[str, str], message: str) -> None:
     line = uneven(np.ones(4)).assign(I_d=("time", [1.0, 2.0], {"units": "A"}))
     with pytest.raises(ValueError, match=message):
         gradient(line, **{"name": "slope", **settings})
-
-
-def test_one_cell_has_no_gradient() -> None:
-    with pytest.raises(ValueError, match=r"two or more cells along z or r: .*'z': 1.* came"):
-        gradient(uneven(np.ones(4)).isel(z=[0]), of="n_i", name="slope")

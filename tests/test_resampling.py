@@ -1,38 +1,9 @@
 import numpy as np
 import pytest
 
+import ep2sindy as ep
 from ep2sindy.regression import bootstraps
 from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
-from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.systems.systems import lorenz
-
-
-def test_a_draw_has_the_size_asked_for() -> None:
-    rng = np.random.default_rng(0)
-    for n_drawn, block in ((1, 1), (100, 1), (100, 7), (3, 20), (1000, 50)):
-        assert moving_block_counts(50, n_drawn=n_drawn, block=block, rng=rng).sum() == n_drawn
-
-
-def test_a_draw_is_made_of_whole_runs() -> None:
-    counts = moving_block_counts(1000, n_drawn=20, block=20, rng=np.random.default_rng(0))
-    (drawn,) = np.nonzero(counts)
-    assert (np.diff(drawn) == 1).all()
-    assert (counts[drawn] == 1).all()
-
-
-def test_every_run_is_equally_likely() -> None:
-    rng = np.random.default_rng(0)
-    counts = moving_block_counts(10, n_drawn=80_000, block=4, rng=rng)
-    covered_by = np.array([1, 2, 3, 4, 4, 4, 4, 3, 2, 1])  # of the seven runs of four
-    expected = 20_000 * covered_by / 7
-    np.testing.assert_allclose(counts, expected, atol=4 * np.sqrt(expected.max()))
-
-
-def test_single_rows_are_drawn_as_plain_integers() -> None:
-    counts = moving_block_counts(30, n_drawn=12, block=1, rng=np.random.default_rng(3))
-    drawn = np.random.default_rng(3).integers(30, size=12)
-    np.testing.assert_array_equal(counts, np.bincount(drawn, minlength=30))
 
 
 @pytest.mark.parametrize("block", [0, 31])
@@ -42,8 +13,8 @@ def test_a_block_must_fit(block: int) -> None:
 
 
 def test_bootstraps_draw_neighbours_together() -> None:
-    system = lorenz()
-    (problem,) = Differential().assemble(
+    system = ep.lorenz()
+    (problem,) = ep.Differential().assemble(
         [system.trajectory()], system.model.library, rng=np.random.default_rng(0)
     )
     terms = np.ones(len(system.model.library), dtype=np.bool_)
@@ -58,19 +29,19 @@ def test_bootstraps_draw_neighbours_together() -> None:
 def test_weights_of_a_long_record_are_held_for_some_draws_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    system = lorenz()
-    (problem,) = Differential().assemble(
+    system = ep.lorenz()
+    (problem,) = ep.Differential().assemble(
         [system.trajectory().window(0, 400)], system.model.library, rng=np.random.default_rng(0)
     )
     terms, held = np.ones(len(system.model.library), dtype=np.bool_), []
     together = Bootstraps(n=7).draw(problem, terms, np.random.default_rng(0))
-    resampled_sums = RegressionRows.resampled_sums
+    resampled_sums = ep.regression.RegressionRows.resampled_sums
 
-    def tell(problem: RegressionRows, weights: np.ndarray) -> np.ndarray:
+    def tell(problem: ep.regression.RegressionRows, weights: np.ndarray) -> np.ndarray:
         held.append(weights.size)
         return resampled_sums(problem, weights)
 
-    monkeypatch.setattr(RegressionRows, "resampled_sums", tell)
+    monkeypatch.setattr(ep.regression.RegressionRows, "resampled_sums", tell)
     monkeypatch.setattr(bootstraps, "MOST_WEIGHTS", 2 * problem.n_train)
     in_parts = Bootstraps(n=7).draw(problem, terms, np.random.default_rng(0))
     assert max(held) <= 2 * problem.n_train
@@ -79,16 +50,11 @@ def test_weights_of_a_long_record_are_held_for_some_draws_at_once(
 
 
 def test_blocks_never_cross_trajectories() -> None:
-    system = lorenz()
+    system = ep.lorenz()
     run = system.trajectory()
-    (problem,) = Differential().assemble(
+    (problem,) = ep.Differential().assemble(
         [run, run], system.model.library, rng=np.random.default_rng(0)
     )
     terms = np.ones(len(system.model.library), dtype=np.bool_)
     with pytest.raises(ValueError, match="cross from one trajectory to the next: 2 trajectories"):
         Bootstraps(block=2).draw(problem, terms, np.random.default_rng(0))
-
-
-def test_a_block_of_a_bootstrap_is_a_whole_number() -> None:
-    with pytest.raises(ValueError, match="block must be a whole number, one or more: 0 came"):
-        Bootstraps(block=0)

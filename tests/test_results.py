@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import pandas as pd
 import pytest
 
 from ep2sindy.report.results import Metric, ResultTable, View, facts, percent
@@ -77,12 +76,6 @@ def test_json_keeps_states_together_and_headlines_part_them() -> None:
     assert headline == {"free/f_error": 0.012, "free/x/r2": 0.5, "free/y/r2": 0.25}
 
 
-def test_records_need_no_names() -> None:
-    table = ResultTable(list(FITS.values()), METRICS)
-    assert list(table.csv()) == ["status", "f_error", "r2_x", "r2_y"]
-    assert list(ResultTable([FITS["free"]], METRICS[1:2]).headline()) == ["f_error"]
-
-
 def test_no_records_make_no_rows() -> None:
     empty: ResultTable[Fit] = ResultTable({}, METRICS)
     assert empty.csv("fit").empty
@@ -110,9 +103,3 @@ def test_a_column_may_hold_the_state_in_its_middle() -> None:
 )
 def test_shares_read_as_percent(value: float, text: str) -> None:
     assert percent(1, sign=True)(value) == text
-
-
-def test_what_has_no_format_is_left_to_the_table() -> None:
-    assert METRICS[0].cell("converged") == "converged"
-    assert Metric("n", len).cell(None) is None
-    assert pd.isna(Metric("n", len).cell(float("nan")))  # type: ignore[call-overload]

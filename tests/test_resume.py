@@ -17,7 +17,6 @@ from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.studies import benchmark, trace
 from tests.programs import Computed, composed, computed
 from tests.test_experiment_trace import glance, scope, signal
-from tests.test_file_names import swing
 
 
 @pytest.fixture(autouse=True)
@@ -134,17 +133,7 @@ def test_a_benchmark_goes_on(cache: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert not list(cache.rglob("output.pkl"))  # removed once all is written
 
 
-def test_a_prediction_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    swing(Path(), 0.6, 0.9, 1.2)
-    config = composed(
-        "+exp=predict", "data=recognised", "points.files=a{a}.csv", "~models",
-        "+models.own.terms={n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}", "degrees=[1]",
-        "windows.n_windows=4", "map_points=2", "forecasts=2", "parallel=serial",
-    )  # fmt: skip
-    whole = computed(config)
-    check_same(whole, broken_and_resumed(monkeypatch, config, after=5))
-
-
+@pytest.mark.slow
 def test_a_trace_that_ends_in_its_tests_searches_once(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

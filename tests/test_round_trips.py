@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
 from ep2sindy.data.mapping import Variable
-from ep2sindy.data.numbers import real_numbers, seconds
+from ep2sindy.data.numbers import seconds
 from ep2sindy.data.open import open_field
 from ep2sindy.data.runs import trajectories_of
 
@@ -108,14 +108,6 @@ def test_every_container_gives_its_samples(values: np.ndarray, kind: str) -> Non
     (found,) = trajectories_of(run)
     np.testing.assert_array_equal(found.states, values)
     np.testing.assert_array_equal(found.t, t)
-
-
-@FEW
-@given(arrays(np.float64, N, elements=st.floats(-1e9, 1e9)), arrays(bool, N))
-def test_what_is_masked_is_missing_and_nothing_else(values: np.ndarray, mask: np.ndarray) -> None:
-    found = real_numbers(np.ma.array(values, mask=mask), "x")
-    np.testing.assert_array_equal(np.isnan(found), mask)
-    np.testing.assert_array_equal(found[~mask], values[~mask])
 
 
 @FEW

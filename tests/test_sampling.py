@@ -3,27 +3,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import Regression
+import ep2sindy as ep
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.test_functions import Bumps, even_grid, is_even, one_about_each
-from ep2sindy.regression.weak import Weak, WeightedWeak
+from ep2sindy.regression.test_functions import even_grid, is_even, one_about_each
 from ep2sindy.regression.whitening import whitened_rows
-from ep2sindy.systems.systems import System, lorenz, lotka_volterra, van_der_pol
+from ep2sindy.systems.systems import System, van_der_pol
 
-EVERY_ROW = Weak(split=RandomSplit(0.0))
+EVERY_ROW = ep.Weak(split=ep.RandomSplit(0.0))
 RANDOM = np.cumsum(np.random.default_rng(3).exponential(size=400))
 
 
-def thinned(run: Trajectory, rng: np.random.Generator, share: float = 0.7) -> Trajectory:
+def thinned(run: ep.Trajectory, rng: np.random.Generator, share: float = 0.7) -> ep.Trajectory:
     """What is left of a trajectory that has lost samples at random."""
     kept = np.sort(rng.permutation(run.n_samples)[: round(share * run.n_samples)])
     return replace(run, t=run.t[kept], states=run.states[kept])
 
 
-def assembled(system: System, runs: list[Trajectory]) -> tuple[RegressionRows, ...]:
+def assembled(system: System, runs: list[ep.Trajectory]) -> tuple[RegressionRows, ...]:
     return EVERY_ROW.assemble(runs, system.model.library, rng=np.random.default_rng(0))
 
 
@@ -33,7 +29,9 @@ def test_rounded_times_count_as_even() -> None:
     assert not is_even(np.round(t, 2))
     assert not is_even(np.delete(t, 100))
     x = np.sin(t)
-    exact, rounded = (Bumps().windows(s, x, rng=np.random.default_rng(0)) for s in (t, t.round(3)))
+    exact, rounded = (
+        ep.Bumps().windows(s, x, rng=np.random.default_rng(0)) for s in (t, t.round(3))
+    )
     np.testing.assert_allclose(exact.mean.toarray(), rounded.mean.toarray())
 
 
@@ -44,7 +42,7 @@ def test_straight_lines_pass_unequal_steps_unchanged() -> None:
     assert lines @ RANDOM == pytest.approx(grid, rel=1e-12)
     assert lines.data.min() > 0.0
     x = np.sin(0.05 * RANDOM)
-    windows = Bumps(half_width_s=8.0).windows(RANDOM, x, rng=np.random.default_rng(0))
+    windows = ep.Bumps(half_width_s=8.0).windows(RANDOM, x, rng=np.random.default_rng(0))
     n = len(windows)
     assert windows.slope @ (2.0 - 3.0 * RANDOM) == pytest.approx(np.full(n, -3.0), rel=1e-9)
     assert windows.mean @ np.ones(400) == pytest.approx(np.ones(n), rel=1e-12)
@@ -55,16 +53,18 @@ def test_no_two_windows_stand_about_one_sample() -> None:
     t = np.array([0.0, 1.0, 5.0, 6.0])
     middle = np.array([0.0, 1.0, 2.0, 3.5, 4.0, 5.0, 6.0])
     assert one_about_each(t, middle).tolist() == [0, 1, 3, 6]
-    windows = Bumps(half_width_s=3.0).windows(RANDOM, np.sin(RANDOM), rng=np.random.default_rng(0))
+    windows = ep.Bumps(half_width_s=3.0).windows(
+        RANDOM, np.sin(RANDOM), rng=np.random.default_rng(0)
+    )
     assert len(windows) < len(RANDOM)
 
 
 def test_windows_never_cross_a_gap() -> None:
     t = np.concatenate([np.arange(100.0), 150.0 + np.arange(8.0), 200.0 + np.arange(60.0)])
     states = np.stack([np.sin(0.2 * t), np.cos(0.2 * t)], axis=1)
-    run = Trajectory(t=t, states=states, state_names=["x", "y"])
+    run = ep.Trajectory(t=t, states=states, state_names=["x", "y"])
     halves = [run.window(0, 100), run.window(108, 168)]  # 8 samples say nothing of their noise
-    system = lotka_volterra()
+    system = ep.lotka_volterra()
     whole, apart = assembled(system, [run]), assembled(system, halves)
     for problem, other in zip(whole, apart, strict=True):
         assert np.array_equal(problem.theta, other.theta)
@@ -72,13 +72,13 @@ def test_windows_never_cross_a_gap() -> None:
         assert problem.trajectories == (run,)
     t = np.arange(200.0).reshape(20, 10) + 40.0 * np.arange(20)[:, None]
     with pytest.raises(ValueError, match="20 samples without a gap: 19 steps are over 10 times"):
-        Trajectory(t.ravel(), np.sin(t).reshape(-1, 1), ["x"]).stretches()
-    short = Trajectory(np.arange(8.0), np.sin(np.arange(8.0))[:, None], ["x"])
+        ep.Trajectory(t.ravel(), np.sin(t).reshape(-1, 1), ["x"]).stretches()
+    short = ep.Trajectory(np.arange(8.0), np.sin(np.arange(8.0))[:, None], ["x"])
     assert short.stretches() == [short]
 
 
 def test_residuals_of_the_truth_are_white_where_samples_are_missing() -> None:
-    system, rng = lotka_volterra(), np.random.default_rng(0)
+    system, rng = ep.lotka_volterra(), np.random.default_rng(0)
     runs = [thinned(system.trajectory(noise=0.02, rng=rng), rng) for _ in range(6)]
     for problem in assembled(system, runs):
         truth = system.model.terms(problem.equations[0])
@@ -93,12 +93,12 @@ def test_residuals_of_the_truth_are_white_where_samples_are_missing() -> None:
 
 
 @pytest.mark.parametrize(
-    "system", [lotka_volterra(), van_der_pol(), lorenz()], ids=lambda s: s.name
+    "system", [ep.lotka_volterra(), van_der_pol(), ep.lorenz()], ids=lambda s: s.name
 )
 def test_known_systems_are_found_with_30_percent_of_the_samples_missing(system: System) -> None:
     rng = np.random.default_rng(1)
     run = thinned(system.trajectory(noise=0.05, rng=rng), rng)
-    found = discover(run, system.model.library, Regression(WeightedWeak()))
+    found = ep.discover(run, system.model.library, ep.Regression(ep.WeightedWeak()))
     for state in system.model.states:
         truth = system.model.terms(state)
         assert found.model.terms(state) == pytest.approx(truth, rel=0.2)

@@ -1,19 +1,17 @@
 import numpy as np
 import pytest
 
-from ep2sindy.library.library import polynomial
-from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+import ep2sindy as ep
+from ep2sindy.regression.bootstraps import pooled_supports
 from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.searches import BestSubset
-from ep2sindy.selection.criteria import EBIC, Knee, log_supports
+from ep2sindy.selection.criteria import log_supports
 from ep2sindy.selection.rule import Selection
-from ep2sindy.systems.systems import lorenz
 from tests.models import plain_rows
 
-BIC, LOG_KNEE = EBIC(gamma=0.0, coarsening=None), Knee(scale="log")
-RULES = [Knee(), LOG_KNEE, BIC, EBIC(), EBIC(coarsening=None)]
-CRITERIA = [BIC, EBIC(), EBIC(coarsening=None)]
+BIC, LOG_KNEE = ep.EBIC(gamma=0.0, coarsening=None), ep.Knee(scale="log")
+RULES = [ep.Knee(), LOG_KNEE, BIC, ep.EBIC(), ep.EBIC(coarsening=None)]
+CRITERIA = [BIC, ep.EBIC(), ep.EBIC(coarsening=None)]
 
 
 def front_of(errors: list[float], n_library: int) -> ParetoFront:
@@ -43,27 +41,27 @@ def n_selected(rule: Selection, front: ParetoFront) -> int:
 def test_knee_distance_is_equation_9_of_the_thesis() -> None:
     # Table I: R2 0.63 with two of six terms has d = 0.49 (0.498), 0.69 with three 0.59.
     front = front_of([1.0, 0.9, 0.37, 0.31], 6)
-    (distances,) = Knee("library").scores([front])
+    (distances,) = ep.Knee("library").scores([front])
     assert distances[2:] == pytest.approx([0.498, 0.588], abs=1e-3)
-    assert n_selected(Knee("library"), front) == 2
+    assert n_selected(ep.Knee("library"), front) == 2
 
 
 def test_knee_can_be_normalised_by_the_largest_candidate() -> None:
     # Table II: R2 0.92 with two terms has d = 0.41, 0.95 with three 0.60: n_norm is 5.
     front = front_of([1.0, 0.9, 0.08, 0.05, 0.04], 20)
-    (distances,) = Knee("max_terms").scores([front])
+    (distances,) = ep.Knee("max_terms").scores([front])
     assert distances[2:4] == pytest.approx([0.41, 0.60], abs=5e-3)
-    assert n_selected(Knee("library"), front) == 2
+    assert n_selected(ep.Knee("library"), front) == 2
 
 
 def test_normalisations_disagree_where_a_term_costs_less() -> None:
     front = front_of([1.0, 0.30, 0.10, 0.02], 40)
-    assert n_selected(Knee("library"), front) == 3
-    assert n_selected(Knee("max_terms"), front) == 1
+    assert n_selected(ep.Knee("library"), front) == 3
+    assert n_selected(ep.Knee("max_terms"), front) == 1
 
 
 def test_nothing_is_selected_when_nothing_helps() -> None:
-    assert n_selected(Knee(), front_of([1.0, 0.999], 2)) == 0
+    assert n_selected(ep.Knee(), front_of([1.0, 0.999], 2)) == 0
 
 
 def test_a_score_is_called_by_its_own_name() -> None:
@@ -75,7 +73,7 @@ def test_a_score_is_called_by_its_own_name() -> None:
 def test_the_log_knee_keeps_a_small_term_of_an_exact_law() -> None:
     # The third term lowers the error by 1 % of the whole, but by a factor of a thousand.
     front = front_of([1.0, 0.5, 0.01, 1e-5, 0.9e-5], 10)
-    assert n_selected(Knee(), front) == 2
+    assert n_selected(ep.Knee(), front) == 2
     assert n_selected(LOG_KNEE, front) == 3
     (scores,) = LOG_KNEE.scores([front])
     height = np.log([1e5, 0.5e5, 1e3, 1.0, 0.9]) - np.log(0.9)
@@ -100,7 +98,7 @@ def noisy_front(n_rows: int = 200, *, seed: int = 0, scale: float = 1.0) -> Pare
 
 def fronts_from(problem: RegressionRows) -> list[ParetoFront]:
     rng = np.random.default_rng(0)
-    pooled = pooled_supports(problem, BestSubset(max_terms=6), Bootstraps(n=0), rng=rng)
+    pooled = pooled_supports(problem, ep.BestSubset(max_terms=6), ep.Bootstraps(n=0), rng=rng)
     return [pareto_front(problem, supports) for supports in pooled]
 
 
@@ -121,7 +119,7 @@ def test_criteria_are_their_formulas() -> None:
     ways = np.array([log_supports(front.problem.library, c.terms) for c in front.candidates])
     for rule, penalty in (
         (BIC, k * np.log(60)),
-        (EBIC(gamma=0.5, coarsening=None), k * np.log(60) + ways),
+        (ep.EBIC(gamma=0.5, coarsening=None), k * np.log(60) + ways),
     ):
         (scores,) = rule.scores([front])
         expected = misfit(front) + penalty
@@ -133,12 +131,12 @@ def test_coarsening_counts_fewer_rows() -> None:
     front = noisy_front(n_rows=60)
     n = 60 / (1 + 60 / 40)
     ways = np.array([log_supports(front.problem.library, c.terms) for c in front.candidates])
-    (scores,) = EBIC(coarsening=40.0).scores([front])
+    (scores,) = ep.EBIC(coarsening=40.0).scores([front])
     expected = n / 60 * misfit(front) + front.sizes * np.log(n) + 2 * ways
     assert np.diff(scores) == pytest.approx(np.diff(expected), rel=1e-9)
 
 
-@pytest.mark.parametrize("rule", [BIC, EBIC(), EBIC(coarsening=None)], ids=repr)
+@pytest.mark.parametrize("rule", [BIC, ep.EBIC(), ep.EBIC(coarsening=None)], ids=repr)
 def test_criteria_find_two_true_terms_in_white_noise(rule: Selection) -> None:
     found = []
     for seed in range(40):
@@ -154,7 +152,7 @@ def test_criteria_find_two_true_terms_in_white_noise(rule: Selection) -> None:
 @pytest.fixture(scope="module")
 def exact_fronts() -> list[ParetoFront]:
     """Of the Lorenz system, with the true derivative in place of a numerical one."""
-    system = lorenz()
+    system = ep.lorenz()
     run, library = system.trajectory(), system.model.library
     target = system.model.derivative(run.states, np.empty((run.n_samples, 0)))
     return fronts_from(plain_rows(library.evaluate(run.states), target, library, run.state_names))
@@ -164,7 +162,7 @@ def exact_fronts() -> list[ParetoFront]:
 def test_criteria_keep_no_term_that_explains_rounding(
     rule: Selection, exact_fronts: list[ParetoFront]
 ) -> None:
-    truth = lorenz().model
+    truth = ep.lorenz().model
     for front, scores in zip(exact_fronts, rule.scores(exact_fronts), strict=True):
         assert set(front.with_scores(scores).best.terms) == set(truth.terms(front.equation))
 
@@ -185,7 +183,7 @@ def test_every_front_has_its_own_scores(rule: Selection) -> None:
 
 
 def test_supports_are_counted_among_terms_of_no_higher_degree() -> None:
-    library = polynomial(["x", "y"], degree=3)  # 1, 3, 6 and 10 terms up to degrees 0 to 3
+    library = ep.polynomial(["x", "y"], degree=3)  # 1, 3, 6 and 10 terms up to degrees 0 to 3
     assert log_supports(library, []) == 0.0
     assert log_supports(library, ["1"]) == 0.0
     assert log_supports(library, ["x"]) == pytest.approx(np.log(3))
@@ -196,10 +194,10 @@ def test_supports_are_counted_among_terms_of_no_higher_degree() -> None:
 @pytest.mark.parametrize(
     ("rule", "setting", "message"),
     [
-        (EBIC, {"gamma": -1.0}, "gamma must be zero or more: -1.0 came"),
-        (EBIC, {"coarsening": 1.0}, "coarsening counts rows, and must be above 1: 1.0 came"),
-        (Knee, {"n_norm": "libary"}, "'library' or 'max_terms': 'libary' came"),
-        (Knee, {"scale": "ln"}, "scale must be 'linear' or 'log': 'ln' came"),
+        (ep.EBIC, {"gamma": -1.0}, "gamma must be zero or more: -1.0 came"),
+        (ep.EBIC, {"coarsening": 1.0}, "coarsening counts rows, and must be above 1: 1.0 came"),
+        (ep.Knee, {"n_norm": "libary"}, "'library' or 'max_terms': 'libary' came"),
+        (ep.Knee, {"scale": "ln"}, "scale must be 'linear' or 'log': 'ln' came"),
     ],
 )
 def test_impossible_settings_are_refused(rule: type, setting: dict, message: str) -> None:

@@ -208,9 +208,9 @@ def test_moved_samples_are_those_of_the_time_they_belong_to() -> None:
     np.testing.assert_allclose(found.samples * late.scale, expected, atol=2e-3)
 
 
-@pytest.mark.parametrize(("kind", "delay"), [("lag 1", 1), ("lag 2", 2)])
-def test_a_late_channel_is_said_and_brought_forward_on_request(kind: str, delay: int) -> None:
-    system, run = spoilt("lotka_volterra", kind, 0, 0.02)
+def test_a_late_channel_is_said_and_brought_forward_on_request() -> None:
+    system, run = spoilt("lotka_volterra", "lag 2", 0, 0.02)
+    run = run.window(0, 500)
     found = ep.discover(run, system.model.library)
     assert found.misfit.startswith("y comes ")
     assert found.model.covariance is None
@@ -218,14 +218,14 @@ def test_a_late_channel_is_said_and_brought_forward_on_request(kind: str, delay:
     np.testing.assert_array_equal(aligned.model.coef != 0.0, system.model.coef != 0.0)
     assert not aligned.misfit
     assert aligned.estimate is not None
-    assert aligned.estimate.delays_s[1] == pytest.approx(delay * run.dt_s, rel=0.05)
+    assert aligned.estimate.delays_s[1] == pytest.approx(2.0 * run.dt_s, rel=0.05)
     assert "brought together with the others" in aligned.remarks[0]
 
 
 def test_the_first_channel_may_be_the_late_one() -> None:
     system, run = spoilt("lorenz", "none", 1, 0.02)
     states = np.column_stack([run.states[:-2, 0], run.states[2:, 1:]])
-    late = ep.Trajectory(run.t[2:], states, run.state_names)
+    late = ep.Trajectory(run.t[2:], states, run.state_names).window(0, 500)
     found = ep.estimate([late], system.model.library, align=True)
     np.testing.assert_allclose(found.delays_s / run.dt_s, [2.0, 0.0, 0.0], atol=0.1)
     np.testing.assert_array_equal(found.model.coef != 0.0, system.model.coef != 0.0)
@@ -269,7 +269,7 @@ def test_a_state_that_is_another_one_is_refused() -> None:
 
 
 def test_states_that_hang_together_but_for_their_noise_are_named() -> None:
-    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0).window(0, 400)
     rng = np.random.default_rng(1)
     second = run.states[:, 0] + 0.02 * rng.standard_normal(run.n_samples)
     both = ep.Trajectory(run.t, np.column_stack([run.states, second]), ["x", "y", "z"])

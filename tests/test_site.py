@@ -26,53 +26,6 @@ def test_every_public_name_stands_on_one_page_of_the_reference() -> None:
     assert all(pages)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),  # `TABLE` stands for the head of a table
-    [
-        (
-            "Sum a*b*c.\n\nt: in s. x: of `a*b`,\nat t.\nRaises ValueError for less.\n\n>>> 1\n1",
-            "Sum a\\*b\\*c.\n\nTABLE\n| `t` | in s. |\n| `x` | of `a*b`, at t. |"
-            "\n\nRaises ValueError for less.\n\n```pycon\n>>> 1\n1\n```",
-        ),
-        (  # a name at the end of a line; names together; a sentence with a colon is no name
-            "Sum.\n\nt: in s. x:\nof t, so: large. x, t: both.",
-            "Sum.\n\nTABLE\n| `t` | in s. |\n| `x` | of t, so: large. |\n| `x`, `t` | both. |",
-        ),
-        (  # where what continues is indented, the rest is a paragraph
-            "Sum.\n\nt: in s,\n    at x.\nValues are read\nwhen they are used.",
-            "Sum.\n\nTABLE\n| `t` | in s, at x. |\n\nValues are read when they are used.",
-        ),
-    ],
-)
-def test_a_docstring_becomes_paragraphs_and_a_table(text: str, expected: str) -> None:
-    pytest.importorskip("griffe", reason="the site's tools come with the extra `docs`")
-    markdown_of = run_path(str(ROOT / "docs" / "docstrings.py"))["markdown_of"]
-    table = "| name | meaning |\n|---|---|"
-    assert markdown_of(text, {"t", "x"}) == expected.replace("TABLE", table)
-
-
-def test_bars_do_not_end_a_cell() -> None:
-    markdown = pytest.importorskip("markdown", reason="the site's tools come with the extra `docs`")
-    docstrings = run_path(str(ROOT / "docs" / "docstrings.py"))
-    text = docstrings["markdown_of"]("t: |x| or `a | b`, <i>.", {"t"})
-    cells = re.findall("<td>(.*)</td>", markdown.markdown(text, extensions=["tables"]))
-    assert cells == ["<code>t</code>", "|x| or <code>a | b</code>, &lt;i&gt;."]
-    assert docstrings["first_sentence"]("The norm\n|x|. More.\n\nx: in m.") == r"The norm \|x\|."
-
-
-def test_the_index_says_of_every_name_what_it_is() -> None:
-    pytest.importorskip("mkdocs", reason="the site's tools come with the extra `docs`")
-    site = run_path(str(ROOT / "docs" / "site.py"))
-    lines = site["_contents"]().splitlines()
-    rows = {
-        row[1]: row[2] for line in lines if (row := re.match(r"\| .*\]\[(.*)\] \| (.*) \|$", line))
-    }
-    assert set(rows) == set(dotted_names())
-    assert not [name for name, text in rows.items() if len(text) < 10]
-    assert rows["ep2sindy.discover"] == "Find sparse equations for every state of the runs."
-    assert rows["ep2sindy.refine"].startswith("Fit the free coefficients")  # overloaded
-
-
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Its address."""

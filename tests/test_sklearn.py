@@ -17,34 +17,6 @@ from tests.models import model_of
 SINDy = ep.sklearn.SINDy
 ROWS = ep.Regression()
 
-NO_TIMES = "the check brings y that is random, or whole numbers; here y are times, which increase"
-EXPECTED = dict.fromkeys(
-    [
-        "check_fit_score_takes_y",
-        "check_estimators_overwrite_params",
-        "check_dont_overwrite_parameters",
-        "check_estimators_fit_returns_self",
-        "check_readonly_memmap_input",
-        "check_n_features_in_after_fitting",
-        "check_positive_only_tag_during_fit",
-        "check_estimators_dtypes",
-        "check_dtype_object",
-        "check_pipeline_consistency",
-        "check_estimators_nan_inf",
-        "check_estimators_pickle",
-        "check_f_contiguous_array_estimator",
-        "check_methods_sample_order_invariance",
-        "check_methods_subset_invariance",
-        "check_fit2d_1feature",
-        "check_dict_unchanged",
-        "check_fit_idempotent",
-        "check_fit_check_is_fitted",
-        "check_n_features_in",
-        "check_fit2d_predict1d",
-    ],
-    NO_TIMES,
-)
-
 
 class WithTimes(SINDy):  # type: ignore[misc]
     """The estimator as the checks can call it: of y they bring it takes the length alone."""
@@ -63,14 +35,6 @@ def record() -> ep.Trajectory:
 
 def test_the_checks_of_scikit_learn_pass_with_times() -> None:
     check_estimator(WithTimes(degree=1, method=ROWS), on_skip=None)
-
-
-def test_without_times_those_checks_fail_that_need_none() -> None:
-    results = check_estimator(
-        SINDy(degree=1, method=ROWS), expected_failed_checks=EXPECTED, on_skip=None
-    )
-    failed = {each["check_name"] for each in results if each["status"] == "xfail"}
-    assert failed == set(EXPECTED)
 
 
 def test_it_finds_what_discover_finds() -> None:

@@ -1,39 +1,35 @@
 import numpy as np
 import pytest
 
-from ep2sindy.systems.systems import (
-    System,
-    damped_oscillator,
-    lorenz,
-    lotka_volterra,
-    van_der_pol,
-)
+import ep2sindy as ep
 
 
 @pytest.mark.parametrize(
     ("system", "n_samples", "n_terms"),
     [
-        (damped_oscillator(), 3000, 3),
-        (lotka_volterra(), 1000, 4),
-        (van_der_pol(), 1000, 4),
-        (lorenz(), 3000, 7),
+        (ep.systems.damped_oscillator(), 3000, 3),
+        (ep.lotka_volterra(), 1000, 4),
+        (ep.systems.van_der_pol(), 1000, 4),
+        (ep.lorenz(), 3000, 7),
     ],
     ids=lambda v: getattr(v, "name", None),
 )
-def test_systems_are_sampled_as_in_the_thesis(system: System, n_samples: int, n_terms: int) -> None:
+def test_systems_are_sampled_as_in_the_thesis(
+    system: ep.systems.System, n_samples: int, n_terms: int
+) -> None:
     assert system.trajectory().n_samples == n_samples
     assert np.count_nonzero(system.model.coef) == n_terms
 
 
 def test_damped_oscillator_matches_its_solution() -> None:
-    run = damped_oscillator().trajectory()
+    run = ep.systems.damped_oscillator().trajectory()
     damped = 3.0 * np.sqrt(1 - 0.1**2)
     exact = np.exp(-0.3 * run.t) * (np.cos(damped * run.t) + 0.3 / damped * np.sin(damped * run.t))
     assert run.states[:, 0] == pytest.approx(exact, abs=1e-8)
 
 
 def test_noise_is_a_share_of_the_rms() -> None:
-    system = lorenz()
+    system = ep.lorenz()
     clean = system.trajectory().states
     noisy = system.trajectory(noise=0.05, rng=np.random.default_rng(0)).states
     rms = np.sqrt(np.square(clean).mean(axis=0))
@@ -43,4 +39,4 @@ def test_noise_is_a_share_of_the_rms() -> None:
 
 def test_noise_without_a_generator_is_refused() -> None:
     with pytest.raises(ValueError, match="together with an rng: noise=0.05, rng=None"):
-        lorenz().trajectory(noise=0.05)
+        ep.lorenz().trajectory(noise=0.05)

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import Task
-from ep2sindy.discovery.method import DiscoveryMethod
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.runtime.values import check_kind
 
@@ -29,14 +27,6 @@ WRONG = {
         replace(OTHER, states=OTHER.states[:, ::-1], state_names=["y", "x"]),
         r"trajectory 1 has states \['y', 'x'\] and inputs \[\]; give all of them the same states",
     ),
-    "fewer": (
-        ep.Trajectory(OTHER.t, OTHER.states[:, :1], ["x"]),
-        r"trajectory 1 has states \['x'\] and inputs \[\]; give all of them the same states",
-    ),
-    "more": (
-        ep.Trajectory(OTHER.t, np.column_stack([OTHER.states, np.sin(OTHER.t)]), ["x", "y", "z"]),
-        r"trajectory 1 has states \['x', 'y', 'z'\] and inputs \[\]; give all of them",
-    ),
     "repeated": (RUN, "every sample must come once: 200 samples in a row stand in"),
 }
 
@@ -49,20 +39,10 @@ def test_runs_that_do_not_agree_are_refused_by_every_method(method, wrong: str) 
         ep.discover([RUN, other], LIBRARY, method)
 
 
-@pytest.mark.parametrize("wrong", WRONG)
-def test_runs_that_do_not_agree_are_not_estimated(wrong: str) -> None:
-    other, message = WRONG[wrong]
-    with pytest.raises(ValueError, match=message):
-        ep.estimate([RUN, other], LIBRARY)
-
-
 ASKED = [
     ({"terms": {"z": ["x"]}}, r"unknown state 'z'; there are \['x', 'y'\]"),
-    ({"terms": {"z": []}}, r"unknown state 'z'; there are \['x', 'y'\]"),
     ({"terms": {"x": []}}, r"an equation whose terms are given must have some: \['x'\]"),
-    ({"terms": {"x": ["x^3"]}}, "unknown term 'x\\^3'; this library has"),
     ({"relations": ["z: x == 1"]}, r"unknown state 'z'; there are \['x', 'y'\]"),
-    ({"relations": ["x: w == 1"]}, "unknown variable 'w'"),
     ({"runs": []}, "at least one run is needed: an empty list came"),
     ({"library": ep.polynomial(["x", "u"], degree=1)}, r"the library needs \['u'\]: sample it as"),
 ]
@@ -84,7 +64,7 @@ def test_an_estimate_takes_runs_and_relations_as_discover_does() -> None:
 
 def test_a_task_keeps_its_values_and_takes_a_tuple_of_runs() -> None:
     terms = {"x": ["x", "x*y"]}
-    task = Task([RUN, OTHER], LIBRARY, [parse_relation("y: y == 1")], terms)
+    task = ep.discovery.Task([RUN, OTHER], LIBRARY, [parse_relation("y: y == 1")], terms)
     terms["x"].append("y")
     assert task.states == ("x", "y")
     assert task.terms == {"x": ("x", "x*y")}
@@ -133,7 +113,6 @@ def test_a_method_needs_no_more_than_a_rule_and_an_answer() -> None:
     ("value", "lacking"),
     [
         (ep.BestSubset(), "which has no selection and no identify"),
-        (ep.EBIC(), "which has no selection and no identify"),
         (SimpleNamespace(selection=ep.EBIC()), "which has no identify"),
         (ep.Regression, "the class Regression came; call it to make a value$"),
     ],
@@ -141,4 +120,4 @@ def test_a_method_needs_no_more_than_a_rule_and_an_answer() -> None:
 def test_what_is_no_method_is_refused_with_what_it_lacks(value: object, lacking: str) -> None:
     message = f"(?s)^method must be a DiscoveryMethod, such as ep.Regression.*{lacking}"
     with pytest.raises(ValueError, match=message):
-        check_kind("method", value, DiscoveryMethod, "ep.Regression()")
+        check_kind("method", value, ep.discovery.DiscoveryMethod, "ep.Regression()")

@@ -11,16 +11,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+import ep2sindy as ep
 from ep2sindy.app import main as program
-from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import Regression
 from ep2sindy.regression.front import ParetoFront
-from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.threads import NUMBERS, one_thread
-from ep2sindy.selection.criteria import EBIC
-from ep2sindy.systems.systems import lotka_volterra
 
-PREY = lotka_volterra()
+PREY = ep.lotka_volterra()
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +45,7 @@ class WatchedChoice:
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[np.ndarray]:
         self.seen.append(threads())
-        return EBIC().scores(fronts)
+        return ep.EBIC().scores(fronts)
 
 
 def test_on_one_thread_and_then_on_as_many_as_before() -> None:
@@ -98,11 +94,12 @@ def test_a_refinement_runs_on_one_thread() -> None:
 
 def test_a_discovery_runs_on_one_thread() -> None:
     rule = WatchedChoice()
-    discover(PREY.trajectory(), method=Regression(WeightedWeak(), selection=rule))
+    ep.discover(PREY.trajectory(), method=ep.Regression(ep.WeightedWeak(), selection=rule))
     assert rule.seen == [(1, 1)]
     assert threads() == (2, 2)
 
 
+@pytest.mark.slow
 def test_a_process_starts_on_one_thread_whatever_the_environment_says() -> None:
     code = (
         "from ep2sindy.runtime.threads import start_on_one_thread as start; start()\n"

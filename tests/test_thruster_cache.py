@@ -61,47 +61,23 @@ def test_second_call_reads_identical_values(tmp_path, monkeypatch):
         np.testing.assert_equal(second.attrs[name], value)
 
 
-@pytest.mark.parametrize("size", [0, 1000])
-def test_truncated_file_is_reported_and_recomputed(tmp_path, capsys, small_runs, size):
-    first = simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
-    (path,) = tmp_path.iterdir()
-    path.write_bytes(path.read_bytes()[:size])
-    again = simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
-    xr.testing.assert_identical(first.drop_attrs(), again.drop_attrs())
-    assert len(small_runs) == 2
-    printed = capsys.readouterr()
-    assert "cannot be read" in printed.out + printed.err
-    xr.testing.assert_identical(again.drop_attrs(), cache.read(path).drop_attrs())
-
-
-@pytest.mark.parametrize(
-    ("thruster", "point", "change"),
-    [
-        (Thruster(), POINT, {"initial": ColdStart()}),
-        (Thruster(), POINT, {"averaged": False}),
-        (Thruster(series_resistance=2.0), POINT, {}),
-        (Thruster(), OperatingPoint(300.0, 5.0, neutral_speed=281.0), {}),
-        (Thruster(), POINT, {"n_cells": 41}),
-    ],
-)
-def test_other_parameters_have_another_file(tmp_path, small_runs, thruster, point, change):
-    simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
-    simulate(thruster, point, cache=tmp_path, **(BRIEF | change))
-    assert len(kept(tmp_path)) == len(small_runs) == 2
-
-
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (ColdStart(), ColdStart(n_i=4e17)),
-        (SoftStart(hold_s=1e-5), SoftStart(hold_s=2e-5)),
+        ({}, {"initial": ColdStart()}),
+        ({"initial": ColdStart()}, {"initial": ColdStart(n_i=4e17)}),
+        ({"initial": SoftStart(hold_s=1e-5)}, {"initial": SoftStart(hold_s=2e-5)}),
+        ({}, {"averaged": False}),
+        ({}, {"thruster": Thruster(series_resistance=2.0)}),
+        ({}, {"operating_point": OperatingPoint(300.0, 5.0, neutral_speed=281.0)}),
+        ({}, {"n_cells": 41}),
     ],
 )
-def test_other_starts_have_another_file(tmp_path, small_runs, one, other):
-    for initial in (one, other, one):
-        simulate(Thruster(), POINT, cache=tmp_path, initial=initial, **BRIEF)
-    assert len(kept(tmp_path)) == 2
-    assert small_runs == [(POINT, one), (POINT, other)]
+def test_other_parameters_have_another_file(tmp_path, small_runs, one, other):
+    usual = {"thruster": Thruster(), "operating_point": POINT, "cache": tmp_path, **BRIEF}
+    for change in (one, other, one):
+        simulate(**(usual | change))
+    assert len(kept(tmp_path)) == len(small_runs) == 2
 
 
 @pytest.mark.usefixtures("small_runs")
@@ -147,6 +123,7 @@ def other_parameters(content: bytes) -> bytes:
     [
         (damaged, "cannot be read"),
         (lambda content: content[:-9], "cannot be read"),
+        (lambda content: b"", "cannot be read"),
         (other_parameters, "it is of other parameters"),
     ],
 )

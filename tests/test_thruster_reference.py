@@ -8,7 +8,6 @@ from benchmarks.source import (
     POINTS,
     alternation_eV,
     full_run,
-    lasting_swing,
     zone_coefficients,
 )
 from ep2sindy.thruster.balance import zone_balance
@@ -67,9 +66,3 @@ def test_balances_close(label):
 @pytest.mark.parametrize("label", ["300V_5mgs", "400V_5mgs"])
 def test_the_temperature_does_not_alternate_from_step_to_step(label):
     assert alternation_eV(label) < 0.01
-
-
-def test_a_swing_that_goes_on_is_told_from_one_that_does_not():
-    steps = np.arange(20.0)[:, None]
-    assert lasting_swing(5.0 + 0.1 * (-1.0) ** steps) == pytest.approx(0.1)
-    assert lasting_swing(5.0 + 0.1 * np.sin(steps)) == 0.0

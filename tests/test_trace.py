@@ -292,24 +292,10 @@ def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ep.signals.LogRate(0.5), "harmonics must be one or more: 0.5 came"),
         (lambda: ep.signals.Delays(share=1.0), "share of the period must lie between 0 and 1"),
         (lambda: ep.signals.LogSmoother(0.0), "finest_s must be a positive time"),
-        (lambda: ep.signals.KalmanSmoother(coarsest_s=-1.0), "coarsest_s must be a positive time"),
         (lambda: ep.signals.Rate(n_states=6), "n_states must be 2 to 5: 6 came"),
-        (
-            lambda: ep.signals.prepare_signal(sine(), detrend="yes"),
-            "detrend must be auto, true or false: 'yes' came",
-        ),
-        (
-            lambda: ep.signals.prepare_signal(sine(), decimate=0),
-            "decimate must be auto, null or a whole number",
-        ),
-        (lambda: ep.signals.prepare_signal(sine(), "y"), "unknown variable 'y'"),
-        (
-            lambda: ep.signals.prepare_signal(ep.lotka_volterra().trajectory()),
-            "one signal must be named",
-        ),
+        (lambda: ep.signals.prepare_signal(ep.lotka_volterra().trajectory()), "one signal must be"),
         (
             lambda: ep.signals.LogSmoother().estimate(np.arange(9.0), -np.ones(9)),
             "a signal must be positive for its logarithm",
@@ -359,9 +345,7 @@ def test_one_call_makes_states_by_smoothing_where_it_is_asked_to() -> None:
     [
         ({"embedding": "lags"}, "embedding must be auto, hidden or log_rate or rate or delays"),
         ({"n_states": "few"}, "n_states must be auto or a number: 'few' came"),
-        ({"n_states": 6}, "n_states must be 2 to 5: 6 came"),
         ({"held_out": 1.0}, "held_out must be a share, 0 or more and below 1: 1.0 came"),
-        ({"signal": "y"}, "unknown variable 'y'"),
         ({"decimate": 0}, "decimate must be auto, null or a whole number"),
     ],
 )

@@ -35,35 +35,11 @@ def test_equal_points_are_the_two_zone_model_without_zones():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (
-            lambda: ep.thruster.GaussianTransport(trough=1.5),
-            r"GaussianTransport\.trough must be at most 1",
-        ),
-        (
-            lambda: ep.thruster.GaussianTransport(width=0.0),
-            r"GaussianTransport\.width must be finite and",
-        ),
+        (lambda: ep.thruster.GaussianTransport(trough=1.5), r"GaussianTransport\.trough must be"),
         (lambda: ep.thruster.GaussianTransport(center=np.nan), r"center must be finite, got nan"),
-        (
-            lambda: ep.thruster.MultiLogTransport([0.0], [0.1]),
-            r"distance must hold two numbers or more",
-        ),
-        (
-            lambda: ep.thruster.MultiLogTransport([0.0, 0.0], [0.1, 0.1]),
-            r"must increase: 0 follows 0 at",
-        ),
-        (
-            lambda: ep.thruster.MultiLogTransport([0.0, 1.0], [0.1]),
-            r"c must have one number for each of",
-        ),
-        (
-            lambda: ep.thruster.MultiLogTransport([0.0, 1.0], [0.1, np.nan]),
-            r"c must be finite, got nan",
-        ),
-        (
-            lambda: ep.thruster.MultiLogTransport([0.0, 1.0], [0.1, 0.0]),
-            r"c must be positive at every",
-        ),
+        (lambda: ep.thruster.MultiLogTransport([0.0, 0.0], [0.1, 0.1]), r"must increase: 0 follow"),
+        (lambda: ep.thruster.MultiLogTransport([0.0, 1.0], [0.1]), r"c must have one number for"),
+        (lambda: ep.thruster.MultiLogTransport([0.0, 1.0], [0.1, 0.0]), r"c must be positive at"),
     ],
 )
 def test_bad_transport_says_what_must_hold(build, message):

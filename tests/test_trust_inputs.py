@@ -45,8 +45,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     "model.json": lambda path: ep.SparseModel.load(path),
 }
 DAMAGED = {
-    "bytes": b"\xff\xfe\x00\x01" * 100, "NUL": b"\0" * 4000, "a quote": b'"' + b"x" * 200_000,
-    "nested": b"[" * 100_000, "cut": b'{"states": [', "nothing": b"\n",
+    "bytes": b"\xff\xfe\x00\x01" * 100, "a quote": b'"' + b"x" * 200_000,
+    "nested": b"[" * 100_000, "cut": b'{"states": [',
 }  # fmt: skip
 
 
@@ -76,13 +76,10 @@ RUN = {"summary.json": '{"experiment": "weak", "seed": 1}', "provenance.json": "
     ("name", "content"),
     [
         ("summary.json", '{"experiment": "weak"}'),
-        ("summary.json", '{"experiment": "weak", "seed": 1, "headline": {"f": "<b>"}}'),
         ("summary.json", '{"experiment": "weak", "seed": 1, "data": {"time_unit": "ages"}}'),
         ("summary.json", "[" * 100_000),
         ("provenance.json", "[1]"),
-        ("config.yaml", "- 1"),
         ("config.yaml", "a: &a {b: *a}"),
-        ("config.yaml", "a: ["),
     ],
 )
 def test_a_damaged_run_folder_is_named(name: str, content: str, tmp_path: Path) -> None:
@@ -124,8 +121,6 @@ def test_a_circle_of_groups_is_not_walked_twice(tmp_path: Path) -> None:
     ("error", "said"),
     [
         (AttributeError("'NoneType' object has no attribute 'x'"), "it is damaged, or of another"),
-        (ValueError("zip() argument 2 is shorter than argument 1"), "it is damaged, or of another"),
-        (KeyError("x"), "it is damaged, or of another"),
         (OSError("Unable to open file\n(truncated file: eof = 9)."), "Unable to open file (trunca"),
     ],
 )
@@ -162,11 +157,6 @@ def test_pickled_objects_of_a_zarr_store_do_not_run(
     with pytest.raises(ValueError, match="a.zarr cannot be read"):
         ep.open_field(path, variables={"I_d": ep.Variable("I", "A")}, time=ep.Variable("time", "s"))
     assert not Path("it_ran").exists()
-
-
-def test_numcodecs_that_unpickle_are_not_installed_along() -> None:
-    project = (Path(__file__).resolve().parents[1] / "pyproject.toml").read_text()
-    assert "numcodecs>=0.16.6" in project
 
 
 @pytest.mark.parametrize("text", ["x*" * 20_000, "sin(" + "1" * 40_000, "x" + " " * 100_000 + "!"])

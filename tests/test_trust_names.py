@@ -27,7 +27,7 @@ from ep2sindy.report.screen import Screen
 PATHS = ["../../x", "/tmp/x", "a/b", "a\\b", "..", ".", "", "~x", "a\nb", "a\0b", "x" * 300]
 MARKUP = [
     "<script>alert(1)</script>", "<img src=x onerror=alert(1)>", '"onload="alert(1)', "'", "a&b",
-    "[/red]", "$x_{$", "{{x}}",
+    "[/red]", ":fire:", "$x_{$", "{{x}}",
 ]  # fmt: skip
 MATH = {"mi", "mn", "mo", "mrow", "mspace", "msub", "msup"}  # as many as a name has signs
 

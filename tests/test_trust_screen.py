@@ -4,25 +4,16 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
-import xarray as xr
 from omegaconf import OmegaConf
 
-import ep2sindy as ep
 from ep2sindy.app import program
 from ep2sindy.app.inspection import commands, config_text
 from ep2sindy.data.open import inspect_file
-from ep2sindy.report.document import Section, Table, Text
 from ep2sindy.report.screen import Screen
-from ep2sindy.runtime import progress
 from ep2sindy.runtime.screen import in_line, one_screen, plain, say
-from ep2sindy.studies.source import say_data
-from ep2sindy.thruster import cache
 from tests.test_trust_folder import CSV, write_csv
 
 ODD = (
@@ -90,59 +81,6 @@ def test_warnings_and_errors_of_the_program_are_plain(capsys: pytest.CaptureFixt
     except RuntimeError:
         program._print_error(*sys.exc_info())
     assert capsys.readouterr().err.endswith("RuntimeError: c\\x1bd\n")
-
-
-def test_markup_and_names_of_emoji_are_text_on_every_screen(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
-    text = "[bold red]x[/] :fire: \\\\"
-    screen = Screen(tmp_path / "run.log")
-    screen.print(text)
-    screen.show([Section(text, [Text(text), Text(text, warning=True)])])
-    screen.show([Section("s", [Table(pd.DataFrame({text: [text]}), title=text, note=text)])])
-    screen.close()
-    assert (tmp_path / "run.log").read_text().count(text) == 8
-
-
-def test_labels_of_bars_and_files_that_are_read_stay_in_their_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(progress, "is_watched", lambda: True)
-    with progress.Bars().stage(2, "piece", "a\x1b[31m\nb") as advance:
-        advance(1)
-    assert r"a\x1b[31m\nb:" in capsys.readouterr().err
-    path = tmp_path / "a\x1b\n.nc"
-    path.write_text("none")
-    field = xr.Dataset({"x": ("time", [1.0, 2.0])}, coords={"time": [0.0, 1.0]})
-    monkeypatch.setattr(cache, "read", lambda path: field)
-    monkeypatch.setattr(cache, "fingerprint", lambda *given, **settings: "0")
-    path.rename(tmp_path / "a\x1b\n_0.nc")
-    cache.read_or_run(tmp_path, "a\x1b\n", {}, lambda: field, False)
-    (line,) = capsys.readouterr().out.splitlines()
-    assert r"a\x1b\n_0.nc cannot be read" in line
-
-
-def test_a_run_says_its_file_in_one_line() -> None:
-    said: list[str] = []
-    t = 0.1 * np.arange(50)
-    field = xr.Dataset({"x": ("time", np.sin(t))}, coords={"time": t}, attrs={"file": "a\nb.csv"})
-    run: Any = SimpleNamespace(say=said.append, warn=said.append)
-    say_data(run, ep.Trajectory(t, np.sin(t)[:, None], ["x"]), field, "")
-    assert said[0].startswith(r"data: a\nb.csv; 50 samples")
-
-
-def test_help_shows_names_of_configs_as_text(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "conf" / "exp"
-    folder.mkdir(parents=True)
-    (folder / "a\x1b[31m[b].yaml").write_text("# @package _global_\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["ep2sindy", "--help"])
-    with pytest.raises(SystemExit):
-        program.run()
-    assert r"exp: a\x1b[31m[b], benchmark" in capsys.readouterr().out
 
 
 @pytest.mark.skipif(os.name == "nt", reason="pipes of POSIX")

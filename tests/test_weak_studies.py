@@ -5,45 +5,35 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import ep2sindy as ep
 from ep2sindy.app.schema import Configured
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.method import Regression
-from ep2sindy.figures.identified import frontier_figure
-from ep2sindy.figures.windows import window_error_figure
-from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.searches import BestSubset
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.test_functions import Boxes, Bumps
-from ep2sindy.regression.weak import Weak
 from ep2sindy.runtime.parallel import Serial
-from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies import frontier as frontiers
 from ep2sindy.studies import weak_windows
-from ep2sindy.studies.weak import Setting, boxes_grid, fit_settings, fit_terms
+from ep2sindy.studies.weak import Setting, boxes_grid, fit_settings
 from ep2sindy.studies.weak_windows import (
     coefficient_error,
     true_library,
     window_cells,
 )
-from ep2sindy.systems.systems import System, lotka_volterra
+from ep2sindy.systems.systems import System
 
-EVERY_ROW = RandomSplit(test_fraction=0.0)
-BOXES = Weak(
-    test_functions=Boxes(),
+EVERY_ROW = ep.RandomSplit(test_fraction=0.0)
+BOXES = ep.Weak(
+    test_functions=ep.Boxes(),
     smooth_library=False,
     split=EVERY_ROW,
     errors_in_variables=False,
 )
-AUTOMATIC = Weak(split=EVERY_ROW)
+AUTOMATIC = ep.Weak(split=EVERY_ROW)
 
 
 def sampled(*, rate_Hz: float = 30.0, duration_s: float = 40.0) -> System:
-    return replace(lotka_volterra(), rate_Hz=rate_Hz, duration_s=duration_s)
+    return replace(ep.lotka_volterra(), rate_Hz=rate_Hz, duration_s=duration_s)
 
 
 def boxes(n_windows: int, n_points: int) -> Setting:
-    return Setting(replace(BOXES, test_functions=Boxes(n_windows=n_windows, n_points=n_points)))
+    return Setting(replace(BOXES, test_functions=ep.Boxes(n_windows=n_windows, n_points=n_points)))
 
 
 def coefficient_errors(
@@ -54,7 +44,7 @@ def coefficient_errors(
     n_realizations: int,
     seed: int = 0,
 ) -> pd.DataFrame:
-    forms = {"formulation": Differential(), "automatic": AUTOMATIC, "parallel": Serial()}
+    forms = {"formulation": ep.Differential(), "automatic": AUTOMATIC, "parallel": Serial()}
     form = Configured({"_target_": "ep2sindy.Weak"}, "boxes")
     study = weak_windows.Study(
         system=system, rate_Hz=system.rate_Hz, boxes=form, n_windows=[1], n_points=[2],
@@ -91,23 +81,6 @@ def test_without_noise_smooth_windows_find_the_coefficients() -> None:
         assert error < 1e-8  # the bump falls to 1e-10 at its edge; the integration has 1e-10
 
 
-def test_windows_of_two_points_are_the_differential_form() -> None:
-    run = sampled().trajectory(noise=0.01, rng=np.random.default_rng(0))
-    found = fit_terms(
-        [run], true_library(lotka_volterra()), TERMS, boxes(500, 2), rng=np.random.default_rng(1)
-    )
-    rng = np.random.default_rng(1)
-    x, y = run.states.T
-    columns = {"x": np.stack([x, x * y], axis=1), "y": np.stack([y, x * y], axis=1)}
-    for state, theta in columns.items():
-        first = Boxes(n_windows=500, n_points=2).windows(run.t, x, rng=rng).first
-        values = run.columns([state])[:, 0]
-        quotient = (values[first + 1] - values[first]) / run.dt_s
-        means = 0.5 * (theta[first] + theta[first + 1])
-        coef = dict(zip(TERMS[state], np.linalg.lstsq(means, quotient)[0], strict=True))
-        assert found[state][0].coef_by_term == pytest.approx(coef, rel=1e-9)
-
-
 def test_more_and_longer_windows_bear_more_noise() -> None:
     settings = boxes_grid(BOXES, n_windows=[100, 2000], n_points=[10, 100])
     errors = coefficient_errors(sampled(), settings, noises=[0.0, 0.05], n_realizations=4, seed=1)
@@ -140,13 +113,13 @@ def test_a_grid_is_named_by_what_varies() -> None:
     assert list(boxes_grid(BOXES, n_windows=[7], n_points=[5, 9])) == ["n_points_5", "n_points_9"]
     assert list(boxes_grid(BOXES, n_windows=[7], n_points=[5])) == ["n_points_5"]
     both = boxes_grid(BOXES, n_windows=[7, 8], n_points=[5, 9])
-    assert both["n_windows_8_n_points_9"].boxes == Boxes(n_windows=8, n_points=9)
+    assert both["n_windows_8_n_points_9"].boxes == ep.Boxes(n_windows=8, n_points=9)
 
 
-def fitted(run: Trajectory, settings: dict[str, Setting]) -> dict:
+def fitted(run: ep.Trajectory, settings: dict[str, Setting]) -> dict:
     return fit_settings(
         run,
-        true_library(lotka_volterra()),
+        true_library(ep.lotka_volterra()),
         TERMS,
         settings,
         rollout_s=None,
@@ -157,7 +130,7 @@ def fitted(run: Trajectory, settings: dict[str, Setting]) -> dict:
 def test_every_form_follows_exact_data() -> None:
     run = sampled().trajectory()
     settings = {
-        "differential": Setting(Differential(split=EVERY_ROW)),
+        "differential": Setting(ep.Differential(split=EVERY_ROW)),
         "boxes": boxes(1000, 50),
         "automatic": Setting(AUTOMATIC),
         "automatic_weighted": Setting(AUTOMATIC, weighted=True),
@@ -171,13 +144,13 @@ def test_every_form_follows_exact_data() -> None:
         assert (found.integrated.model.covariance is not None) == (name == "automatic_weighted")
     bumps = fitted(run, {"automatic": Setting(AUTOMATIC)})["automatic"]
     for state, x in zip(run.state_names, run.states.T, strict=True):
-        windows = Bumps().windows(run.t, x, rng=np.random.default_rng(0))
+        windows = ep.Bumps().windows(run.t, x, rng=np.random.default_rng(0))
         assert 2 * bumps.half_width[state] + 1 == windows.mean.indptr[1]
 
 
 def test_a_weighted_fit_needs_rows_that_know_their_noise() -> None:
     with pytest.raises(ValueError, match="a weighted fit needs the formulation Weak with"):
-        Setting(Differential(), weighted=True)
+        Setting(ep.Differential(), weighted=True)
 
 
 def test_windows_longer_than_the_data_are_refused() -> None:
@@ -199,13 +172,13 @@ def test_errors_of_nothing_are_refused(settings: dict) -> None:
         coefficient_errors(sampled(), **(defaults | settings))
 
 
-VARIANT = Regression(
-    formulation=Differential(smooth_library=False),
-    search=BestSubset(max_terms=3),
-    selection=Knee(),
-    bootstraps=Bootstraps(n=0),
+VARIANT = ep.Regression(
+    formulation=ep.Differential(smooth_library=False),
+    search=ep.BestSubset(max_terms=3),
+    selection=ep.Knee(),
+    bootstraps=ep.Bootstraps(n=0),
 )
-RESAMPLED = replace(VARIANT, bootstraps=Bootstraps(n=4))
+RESAMPLED = replace(VARIANT, bootstraps=ep.Bootstraps(n=4))
 
 
 def frontier(**settings: object) -> pd.DataFrame:
@@ -217,7 +190,7 @@ def frontier(**settings: object) -> pd.DataFrame:
     arguments = defaults | settings
     variants = arguments.pop("variants")
     study = frontiers.Study(
-        lotka_volterra(), **arguments, variants=list(variants), definitions={}, parallel=Serial()
+        ep.lotka_volterra(), **arguments, variants=list(variants), definitions={}, parallel=Serial()
     )
     return study.points(variants)
 
@@ -242,7 +215,7 @@ def test_too_few_samples_count_as_not_identified_and_say_why() -> None:
 
 
 def test_a_variant_that_cannot_run_at_all_is_an_error() -> None:
-    broken = replace(VARIANT, bootstraps=Bootstraps(n=1, n_culled=6))
+    broken = replace(VARIANT, bootstraps=ep.Bootstraps(n=1, n_culled=6))
     with pytest.raises(ValueError, match="n_culled must leave a term"):
         frontier(variants={"broken": broken})
 
@@ -256,27 +229,3 @@ def test_leaving_a_variant_out_changes_no_other() -> None:
 def test_a_frontier_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="there must be something to run"):
         frontier(rates_Hz=[])
-
-
-def test_the_frontier_figure_shows_every_point_once() -> None:
-    points = frontier()
-    figure = frontier_figure(points)
-    assert [ax.get_title() for ax in figure.axes] == ["plain", "resampled"]
-    for ax in figure.axes:
-        assert sum(len(line.get_xdata()) for line in ax.lines) == 6
-
-
-def test_the_window_figure_has_a_panel_per_length() -> None:
-    settings = {
-        "automatic": Setting(AUTOMATIC),
-        **boxes_grid(BOXES, n_windows=[50, 100], n_points=[10, 20]),
-    }
-    for noises, shown in (([0.0, 0.05, 0.1], 2), ([0.0], 1)):
-        errors = coefficient_errors(sampled(), settings, noises=noises, n_realizations=1)
-        figure = window_error_figure(window_cells(errors, settings), references=["automatic"])
-        assert [ax.get_title() for ax in figure.axes] == [
-            "10 points per window",
-            "20 points per window",
-        ]
-        for ax in figure.axes:
-            assert [len(line.get_xdata()) for line in ax.lines] == [shown] * 3

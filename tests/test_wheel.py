@@ -1,15 +1,11 @@
 """The wheel, installed where nothing else is: its program runs from an empty folder."""
 
-import json
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
-
-from tests.test_trust_folder import CSV
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -65,21 +61,3 @@ def test_the_main_job_runs_from_an_empty_folder(program: Path, tmp_path: Path) -
     folder = tmp_path / Path(result.stdout.splitlines()[-1].removeprefix("open: ")).parent
     assert (folder / "summary.json").is_file()
     assert (folder / "report.html").is_file()
-
-
-def test_one_bad_job_of_three_leaves_two_results_and_its_error(
-    program: Path, tmp_path: Path
-) -> None:
-    t = np.arange(0.0, 30.0, 0.05)
-    table = np.column_stack([t, np.sin(t), np.cos(t)])
-    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="time,x,y", comments="")
-    result = run(program, "-m", *CSV, "seed=0,-1,1", cwd=tmp_path)
-    assert result.returncode == 1
-    paths = sorted(tmp_path.glob("outputs/multirun/*/jobs/*.json"))
-    jobs = [json.loads(path.read_text()) for path in paths]
-    assert jobs[1]["error"].startswith("seed must be a whole number, zero or more: -1")
-    for k in (0, 2):
-        summary = json.loads((tmp_path / jobs[k]["folder"] / "summary.json").read_text())
-        found = summary["headline"]["model/f_kHz"]
-        assert found == pytest.approx(1e-3 / (2 * np.pi), rel=0.01)
-    assert "ep2sindy compare outputs/multirun/" in result.stdout
