@@ -82,14 +82,8 @@ def test_a_speed_of_the_neutrals_follows_its_table() -> None:
     ("make", "message"),
     [
         (lambda: ep.thruster.Background(-1.0), "pressure_Pa must be finite and zero or more"),
-        (
-            lambda: ep.thruster.Background(1.0, temperature_K=0.0),
-            "temperature_K must be finite and",
-        ),
-        (lambda: ep.thruster.Background(1.0, ingestion=math.inf), "ingestion must be finite and"),
         (lambda: replace(SHIFT, alpha=1.0), "PressureShift.alpha must be above 1, got 1.0"),
         (lambda: replace(SHIFT, dz=math.nan), "z0 and dz must be finite, in channel lengths"),
-        (lambda: replace(SHIFT, pressure_Pa=0.0), "pressure_Pa must be finite and positive"),
         (lambda: ep.thruster.NeutralSpeed([0.0, 0.0], [1.0, 1.0]), "distance must increase"),
         (
             lambda: ep.thruster.NeutralSpeed([0.0, 1.0], [1.0]),

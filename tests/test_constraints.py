@@ -125,17 +125,11 @@ def test_relations_are_read(text: str, factors: list[tuple[float, str, str]], va
     ("text", "message"),
     [
         ("x: x", "two sides joined by one '=='"),
-        ("x: x == 1 == 2", "two sides joined by one '=='"),
         ("1 == 2", "must name a coefficient: '1 == 2'"),
         ("x: x == 1e999", "must be finite: 'x: x == 1e999'"),
         ("x: x == ", r"a number must stand at character 9 of the relation 'x: x == ': 'the end'"),
-        (" == 1", r"a number must stand at character 2 .*'== 1' came"),
         ("x: x y: y == 0", r"\+, -, == or the end must stand at character 6 .*'y: y == 0' came"),
         ("x: x + 2 * foo == 0", r"character 10 .*'\* foo == 0' came; write it like 'n_i: n"),
-        ("x: x*y*2 == 0", r"character 7 .*'\*2 == 0'"),
-        ("2x: x == 0", r"character 1 .*'2x: x == 0'"),
-        ("x: 1e3 == 0", r"character 1 .*'x: 1e3 == 0'"),
-        ("x: x^1.5 == 0", r"character 7 .*'.5 == 0'"),
     ],
 )
 def test_unreadable_relations_are_quoted_with_the_position(text: str, message: str) -> None:
@@ -201,13 +195,11 @@ def test_a_chain_of_ties_keeps_the_first_coefficient_free() -> None:
             ["0.1 * x: x + 0.2 * y: y == 0.3", "x: x + 2 * y: y == 3"],
             "relation 'x: x \\+ 2 \\* y: y == 3' is redundant: it is implied by the earlier ones",
         ),
-        (["x: x == 1", "y: y == 2", "x: x + y: y == 3"], "'x: x \\+ y: y == 3' is redundant"),
         (["x: x*y == x: y*x"], "is redundant: it is implied by arithmetic alone"),
         (["x: x*y == x: y*x + 1"], "contradicts arithmetic alone"),
         (["x: y == 0"], r"relation 'x: y == 0': 'y' is not in the support of 'x', \['x', 'x\*y'\]"),
         (["z: y == 0"], r"relation 'z: y == 0': unknown state 'z'; .* for \['x', 'y'\]"),
         (["x: y^3 == 0"], r"relation 'x: y\^3 == 0': unknown term 'y\^3'"),
-        (["x: q == 0"], "relation 'x: q == 0': unknown variable 'q' in term 'q'"),
     ],
 )
 def test_relations_are_refused_by_name(relations: list[str], message: str) -> None:

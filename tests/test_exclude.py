@@ -56,10 +56,7 @@ def test_a_hidden_state_enters_by_no_excluded_term() -> None:
     [
         ({"terms": {"x": {"x": 0.6667}}}, r"relations=\['x: x == 0.6667'\]"),
         ({"terms": {"x": "x"}}, r"the terms of 'x' must be a list: 'x' came; write \['x'\]"),
-        ({"terms": {"x": ["x", 0.5]}}, "terms must hold names of terms, .*: 0.5 came for 'x'"),
-        ({"terms": {"x": 1}}, "terms must be a list for every state: 1 came for 'x'"),
         ({"terms": ["x"]}, r"terms must be lists of terms by state, .*: \['x'\] came"),
-        ({"exclude": ["x"]}, r"exclude must be lists of terms by state, .*: \['x'\] came"),
         ({"exclude": {"x": [1]}}, "exclude must hold names .*: 1 came for 'x'; the constant"),
         ({"exclude": {"z": ["x"]}}, r"unknown state 'z'; there are \['x', 'y'\]"),
         ({"exclude": {"x": ["x^3"]}}, r"unknown term 'x\^3'; this library has \["),
@@ -68,7 +65,6 @@ def test_a_hidden_state_enters_by_no_excluded_term() -> None:
             {"exclude": {"x": ["x"]}, "terms": {"x": ["x", "x*y"]}},
             "a term is excluded, or it is named in terms and relations: 'x' of 'x' came in both",
         ),
-        ({"exclude": {"x": ["x"]}, "relations": ["x: x == 1"]}, "'x' of 'x' came in both"),
         (
             {"exclude": {"x": ["x"]}, "roles": ep.Roles(outflow=["x"], inflow={"y": 1.0})},
             "relations, terms or exclude came as well; give roles alone",

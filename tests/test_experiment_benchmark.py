@@ -150,20 +150,11 @@ def test_a_rival_without_pysindy_is_refused(tmp_path: Path) -> None:
     ("override", "message"),
     [
         ("n_realizations=0", "n_realizations must be a whole number, one or more: 0 came"),
-        ("n_realizations=1.5", "n_realizations must be a whole number, one or more: 1.5 came"),
-        ("n_trajectories=true", "n_trajectories must be a whole number, one or more: True came"),
-        ("+parallel.n_jobs=0", "unexpected keyword argument 'n_jobs'"),
         ("noises=[0.1,-0.1]", "noises[1] must be numbers, zero or more: -0.1 came"),
-        ("noises=[nan]", "noises[0] must be numbers, zero or more: nan came"),
-        ("noises=0.1", "noises must be a list"),
-        ("noises=[0,0.0]", "noises must be a list such as [a,b], each once"),
-        ("systems=[]", "systems must be a name, or a list such as [a,b], each once"),
         ("systems=[pendulum]", "unknown systems ['pendulum']; there are"),
         ("variants=[our]", "unknown variants ['our']; there are "),
         ("definitions.ours.selection.gamma=-1.0", "gamma must be zero or more"),
-        ("+definitions.ours.selection.gama=1", "unexpected keyword argument 'gama'"),
         ("definitions.ours={_target_:builtins.dict}", "definitions.ours must name a _target_"),
-        ("+rollout_s=1", "unknown keys ['rollout_s']; there are "),
     ],
 )
 def test_settings_that_cannot_work_are_refused(override: str, message: str, tmp_path: Path) -> None:

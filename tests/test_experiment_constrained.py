@@ -81,11 +81,9 @@ def test_held_out_times_count_from_the_start_of_the_held_out_part(
     ("overrides", "message"),
     [
         (["models=null"], "models must be like {name: {terms: {x: [x, x*y]}, relations: [..]}}"),
-        (["~models.velocity.relations"], "models.velocity must have terms and relations"),
         (["models.velocity.relations=null"], "models.velocity.relations must be a list"),
         (["~models.velocity.terms.n_i"], "models.velocity.terms must list the terms"),
         (["models.velocity.relations=['n_i: 2']"], "joined by one '=='"),
-        (["held_out=yes"], "held_out must be a number between 0 and 1"),
     ],
 )
 def test_constrained_settings_that_cannot_work_are_refused(

@@ -33,7 +33,6 @@ def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
     [
         (["variants=[STLSG]"], "unknown variants ['STLSG']; there are ['"),
         (["rates_Hz=[0]"], "rates_Hz[0] must be numbers, above zero: 0 came"),
-        (["durations_s=10"], "durations_s must be a list such as [a,b]"),
         (["parallel.n_jobs=0"], "n_jobs must be a number of processes"),
     ],
 )

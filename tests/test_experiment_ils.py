@@ -128,17 +128,12 @@ def test_iterations_go_to_tensorboard(toy_run: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["held_out=1.5"], "held_out must be a number between 0 and 1: 1.5 came"),
         (["held_out=0.001"], "held_out=0.001 must leave 20 samples on either side"),
-        (["window=0"], "window must be a whole number, one or more: 0 came"),
         (["window=901"], "window must hold 5 samples or more and fit the first part"),
-        (["windows=[3]"], "windows must hold 5 samples or more and fit the first part"),
-        (["windows=60"], "windows must be a list such as [a,b]"),
         (["relations=[]"], "relations must be a list of relations, such as"),
         (["relations=['n_i: n_n == 1']"], "'n_n' is not in the support of 'n_i'"),
         (["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
         (["+figures.colour=1"], "figures may have duration_s and f_max_Hz alone"),
-        (["+n_points=3"], "unknown keys ['n_points']"),
     ],
 )
 def test_ils_settings_that_cannot_work_are_refused(

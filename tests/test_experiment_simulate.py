@@ -190,13 +190,8 @@ def test_a_scan_where_nothing_can_be_run_is_an_error(tmp_path: Path) -> None:
     ("override", "message"),
     [
         ("scan={operating_point.volts:[1]}", "data.operating_point.volts must be there"),
-        ("scan={thruster.transport.c:[1]}", "data.thruster.transport.c must be there"),
         ("scan={n_cells:[]}", "scan must be like {operating_point.voltage: [250,300]}"),
-        ("scan={n_cells:30}", "scan must be like"),
-        ("scan={}", "scan must be like"),
         ("scan={n_cells:[30,30]}", "each value once"),
-        ("figures.periods=0", "figures.periods must be a positive number"),
-        ("+scans=1", "unknown keys ['scans']"),
     ],
 )
 def test_settings_that_cannot_be_are_refused_before_a_run(
@@ -360,12 +355,9 @@ def test_a_steady_simulation_warns_on_the_page_of_the_study_that_takes_it(tmp_pa
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (250.0, "250"),
         (0.0077, "0.0077"),
-        ("BN", "BN"),
         (None, "null"),
         ([1, 2.5], "[1, 2.5]"),
-        ({"_target_": "ep2sindy.thruster.ColdStart"}, "ColdStart"),
         ({"_target_": "ep2sindy.thruster.ColdStart", "n_i": 1e17}, "ColdStart(n_i=1e+17)"),
     ],
 )

@@ -223,9 +223,7 @@ def test_a_point_without_data_is_refused(place: dict, message: str) -> None:
     ("zone", "names", "message"),
     [
         (Zone(z=(0.2, 0.8)), {}, r"z from 0.2 to 0.8 m came, the grid has 2 points from 0 to 1 m"),
-        (Zone(z=(5.0, 8.0)), {}, r"z from 5 to 8 m came"),
         (Zone(z=(0.0, 25.0)), {}, r"stay on the grid: z from 0 to 25 m came"),
-        (Zone(r=(-3.0, 2.0)), {}, r"r from -3 to 2 m came"),
         (
             Zone(),
             {"states": ["ni"], "products": ["n_i*x"]},
@@ -302,10 +300,8 @@ def test_names_of_any_field_of_science_work() -> None:
         (GOOD.isel(time=0, drop=True), "a field has the dimension time"),
         (GOOD.drop_vars("z"), "the dimension 'z' needs a coordinate"),
         (GOOD.assign_coords(time=np.r_[T[:5], T[4:10]]), r"t\[5\] = 4e-05 s follows 4e-05 s"),
-        (GOOD.isel(time=slice(None, None, -1)), r"t must increase: t\[1\] = 9e-05 s"),
         (GOOD.isel(time=[0]), "at least two samples"),
         (GOOD.isel(z=[1, 0]), r"z must be finite and increase: z\[0:2\] = \[1. 0.\] m"),
-        (GOOD.assign_coords(z=[0.0, np.nan]), "z must be finite"),
         (GOOD.astype(complex), "n_i must hold real numbers: its type is complex128"),
         (GOOD.rename(n_i="n i"), "a variable's name must be letters, digits and _: 'n i' came"),
         (GOOD.drop_attrs(), "n_i must name its unit"),

@@ -166,10 +166,8 @@ def test_units_change_nothing(found):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"n_folds": 1}, "n_folds must be a whole number, two or more: 1 came"),
         ({"window_periods": 0.0}, "window_periods must be positive: 0.0 came"),
         ({"margin": 1.5}, "margin must lie between 0 and 1: 1.5 came"),
-        ({"n_starts": 0}, "n_starts must be a whole number, one or more: 0 came"),
     ],
 )
 def test_settings_are_checked(settings, message):

@@ -91,7 +91,6 @@ def test_transport_may_follow_the_shear_of_the_drift():
         (Level(-0.1), r"everywhere: .*Level \w+ gave -0\.1 at -24\.2 mm from the exit"),
         (gives_too_few, r"one coefficient for each of 30 distances, .* gave the shape \(3,\)"),
         (partial(default_c), r"must be known by its source, .*: functools\.partial.* frozen data"),
-        (3.0, r"must be a function c\(z, t, plasma\), or the dotted name of one: 3\.0 came"),
         (
             "no_such_module.c",
             r"must be a function of yours, as my_module\.c, .* has no no_such",

@@ -219,7 +219,6 @@ def test_a_plume_that_is_solved_is_thermal(folder: Path, corrected: bool) -> Non
         ({"domain": [0.01, 0.08]}, r"config\.domain must begin at the anode"),
         ({"discharge_voltage": "300 V"}, r"config\.discharge_voltage must be a number: '300 V'"),
         ({"propellants": [{}, {}]}, r"a mixture of 2 is not supported"),
-        ({"propellants": [{"gas": "Bismuth"}]}, r"propellants\[0\]\.gas must be one of .*Bismuth"),
         (
             {"propellants": [{"flow_rate_kg_s": 5e-6, "max_charge": 4}]},
             r"must ask for the charges of xenon_5eV from 1 to at most 3: \[1, 2, 3, 4\] is not",
@@ -229,37 +228,16 @@ def test_a_plume_that_is_solved_is_thermal(folder: Path, corrected: bool) -> Non
             r"must ask for the charges of xenon_5eV from 1 to at most 3: \[2\] is not supported",
         ),
         (
-            {"propellants": [{"gas": "Argon", "flow_rate_kg_s": 5e-6, "max_charge": 2}]},
-            r"must ask for the charges of argon from 1 to at most 1: \[1, 2\] is not supported",
-        ),
-        (
             {"propellants": [{"flow_rate_kg_s": 5e-6, "velocity_m_s": {"xs": [], "ys": []}}]},
             r"velocity_m_s must be a number: profiles are not supported",
-        ),
-        (
-            {"propellants": [{"flow_rate_kg_s": 5e-6, "excited_levels": [1]}]},
-            r"config\.propellants\[0\] has keys that are not supported: \['excited_levels'\]",
-        ),
-        ({"anom_model": {"type": "NoAnom"}}, r"anom_model\.type must be TwoZone"),
-        (
-            {"anom_model": {"type": "LogisticPressureShift"}},
-            r"anom_model must have the key 'model'",
         ),
         (
             {"anom_model": SHIFTED | {"model": {"type": "LogisticPressureShift"}}},
             r"config\.anom_model\.model\.type must be TwoZoneBohm",
         ),
-        ({"wall_loss_model": {"type": "Glue"}}, r"wall_loss_model\.type must be WallSheath"),
         (
             {"wall_loss_model": {"type": "WallSheath", "material": "Gold"}},
             r"wall_loss_model\.material must be one of .* 'Gold' came",
-        ),
-        ({"conductivity_model": {"type": "Spitzer"}}, r"conductivity_model\.type must be one of"),
-        ({"anode_boundary_condition": "neumann"}, r"anode_boundary_condition must be sheath or"),
-        ({"filter_circuit": {"type": "RLC"}}, r"config\.filter_circuit is not supported"),
-        (
-            {"thruster": {**THRUSTER, "shielded": True}},
-            r"thruster\.shielded is not supported here bu",
         ),
         ({"thruster": {"geometry": {}}}, r"config\.thruster\.geometry must have the key 'channel_"),
     ],
@@ -276,7 +254,10 @@ def test_a_missing_field_says_where_it_was_looked_for(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("{", r"must be JSON"), ("[]", r"must have the key 'config'"), ("{}", r"it has \[\]")],
+    [
+        ("{", r"must be JSON"),
+        ("[]", r"must have the key 'config'"),
+    ],
 )
 def test_a_file_that_is_no_input_is_refused(tmp_path: Path, content: str, message: str) -> None:
     path = tmp_path / "input.json"

@@ -117,19 +117,17 @@ def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> No
     [
         (ep.prepare.resample, {"dt_s": 2.0},
          "leave two samples or more: 2 s came for a record of 1 s"),
-        (ep.prepare.resample, {"dt_s": 0.0}, "dt_s must be positive"),
+        
         (ep.prepare.delay, {"variable": "q", "delay_s": 0.1},
          r"unknown variable .*'q'; .*\['x', 'I_d'\]"),
         (ep.prepare.delay, {"variable": "x", "delay_s": -0.1}, "delay_s must be positive"),
-        (ep.prepare.delay, {"variable": "x", "delay_s": 1.5},
-         "leave two samples or more: 1.5 s came"),
+        
         (ep.prepare.delay, {"variable": "x", "delay_s": 0.1, "name": "I_d"},
          "a new name .*'I_d' came"),
-        (ep.prepare.derivative, {"variable": "B"}, "unknown variable of time 'B'"),
-        (ep.prepare.derivative, {"variable": "x", "name": "a b"},
-         "letters, digits and _: 'a b' came"),
+        
+        
         (ep.prepare.detrend, {"degree": 0}, "degree must be 1 or more, .*: 0 came"),
-        (ep.prepare.detrend, {"variables": ["q"]}, "unknown variable of time 'q'"),
+        
     ],
 )  # fmt: skip
 def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: str) -> None:
