@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.rows import RegressionRows
@@ -28,3 +29,10 @@ def plain_rows(
     library = terms if isinstance(terms, Library) else named_terms(terms, terms)
     n = len(theta)
     return RegressionRows(theta, target, library, equations, np.arange(n), np.zeros(n, dtype=bool))
+
+
+def lienard(a: float) -> Trajectory:
+    """van der Pol's states after Lienard, on their cycle; a period takes seven seconds."""
+    model = model_of({"p": {"p": a, "q": -1.0, "p^3": -0.3}, "q": {"p": 1.0}})
+    t = 0.1 * np.arange(1000)
+    return Trajectory(t[:700], model.simulate(t, [1.0, 0.0]).states[300:], ["p", "q"])

@@ -28,6 +28,12 @@ ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "exp").glob("*.yaml"))
 
 
+def on_file(path: Path, output: Path, *variables: str) -> list[str]:
+    """Overrides that open a file of densities and of these variables, by the names we use."""
+    names = (f"data.variables.{name}.name={name}" for name in variables)
+    return ["data=file", f"data.path={path}", *names, f"output={output}"]
+
+
 def composed(*overrides: str) -> DictConfig:
     """The config of the command line `ep2sindy OVERRIDES`.
 

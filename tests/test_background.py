@@ -9,9 +9,9 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.thruster.axial.model import build_model, cell_faces, lengths_and_centres
 from ep2sindy.thruster.constants import K_BOLTZMANN, M_XENON
+from tests.thrusters import POINT, brief
 
 TORR = 133.322  # Pa
-POINT = ep.thruster.OperatingPoint(300.0, 5.0)
 GAUSS = ep.thruster.GaussianTransport()
 SHIFT = ep.thruster.PressureShift(
     GAUSS, z0=-0.17682, dz=0.3594, pressure_Pa=4.735e-5 * TORR, alpha=15.0
@@ -63,10 +63,10 @@ def test_the_transport_moves_towards_the_anode_with_the_pressure() -> None:
 
 
 def test_the_pressure_is_part_of_a_simulation_and_its_balance_closes() -> None:
-    settings = {"duration_s": 1e-4, "warm_up_s": 0.0, "n_cells": 30, "progress": False}
-    field = ep.thruster.simulate(ep.thruster.Thruster(), at(0.05), **settings)
+    settings = {"duration_s": 1e-4, "warm_up_s": 0.0, "n_cells": 30}
+    field = brief(point=at(0.05), **settings)
     assert field.attrs["mass_balance"] == pytest.approx(1.0, abs=1e-3)  # stored in float32
-    plain = ep.thruster.simulate(ep.thruster.Thruster(), POINT, **settings)
+    plain = brief(**settings)
     assert float(field["n_n"].mean()) > 1.01 * float(plain["n_n"].mean())
 
 

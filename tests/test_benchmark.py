@@ -1,7 +1,6 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import numpy as np
 import pandas as pd
@@ -12,21 +11,17 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Finding, Regression, TrajectorySearch
 from ep2sindy.figures.identified import benchmark_figure, merit_table
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Relation
-from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.searches import STLSQ, AdaptiveLasso
-from ep2sindy.runtime.parallel import Loky, Serial
-from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.runtime.parallel import Serial
 from ep2sindy.selection.criteria import Knee
-from ep2sindy.selection.rule import Decision
 from ep2sindy.studies.benchmark import Study, Variant, cells, merits
 from ep2sindy.systems import collection
 from ep2sindy.systems.collection import collected
 from ep2sindy.systems.draws import realization, system_names
 from ep2sindy.systems.systems import damped_oscillator
+from tests.rules import BySize
 
 TRUTH = {"x": frozenset({"v"}), "v": frozenset({"x", "v"})}  # of the oscillator
 # Draws random bootstraps and a random split: its outcome hangs on its stream.
@@ -107,14 +102,6 @@ def test_leaving_a_variant_out_changes_no_other() -> None:
     assert len(set(alone.drawn)) == 2
     kept = both[both["variant"] == "BALASSO"].reset_index(drop=True)
     pd.testing.assert_frame_equal(kept, outcomes_of(variants={"BALASSO": BALASSO}))
-
-
-@pytest.mark.slow
-def test_the_number_of_processes_changes_nothing() -> None:
-    settings = {"variants": {"BALASSO": BALASSO, "STLSQ": STLSQ_}}
-    pd.testing.assert_frame_equal(
-        outcomes_of(**settings, parallel=Loky(n_jobs=2)), outcomes_of(**settings)
-    )
 
 
 def test_known_findings_give_exact_counts() -> None:
@@ -229,37 +216,11 @@ def test_the_figure_writes_every_percentage_and_marks_what_is_missing() -> None:
     assert names == ["ours", "STLSQ", "thesis"]
 
 
-@dataclass(frozen=True)
-class Largest:
-    """A rule of systems that selects the largest candidates."""
-
-    label: ClassVar[str] = "size"
-
-    def scores(
-        self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
-    ) -> list[np.ndarray]:
-        return [-front.sizes for front in fronts]
-
-    def decide(
-        self,
-        fronts: Sequence[ParetoFront],
-        library: Library,
-        runs: Sequence[Trajectory],
-        relations: Sequence[Relation] = (),
-        *,
-        progress: Progress = SILENT,
-    ) -> Decision:
-        scores = self.scores(fronts, library, runs)
-        best = [front.with_scores(s).best for front, s in zip(fronts, scores, strict=True)]
-        coef = coef_matrix(library, [each.coef_by_term for each in best])
-        return Decision(scores, SparseModel(library, [f.equation for f in fronts], coef), "largest")
-
-
 def test_a_search_of_trajectories_finds_what_its_rule_selects() -> None:
     system, runs = realization("lotka_volterra", 0.05, 0, n_trajectories=1, seed=0)
     library = system.model.library
     plain = TrajectorySearch(max_terms=3)
-    by_size = replace(plain, selection=Largest())
+    by_size = replace(plain, selection=BySize())
     found, largest = (method.find(runs, library, rng=0) for method in (plain, by_size))
     assert largest.kept == found.kept
     assert found.selected == {s: frozenset(system.model.terms(s)) for s in ("x", "y")}

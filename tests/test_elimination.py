@@ -64,12 +64,8 @@ def test_relations_hold_on_the_way_and_bound_terms_go_together() -> None:
     truth = PREY.model
     terms = {s: [*truth.terms(s)] for s in truth.states}
     both = {"x": [*terms["x"], "x^2"], "y": [*terms["y"], "x^2"]}
-    coef = np.zeros((len(LIBRARY), 2))
-    for k, state in enumerate(truth.states):
-        for term in both[state]:
-            value = truth.terms(state).get(term, 0.02 * (-1.0) ** k)
-            coef[LIBRARY.index(term), k] = value
-    model = SparseModel(LIBRARY, truth.states, coef)
+    equations = [{**truth.terms("x"), "x^2": 0.02}, {**truth.terms("y"), "x^2": -0.02}]
+    model = SparseModel(LIBRARY, truth.states, ep.coef_matrix(LIBRARY, equations))
     known = truth.terms("x")[terms["x"][0]]
     relations = ep.constraint(
         LIBRARY, both, ["x: x^2 == -1 * y: x^2", f"x: {terms['x'][0]} == {known}"]
@@ -92,8 +88,7 @@ def test_the_path_ends_where_a_state_would_lose_its_last_term() -> None:
     run = Trajectory(
         t, states + 1e-3 * np.random.default_rng(0).normal(size=states.shape), ["x", "y"]
     )
-    coef = np.zeros((len(LIBRARY), 2))
-    coef[LIBRARY.index("x"), 0], coef[LIBRARY.index("y"), 1] = -1.0, -2.0
+    coef = ep.coef_matrix(LIBRARY, [{"x": -1.0}, {"y": -2.0}])
     model = SparseModel(LIBRARY, ["x", "y"], coef)
     found = ep.eliminate(model, [run], n_settings(), seed=0)
     assert len(found.refinements) == 1

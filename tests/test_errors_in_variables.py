@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -85,18 +83,6 @@ def test_errors_are_of_the_size_that_the_covariance_says(system: System) -> None
             scores.append(error @ np.linalg.solve(candidate.covariance, error) / len(error))
     # Mean of chi-square per coefficient: standard error sqrt(2 / n), n = 5 x 4 or 5 x 7.
     assert np.mean(scores) == pytest.approx(1.0, abs=3 * np.sqrt(2 / (5 * 4)))
-
-
-def test_units_change_nothing_but_units() -> None:
-    system = lotka_volterra()
-    (run,) = noisy_runs(system, 0.05)
-    big = replace(run, t=run.t * 1e-6, states=run.states * [1e18, 1e-3])
-    plain, scaled = problems_of(system, [run])[0], problems_of(system, [big])[0]
-    before, after = fitted(system, plain), fitted(system, scaled)
-    unit = 1e6 * np.array([1.0, 1e3])  # of x and x*y in x' = a x - b x y
-    assert after.coef == pytest.approx(before.coef * unit, rel=1e-6)
-    expected = before.covariance * np.outer(unit, unit)
-    np.testing.assert_allclose(after.covariance, expected, rtol=1e-4)
 
 
 def test_two_trajectories_narrow_the_intervals_like_independent_data() -> None:
@@ -195,15 +181,6 @@ def test_weighted_rows_cannot_be_held_out() -> None:
         )
     with pytest.raises(ValueError, match="weak.errors_in_variables"):
         WeightedWeak(weak=Weak(errors_in_variables=False))
-
-
-def test_a_discovered_model_knows_its_intervals() -> None:
-    system = lotka_volterra()
-    found = discover(noisy_runs(system, 0.05), system.model.library, Regression(EVERY_ROW))
-    assert set(found.model.terms("x")) == {"x", "x*y"}
-    low, high = found.model.intervals("x")["x*y"]
-    assert low < found.model.terms("x")["x*y"] < high
-    assert 0.0 < high - low < 0.1
 
 
 def test_an_input_may_be_noisy_too() -> None:

@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -420,19 +421,6 @@ def test_a_linear_library_of_what_is_not_linear_is_called_a_misfit() -> None:
     assert "no model of this library fits these data" in found.misfit
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("term", "words"),
-    [("x^3", "no law of this library explains x"), ("x", "no model of this library fits")],
-)
-def test_a_library_without_a_true_term_is_called_a_misfit(term: str, words: str) -> None:
-    system = ep.systems.van_der_pol()
-    full = system.model.library
-    library = full.take(np.arange(len(full)) != full.index(term))
-    found = ep.estimate([system.trajectory(noise=0.05, rng=0)], library)
-    assert words in found.misfit
-
-
 def test_an_equation_with_all_the_terms_that_it_may_have_is_a_misfit() -> None:
     system = ep.lorenz()
     run, library = system.trajectory(noise=0.05, rng=0), system.model.library
@@ -553,17 +541,19 @@ def test_the_search_is_the_same_in_other_units() -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "settings", "message"),
+    ("settings", "message"),
     [
-        (ep.TrajectorySearch, {"selection": ep.EBIC()}, r"selection must be Evidence\(\)"),
-        (ep.TrajectorySearch, {"max_terms": 0}, "max_terms must be a whole number, one or more: 0"),
+        ({"selection": ep.EBIC()}, r"selection must be Evidence\(\)"),
+        ({"max_terms": 0}, "max_terms must be a whole number, one or more: 0"),
+        ({"limit_s": 0.0}, "limit_s must be positive, in s, or None"),
+        ({"limit_s": np.nan}, "limit_s must be positive, in s, or None"),
     ],
 )
 def test_settings_that_do_not_go_with_trajectories_are_refused(
-    method: Callable[..., object], settings: dict[str, object], message: str
+    settings: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        method(**settings)
+        ep.TrajectorySearch(**settings)
 
 
 RULE = ep.FreeRunScore(n_folds=2)
@@ -611,6 +601,8 @@ def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     with pytest.raises(ValueError, match=r"the library needs \['z'\].*\+exp=trace"):
         ep.estimate([run], ep.polynomial(["x", "y", "z"], degree=1))
+    with pytest.raises(ValueError, match="limit_s must be positive"):
+        ep.estimate([run], ep.polynomial(["x", "y"], degree=2), limit_s=-1.0)
     with pytest.raises(ValueError, match="needs more samples than terms: 6 came"):
         ep.estimate([run.window(0, 6)], ep.polynomial(["x", "y"], degree=2))
     with pytest.raises(ValueError, match="a run must have five samples or more: .* has 2"):
@@ -759,7 +751,7 @@ class Clock:
         return float(self.read)
 
 
-@pytest.mark.parametrize("limit_s", [1e-3, 10.0, 20.0, 4000.0])
+@pytest.mark.parametrize("limit_s", [1e-3, 20.0, 4000.0])
 def test_a_search_ends_at_its_limit_with_the_best_so_far(
     monkeypatch: pytest.MonkeyPatch, limit_s: float
 ) -> None:
@@ -875,17 +867,6 @@ def test_an_interruption_within_a_kernel_is_one() -> None:
     assert is_interruption(twice)
     assert not is_interruption(SystemError("of another kind"))
     assert not is_interruption(ValueError())
-
-
-@pytest.mark.parametrize("limit_s", [0.0, -1.0, float("nan")])
-def test_a_limit_is_positive(limit_s: float) -> None:
-    run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
-    for search in (
-        lambda: ep.estimate(run, ep.polynomial(["x", "y"], degree=2), limit_s=limit_s),
-        lambda: ep.TrajectorySearch(limit_s=limit_s),
-    ):
-        with pytest.raises(ValueError, match="limit_s must be positive, in s, or None"):
-            search()
 
 
 def test_squares_whose_sum_overflows_are_infinite_and_warn_of_nothing() -> None:

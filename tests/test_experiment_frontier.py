@@ -1,10 +1,7 @@
-import re
 from pathlib import Path
 
-import pytest
 from omegaconf import DictConfig
 
-from ep2sindy.app.runner import run_config
 from tests import programs
 
 
@@ -26,18 +23,3 @@ def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
     lowest = frontier.outcome.tables()["lowest_rates"].set_index("variant")
     assert lowest.loc["STLSQ", "40 s"] == 20.0
     frontier.check_figures(*frontier.outcome.figures())
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["variants=[STLSG]"], "unknown variants ['STLSG']; there are ['"),
-        (["rates_Hz=[0]"], "rates_Hz[0] must be numbers, above zero: 0 came"),
-        (["parallel.n_jobs=0"], "n_jobs must be a number of processes"),
-    ],
-)
-def test_frontier_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, tmp_path: Path
-) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        run_config(composed(*overrides, f"output={tmp_path}"))

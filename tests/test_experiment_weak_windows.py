@@ -1,10 +1,7 @@
-import re
 from pathlib import Path
 
-import pytest
 from omegaconf import DictConfig
 
-from ep2sindy.app.runner import run_config
 from tests import programs
 
 
@@ -27,17 +24,3 @@ def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
         assert cell["n"] == 2
         assert {"n_windows", "noise", "error_mean", "error_std"} <= set(cell)
     errors.check_figures("errors")
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["n_points=[10,3001]"], "n_points=3001 was asked of 3000 samples"),
-        (["boxes.test_functions.n_windows=9"], "boxes.test_functions.n_windows is what n_windows"),
-    ],
-)
-def test_weak_windows_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, tmp_path: Path
-) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        run_config(composed(*overrides, f"output={tmp_path}"))

@@ -189,12 +189,6 @@ def test_a_lazy_file_gives_the_same_average(tmp_path: Path) -> None:
     assert np.array_equal(lazy.values, zone_average(masked_field(), Zone(), states=["n_i"]).values)
 
 
-def test_fields_of_different_lengths_give_trajectories_of_theirs() -> None:
-    for n in (5, 11):
-        run = zone_average(GOOD.isel(time=slice(n)), Zone(), states=["n_i"])
-        assert np.array_equal(run.t, T[:n])
-
-
 def test_a_point_is_the_nearest_cell() -> None:
     field = masked_field()
     run = point_samples(field, z=0.9, r=1.2, states=["n_i"], inputs=["n_n", "T_e_eV"])
@@ -285,12 +279,6 @@ def test_a_first_sample_without_values_is_no_mask() -> None:
 def test_a_grid_of_one_point_needs_only_to_be_inside() -> None:
     run = zone_average(GOOD.isel(z=[1]), Zone(z=(0.0, 3.0)), states=["n_i"])
     assert column(run, "n_i")[2] == 3.0
-
-
-def test_names_of_any_field_of_science_work() -> None:
-    field = field_of([0, 1], prey=(("time", "z"), wave(2)), predators=(("time", "z"), wave(2)))
-    run = zone_average(field, Zone(), states=["prey", "predators"], products=["prey*predators"])
-    assert run.names == ("prey", "predators", "<prey*predators>")
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,9 @@ import pytest
 
 from ep2sindy.app.arguments import mend
 from ep2sindy.app.schema import study_of
-from ep2sindy.library.library import polynomial
-from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.file_names import FilePattern, propose_pattern
 from ep2sindy.studies import parametric, predict
+from tests.models import lienard
 from tests.programs import Computed, composed, computed, ended
 
 
@@ -107,15 +106,10 @@ def test_the_pattern_may_be_typed_in_any_form(typed: str) -> None:
 
 
 def swing(folder: Path, *values: float) -> None:
-    """Lienard's van der Pol over one parameter, by its name; a period takes seven seconds."""
-    library = polynomial(["n_i", "n_n"], degree=3)
+    """Lienard's van der Pol over one parameter, by its name."""
     for a in values:
-        terms = [{"n_i": a, "n_n": -1.0, "n_i^3": -0.3}, {"n_i": 1.0}]
-        model = SparseModel(library, ["n_i", "n_n"], coef_matrix(library, terms))
-        states = model.simulate(0.1 * np.arange(1000), [1.0, 0.0]).states[300:]
-        table = pd.DataFrame(states, columns=["n_i [m^-3]", "n_n [m^-3]"])
-        table.insert(0, "time [s]", 0.1 * np.arange(700))
-        table.to_csv(folder / f"a{a}.csv", index=False)
+        table = lienard(a).to_dataframe().set_axis(["n_i [m^-3]", "n_n [m^-3]"], axis=1)
+        table.to_csv(folder / f"a{a}.csv", index_label="time [s]")
 
 
 def predicted(folder: Path, terms: str, *more: str) -> Computed:

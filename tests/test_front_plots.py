@@ -90,27 +90,3 @@ def test_errors_of_exact_fits_stand_on_a_line_that_says_so(
     assert heights.min() == FLOOR > ax.get_ylim()[0]
     assert [text.get_text() for text in ax.texts] == ["$10^{-12}$ or less"]
     assert not drawn(front).texts
-
-
-def test_supports_far_worse_than_none_are_marked_at_the_edge(
-    searched: tuple[ParetoFront, np.ndarray],
-) -> None:
-    front, _ = searched
-    assert front.cloud is not None
-    worse = front.cloud.errors.copy()
-    worse[-1] = 1e6
-    ax = drawn(replace(front, cloud=replace(front.cloud, errors=worse)))
-    assert ax.get_ylim()[1] == TOP
-    (carets,) = [each for each in ax.lines if np.asarray(each.get_ydata()).tolist() == [TOP]]
-    assert np.asarray(carets.get_xdata()).tolist() == [front.cloud.sizes[-1]]
-
-
-def test_many_equations_stand_in_rows_without_empty_panels(
-    searched: tuple[ParetoFront, np.ndarray],
-) -> None:
-    front, _ = searched
-    names = [f"x_{k}" for k in range(7)]
-    scored = front.with_scores(np.arange(float(len(front.candidates))))
-    figure = front_figure(dict.fromkeys(names, scored), label="EBIC")
-    assert len(figure.axes) == 7
-    assert figure.get_figwidth() < 20.0

@@ -18,8 +18,6 @@ from ep2sindy.runtime.files import (
     WriteError,
     replacing,
     sweep,
-    write_bytes,
-    write_text,
 )
 
 resource = pytest.importorskip("resource", reason="limits of a process need POSIX")
@@ -59,12 +57,6 @@ def test_no_netcdf_writer_falls_over_on_a_full_disk(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["field.nc"]
 
 
-def test_an_error_says_path_reason_and_way_out(tmp_path: Path) -> None:
-    (tmp_path / "taken").write_text("a file")
-    with pytest.raises(WriteError, match=r"taken/x.txt could not be written \(.*\).*make room"):
-        write_text(tmp_path / "taken" / "x.txt", "text")
-
-
 def test_an_error_of_a_worker_arrives_whole() -> None:
     sent = WriteError(Path("kept/x.nc"), OSError(28, "No space left on device"))
     arrived = pickle.loads(pickle.dumps(sent))
@@ -99,11 +91,6 @@ def test_only_what_killed_processes_left_is_swept(tmp_path: Path) -> None:
         sweep(tmp_path)
         assert living.exists()
     assert sorted(deeper.iterdir()) == sorted([*others, deeper / "a.b.nc"])
-
-
-def test_bytes_are_written_whole(tmp_path: Path) -> None:
-    write_bytes(tmp_path / "x.bin", memoryview(b"\0\1"))
-    assert (tmp_path / "x.bin").read_bytes() == b"\0\1"
 
 
 def test_a_written_field_is_the_same_from_memory(tmp_path: Path) -> None:

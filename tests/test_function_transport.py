@@ -9,11 +9,9 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.thruster.axial.settings import to_json
+from tests.thrusters import brief
 
-POINT = ep.thruster.OperatingPoint(300.0, 5.0)
-BRIEF = {
-    "duration_s": 9e-5, "warm_up_s": 3e-5, "n_cells": 30, "stretch": 1.0, "progress": False,
-}  # fmt: skip
+BRIEF = {"duration_s": 9e-5, "warm_up_s": 3e-5, "n_cells": 30}
 
 
 def default_c(z, t, plasma):
@@ -42,13 +40,11 @@ class Level:
 
 def run(function, **settings):
     transport = ep.thruster.FunctionTransport(function)
-    return ep.thruster.simulate(
-        ep.thruster.Thruster(transport=transport), POINT, **(BRIEF | settings)
-    )
+    return brief(ep.thruster.Thruster(transport=transport), **(BRIEF | settings))
 
 
 def test_the_default_as_a_function_changes_nothing():
-    plain = ep.thruster.simulate(ep.thruster.Thruster(), POINT, **BRIEF)
+    plain = brief(**BRIEF)
     np.testing.assert_allclose(run(default_c)["I_d"], plain["I_d"], rtol=1e-12)
 
 

@@ -541,18 +541,6 @@ def test_intervals_hold_the_truth_where_functions_bend_in_noise(
     assert low < np.std(errors) < high
 
 
-def test_a_joint_search_takes_a_function_of_ones_own(tanh: str) -> None:
-    truth = model_of({"x": {"y": 1.0}, "y": {"tanh(3*x)": -4.0, "y": -0.05}})
-    clean = truth.simulate(np.linspace(0.0, 20.0, 1001), [1.5, 0.0]).trajectory()
-    noisy = clean.states + 0.03 * np.random.default_rng(1).standard_normal(clean.states.shape)
-    run = ep.Trajectory(clean.t, noisy, ["x", "y"])
-    library = polynomial(["x", "y"], degree=3, functions=["tanh(3*x)"])
-    found = ep.discover(run, library, ep.TrajectorySearch()).model
-    assert found.terms("x") == pytest.approx({"y": 1.0}, rel=0.02)
-    assert set(found.terms("y")) == {"tanh(3*x)", "y"}
-    assert found.terms("y")["tanh(3*x)"] == pytest.approx(-4.0, rel=0.02)
-
-
 @pytest.mark.parametrize("search", ["regression", pytest.param("joint", marks=pytest.mark.slow)])
 def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
     """Decay with feed, s' = u - b s/(K + s), of some 1e18 and over microseconds."""

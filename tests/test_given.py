@@ -20,13 +20,6 @@ def test_a_table_has_its_time_in_a_column_and_states_in_the_others(time: str) ->
     np.testing.assert_array_equal(run.states, X)
 
 
-def test_a_table_may_have_its_time_as_index() -> None:
-    table = pd.DataFrame(X, columns=["a", "b"], index=pd.Index(T, name="t"))
-    (run,) = trajectories_of(table)
-    np.testing.assert_array_equal(run.t, T)
-    assert run.state_names == ("a", "b")
-
-
 def test_arrays_are_named_x() -> None:
     assert trajectories_of((T, X))[0].state_names == ("x0", "x1")
     assert trajectories_of((T, X[:, 0]))[0].state_names == ("x",)

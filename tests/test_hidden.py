@@ -89,9 +89,8 @@ def test_forecasts_need_the_measured_states_alone(found: ep.Discovery) -> None:
 
 
 def test_the_experiment_finds_it_too(tmp_path) -> None:
-    path, run = tmp_path / "prey.csv", only("x")
-    table = np.column_stack([run.t, run.states])
-    np.savetxt(path, table, delimiter=",", header="time_s,x", comments="")
+    path = tmp_path / "prey.csv"
+    only("x").to_dataframe().to_csv(path)
     given = ["+exp=discover", "data=recognised", f"data.path={path}", "trajectory.states=[x]"]
     folder = run_config(composed(*given, "hidden=[g]", "forecasts=4", f"output={tmp_path}"))
     summary = json.loads((folder / "summary.json").read_text())["models"]["model"]

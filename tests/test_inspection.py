@@ -343,13 +343,6 @@ def test_time_that_does_not_increase_is_named(tmp_path: Path) -> None:
     assert list(ep.open_field(rounded, dt_s=0.1)["x"].values) == [1, 2, 0, 3, 1]
 
 
-def test_long_lists_are_cut(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", **{f"signal_{k}": WAVE[:, 0, 0] for k in range(200)})
-    lines = ep.inspect_file(tmp_path / "a.npz").lines()
-    assert len(lines) < 70
-    assert "... 140 more arrays" in lines
-
-
 @pytest.mark.parametrize(
     ("files", "said"),
     [

@@ -460,23 +460,6 @@ def test_a_field_is_written_and_read_back_whole(tmp_path: Path) -> None:
     assert again["n_i"].identical(field["n_i"])
 
 
-def test_a_failed_write_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    field = open_field(npz(tmp_path), **SETTINGS)
-    write_field(field, tmp_path / "field.nc")
-
-    def interrupted(path: Path, content: bytes) -> None:
-        path.open("wb").write(content[: len(content) // 2])
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Path, "write_bytes", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write_field(field.isel(time=slice(2)), tmp_path / "field.nc")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "field.nc"]
-    assert read_field(tmp_path / "field.nc").sizes["time"] == NT
-
-
 def test_a_written_field_is_netcdf(tmp_path: Path) -> None:
     field = open_field(npz(tmp_path), **SETTINGS)
     with pytest.raises(ValueError, match=r"to a name that ends in .nc: .*field.h5 came"):
