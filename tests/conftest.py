@@ -41,6 +41,13 @@ def coarse_figures() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder, in which the test stands."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
 @pytest.fixture(scope="session")
 def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A field on (time, z) whose average follows the thesis's Eq. 23, in SI units."""

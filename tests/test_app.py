@@ -227,32 +227,30 @@ def test_a_package_without_its_configs_says_so(
 
 @pytest.mark.parametrize("named", [False, True])
 def test_configs_below_the_folder_one_stands_in_are_found(
-    named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    named: bool, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "conf").mkdir()
-    monkeypatch.chdir(tmp_path)
+    (here / "conf").mkdir()
     given = ["--config-dir", "elsewhere", "+exp=mine"] if named else ["+exp=mine"]
     monkeypatch.setattr(sys, "argv", ["ep2sindy", *given])
     program.prepare_arguments(ROOT / "conf")
-    own = ["--config-dir", str(tmp_path / "conf"), "+exp=mine"]
+    own = ["--config-dir", str(here / "conf"), "+exp=mine"]
     assert sys.argv[1:] == (given if named else own)
 
 
-def test_flags_may_stand_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_flags_may_stand_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["ep2sindy", "+exp=discover", "-m", "seed=0,1"])
     program.prepare_arguments(ROOT / "conf")
     assert sys.argv[1:] == ["-m", "+exp=discover", "seed=0,1"]
 
 
 def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    here: Path, capsys: pytest.CaptureFixture
 ) -> None:
     """Three jobs that end early, each for its own reason: no job ends another."""
-    (tmp_path / "conf" / "exp").mkdir(parents=True)
+    (here / "conf" / "exp").mkdir(parents=True)
     own = "# @package _global_\ndefaults: [discover]\nexperiment: mine\n"
-    (tmp_path / "conf" / "exp" / "mine.yaml").write_text(own)
-    monkeypatch.chdir(tmp_path)
+    (here / "conf" / "exp" / "mine.yaml").write_text(own)
     error = ended(
         "-m", "+exp=mine", "data=file", "data.path=none.nc", "trajectory.states=[x,y]", "seed=-1,2"
     )
@@ -260,7 +258,7 @@ def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
     said = capsys.readouterr()
     for text in ("job 0: ", "job 1: ", "ep2sindy compare outputs", "seed must be a whole number"):
         assert text in said.out
-    paths = sorted(tmp_path.glob("outputs/multirun/*/jobs/*.json"))
+    paths = sorted(here.glob("outputs/multirun/*/jobs/*.json"))
     errors = [read_json(path.read_text())["error"] for path in paths]
     assert errors[0] == "seed must be a whole number, zero or more: -1 came"
     assert errors[1].startswith("no such file: ")
@@ -277,12 +275,8 @@ def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
         (["+exp=breathing", "output=/proc/none"], "choose another with output=PATH"),
     ],
 )
-def test_mistakes_end_in_one_clear_message(
-    overrides: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture,
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
+def test_mistakes_end_in_one_clear_message(overrides: list[str], message: str, here: Path) -> None:
     error = ended(*overrides)
     assert message in error
     assert error.startswith("error: ")
-    assert not list(tmp_path.glob("outputs/*/*"))  # no run folder of a run that never began
+    assert not list(here.glob("outputs/*/*"))  # no run folder of a run that never began

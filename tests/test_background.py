@@ -93,19 +93,6 @@ def test_a_speed_of_the_neutrals_follows_its_table() -> None:
             lambda: ep.thruster.NeutralSpeed([0.0, 1.0], [1.0, 0.0]),
             "positive everywhere, got 0 m/s",
         ),
-        (
-            lambda: ep.thruster.simulate_2d(operating_point=at(1e-3), progress=False),
-            r"the \(z, r\) model does not solve a background gas",
-        ),
-        (
-            lambda: ep.thruster.simulate_2d(
-                operating_point=replace(
-                    POINT, neutral_speed=ep.thruster.NeutralSpeed([0.0, 1.0], [200.0, 300.0])
-                ),
-                progress=False,
-            ),
-            r"the \(z, r\) model does not solve a neutral speed that varies",
-        ),
     ],
 )
 def test_what_cannot_be_is_refused(make, message: str) -> None:

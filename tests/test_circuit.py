@@ -140,22 +140,31 @@ def test_a_voltage_is_read_from_a_file(tmp_path: Path):
             lambda: driven(ep.thruster.VoltageTable((0.0, 1.0), (280.0, 300.0))),
             "must be the supply's at t = 0: it is 300 V, and the table has 280 V",
         ),
-        (
-            lambda: ep.thruster.simulate_2d(
-                replace(ep.thruster.THRUSTER_2D, circuit=ep.thruster.Circuit(inductance=1e-4)),
-                progress=False,
-            ),
-            "does not solve a circuit; simulate along the axis alone",
-        ),
-        (
-            lambda: ep.thruster.simulate_2d(
-                operating_point=replace(ep.thruster.OPERATING_POINT_2D, supply=SINE),
-                progress=False,
-            ),
-            "does not solve a supply whose voltage varies; simulate along the axis alone",
-        ),
+        
+        
     ],
 )  # fmt: skip
 def test_what_no_circuit_can_be_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def bohm(z, t, plasma):
+    return 0.01
+
+
+@pytest.mark.parametrize(
+    ("thruster", "point", "words"),
+    [
+        ({"circuit": ep.thruster.Circuit(inductance=1e-4)}, {}, "a circuit"),
+        ({"transport": ep.thruster.FunctionTransport(bohm)}, {}, "a transport by a function"),
+        ({}, {"supply": SINE}, "a supply whose voltage varies"),
+        ({}, {"background": ep.thruster.Background(1e-3)}, "a background gas"),
+        ({}, {"neutral_speed": ep.thruster.NeutralSpeed([0.0, 1.0], [2e2, 3e2])}, "a neutral spe"),
+    ],
+)
+def test_the_z_r_model_refuses_what_it_does_not_solve(thruster, point, words):
+    shaped = replace(ep.thruster.THRUSTER_2D, **thruster)
+    driven_so = replace(ep.thruster.OPERATING_POINT_2D, **point)
+    with pytest.raises(ValueError, match=f"does not solve {words}"):
+        ep.thruster.simulate_2d(shaped, driven_so, progress=False)

@@ -41,10 +41,8 @@ def test_names_in_lists_and_mappings_may_have_any_letters() -> None:
     assert value_of("data.path=${oc.env:HOME}") == "${oc.env:HOME}"
 
 
-def test_a_comma_parts_jobs_of_a_sweep_unless_it_stands_in_a_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_a_comma_parts_jobs_of_a_sweep_unless_it_stands_in_a_name() -> None:
     (found,) = OverridesParser.create().parse_overrides([mend("data.path=a.csv,b.csv")])
     assert found.is_sweep_override()
     Path("a,b.csv").touch()

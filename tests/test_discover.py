@@ -134,6 +134,7 @@ def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: AnyMeth
     assert not any(each.leaves_noise for each in left)
     assert min(each.autocorrelation for each in left) > 0.3
     assert "no equation of this library leaves white noise of x'" in lacking.misfit
+    assert lacking.misfit in lacking.note
     assert lacking.model.covariance is None
 
 

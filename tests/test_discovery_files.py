@@ -109,7 +109,7 @@ def test_a_discovery_that_cannot_be_is_refused(change: dict[str, Any], message: 
     assert caught.match(message)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "null", "1", "[" * 100_000, "{}", "\0"])
+@pytest.mark.parametrize("text", ["", "[]", "1", "[" * 100_000, "{}", "\0"])
 def test_text_that_is_no_discovery_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="a discovery must be"):
         ep.Discovery.from_json(text)

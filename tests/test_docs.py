@@ -89,11 +89,9 @@ INLINE = re.compile(r"(?<!`)`(ep2sindy \+exp=[^`]*|ep2sindy -m [^`]*)`(?!`)")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_config_and_a_command_in_the_text_compose(
-    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("here")
+def test_a_config_and_a_command_in_the_text_compose(page: Path) -> None:
     """Configs lie where the page says, in a folder that also holds the page's own modules."""
-    monkeypatch.chdir(tmp_path)
     text = page.read_text("utf-8")
     configs = [b.text for b in blocks(page) if b.language == "yaml"]
     names = [check_config(config, text) for config in configs]
@@ -235,17 +233,6 @@ def test_what_a_page_links_to_is_there() -> None:
     assert not lost, "\n".join(lost)
 
 
-def test_pysindys_examples_take_no_more_lines_here() -> None:
-    page = (ROOT / "docs" / "pysindy.md").read_text("utf-8")
-    pairs = [re.findall(r"```python\n(.*?)```", row, re.DOTALL) for row in page.split("<tr>")]
-    compared = [pair for pair in pairs if len(pair) == 2]
-    assert len(compared) == 7
-    for theirs, ours in compared:
-        assert "ps." in theirs or "model." in theirs
-        assert "ps." not in ours
-        assert len(ours.splitlines()) <= len(theirs.splitlines()), ours
-
-
 @pytest.mark.parametrize(
     ("came", "is_right"),
     [
@@ -329,12 +316,9 @@ def has_example(name: str) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in dotted_names() if has_example(n)])
-def test_the_example_of_a_docstring_runs(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_example_of_a_docstring_runs(name: str, here: Path) -> None:
     """In a folder that holds run.nc."""
-    monkeypatch.chdir(tmp_path)
-    write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, tmp_path / "run.nc")
+    write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, here / "run.nc")
     text = dotted_names()[name].load().__doc__
     example = doctest.DocTestParser().get_doctest(text, {"ep": ep, "np": np}, name, None, None)
     said: list[str] = []

@@ -4,8 +4,6 @@ import pytest
 from benchmarks.intervals import held
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import reweight
-from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.front import Candidate, fit_support, pareto_front
@@ -107,32 +105,6 @@ def test_terms_that_cannot_explain_the_data_still_give_finite_rows() -> None:
     assert np.isfinite(candidate.coef).all()
     assert candidate.left.chi_squared > 2.0
     assert candidate.covariance is None  # it would not hold the truth
-
-
-@pytest.mark.parametrize(
-    ("left_out", "recipe"),
-    [
-        pytest.param(None, TrajectorySearch(), id="None-joint"),
-        pytest.param(None, Regression(WeightedWeak()), id="None-regression"),
-        pytest.param("x", TrajectorySearch(), id="x-joint", marks=pytest.mark.slow),
-        pytest.param("x", Regression(WeightedWeak()), id="x-regression"),
-        pytest.param("x*y", TrajectorySearch(), id="x*y-joint", marks=pytest.mark.slow),
-        pytest.param("x*y", Regression(WeightedWeak()), id="x*y-regression"),
-    ],
-)
-def test_a_library_without_a_true_term_is_told_and_gives_no_intervals(
-    recipe: AnyMethod, left_out: str | None
-) -> None:
-    system = lotka_volterra()
-    library = system.model.library
-    kept = np.array([name != left_out for name in library.names])
-    run = system.trajectory(noise=0.05, rng=0).window(0, 300)
-    found = discover(run, library.take(kept), recipe)
-    assert bool(found.misfit) == (left_out is not None)
-    assert (found.model.covariance is None) == (left_out is not None)
-    assert found.misfit in found.note
-    if left_out:
-        assert "of this library" in repr(found)
 
 
 def test_weighted_rows_leave_exact_data_their_exact_coefficients() -> None:

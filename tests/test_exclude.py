@@ -59,6 +59,9 @@ def test_a_hidden_state_enters_by_no_excluded_term() -> None:
         ({"terms": ["x"]}, r"terms must be lists of terms by state, .*: \['x'\] came"),
         ({"exclude": {"x": [1]}}, "exclude must hold names .*: 1 came for 'x'; the constant"),
         ({"exclude": {"z": ["x"]}}, r"unknown state 'z'; there are \['x', 'y'\]"),
+        ({"relations": ["z: x == 1"]}, r"unknown state 'z'; there are \['x', 'y'\]"),
+        ({"terms": {"x": []}}, r"an equation whose terms are given must have some: \['x'\]"),
+        ({"terms": {"x": ["y"]}, "relations": ["x: x == 1"]}, "is not in the support of"),
         ({"exclude": {"x": ["x^3"]}}, r"unknown term 'x\^3'; this library has \["),
         ({"exclude": {"x": LIBRARY.names}}, "exclude must leave terms to every .* all 6 of the"),
         (

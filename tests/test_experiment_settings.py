@@ -14,6 +14,9 @@ from tests.test_pages import TOYS
 LIBRARY_KEYS = "library may have ['degree', 'products', 'variables'] and needs variables and degree"
 TWICE = "points=[{V_D_V: 300, mdot_mg_s: 5},{V_D_V: 300.0, mdot_mg_s: 5}]"
 ALIKE = "points=[{V_D_V: 1, mdot_mg_s: 5},{V_D_V: 2, mdot_mg_s: 5}]"
+LINE = "{V_D_V: 300, mdot_mg_s: [4, 5, 6, 7]}"
+FEW = "{V_D_V: 300, mdot_mg_s: [4, 5]}, {V_D_V: 310, mdot_mg_s: 4}"
+STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in range(4))
 
 
 @pytest.mark.parametrize(
@@ -57,6 +60,17 @@ ALIKE = "points=[{V_D_V: 1, mdot_mg_s: 5},{V_D_V: 2, mdot_mg_s: 5}]"
         ("pointwise", ["terms=[n_i-n_n]"], "a term is variables joined by *"),
         ("pointwise", ["terms=[n_i*B]"], "unknown variables ['B']; this field has"),
         ("pointwise", ["bootstraps.block=100000"], "no point could be fitted: a block must hold"),
+        ("predict", ["models.conserving.terms.n_i=[n_i,u_iz]"], "runs freely, on its states ['n_i"),
+        ("predict", ["models.conserving.terms.n_n=[]"], "must list the terms of every state"),
+        (
+            "predict",
+            ["models.conserving.known.n_n={1: {flow: 4.58e22}}"],
+            "functions of ['V_D_V', ",
+        ),
+        ("predict", ["+models.conserving.relations=['n_i: n_i == n_n: n_n^2']"], "unknown term"),
+        ("predict", [f"points=[{LINE}]"], "'V_D_V' is 300 at all 4 operating points; give it mor"),
+        ("predict", [f"points=[{FEW}]"], "a law of 3 functions of ['V_D_V', 'mdot_mg_s'] needs m"),
+        ("predict", [f"points=[{STRAIGHT}]"], "4 points do not tell the 3 terms of a law apart"),
         ("simulate", ["scan={operating_point.volts:[1]}"], "operating_point.volts must be there"),
         ("simulate", ["scan={n_cells:[]}"], "scan must be like {operating_point.voltage: [250,"),
         ("simulate", ["scan={n_cells:[30,30]}"], "each value once"),
@@ -71,7 +85,9 @@ ALIKE = "points=[{V_D_V: 1, mdot_mg_s: 5},{V_D_V: 2, mdot_mg_s: 5}]"
 def test_settings_that_cannot_work_are_refused(
     experiment: str, changes: list[str], message: str, predator_prey: Path, tmp_path: Path
 ) -> None:
-    config = composed(f"+exp={experiment}", *TOYS[experiment](predator_prey, tmp_path), *changes)
+    toy = TOYS[experiment](predator_prey, tmp_path)
+    own = [text for text in toy if not text.startswith("+exp=")]
+    config = composed(f"+exp={experiment}", *own, *changes)
     refused = (ValueError, HydraException, OmegaConfBaseException)
     with pytest.raises(refused, match=re.escape(message)):
         run_config(config)

@@ -243,8 +243,6 @@ def test_a_gap_is_no_obstacle() -> None:
         (lambda: ep.forecast(SPRING, spring(0.05), -1.0), "a positive duration in s, or incr"),
         (lambda: ep.forecast(SPRING, spring(0.05), [5.0, 6.0]), "after the history's end at 119.9"),
         (lambda: ep.forecast(SPRING, spring(0.05), 1.0, measured=["z"]), "measured must name some"),
-        (lambda: ep.forecast(ep.pendulum().model, spring(0.05), 1.0), "some of the model's states"),
-        (lambda: ep.forecast(SPRING, spring(0.05), 1.0).amplitude("z"), "unknown state 'z'"),
         (lambda: ep.forecast_skill(SPRING, spring(0.05), n_fitted=1200), "and leave four"),
         (
             lambda: ep.forecast_skill(SPRING, spring(0.05), n_fitted=900, horizon_s=40.0),

