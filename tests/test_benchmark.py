@@ -146,7 +146,6 @@ def test_this_packages_path_is_a_variant_and_keeps_the_empty_support() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"systems": ["pendulum"]}, "unknown systems ['pendulum']; there are ['oscillator', "),
         ({"n_realizations": 0}, "there must be something to run"),
         ({"noises": []}, "there must be something to run"),
         ({"variants": {}}, "there must be something to run"),

@@ -49,8 +49,8 @@ def test_a_comma_parts_jobs_of_a_sweep_unless_it_stands_in_a_name() -> None:
     assert value_of("data.path=a,b.csv") == "a,b.csv"
 
 
-@pytest.mark.parametrize("name", ["it's (1) ä.csv", "$a&b;日本.csv"])
-def test_what_inspect_prints_is_pasted_into_a_shell_and_runs(name: str, tmp_path: Path) -> None:
+def test_what_inspect_prints_is_pasted_into_a_shell_and_runs(tmp_path: Path) -> None:
+    name = "it's (1) ä$a&b;日本.csv"
     t = 1e-6 * np.arange(300)
     rows = np.column_stack([t, 2.0 + np.sin(1e5 * t), 2.0 + np.cos(1e5 * t)])
     np.savetxt(tmp_path / name, rows, delimiter=",", header="t_s,Düse_ä,b", comments="")

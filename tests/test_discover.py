@@ -5,6 +5,7 @@ import pytest
 
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.datasets.records import hare_lynx
 from ep2sindy.discovery import choice
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
@@ -23,12 +24,7 @@ from ep2sindy.selection.rule import combinations
 from ep2sindy.systems.systems import lotka_volterra
 from tests.rules import BySize
 
-# Pelts in thousands, 1900 to 1920. Source: Elton & Nicholson 1942, doi:10.2307/1358.
-HARE = [30, 47.2, 70.2, 77.4, 36.3, 20.6, 18.1, 21.4, 22, 25.4, 27.1, 40.3, 57, 76.6, 52.3, 19.5]
-HARE += [11.2, 7.6, 14.6, 16.2, 24.7]
-LYNX = [4, 6.1, 9.8, 35.2, 59.4, 41.7, 19, 13, 8.3, 9.1, 7.4, 8, 12.3, 19.5, 45.7, 51.1, 29.7]
-LYNX += [15.8, 9.7, 10.1, 8.6]
-PELTS = Trajectory(np.arange(1900.0, 1921.0), np.stack([HARE, LYNX], axis=1), ["hare", "lynx"])
+PELTS = Trajectory(np.arange(1900.0, 1921.0), hare_lynx().states, ["hare", "lynx"])  # in years
 
 RECIPE = Regression(Differential(), AdaptiveLasso(), Knee("library"), Bootstraps(n=8))
 

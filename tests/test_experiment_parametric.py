@@ -19,6 +19,7 @@ from ep2sindy.report.page import page_html
 from ep2sindy.studies.parametric import Study
 from ep2sindy.studies.views import with_error
 from tests import programs
+from tests.fields import along_channel
 
 ESTIMATES = {
     "constrained": {"L_m", "g_inj", "eps"},
@@ -171,16 +172,7 @@ def breathing_file(path: Path, *, amplitude: float, dt_s: float, rate: float = 1
         "R_ion": (5e-14 * (1 + 0.6 * amplitude * np.cos(phase + 0.4)), "m^3/s"),
         "u_iz": (4e3 * (1 + 0.3 * amplitude * np.sin(phase + 1)), "m/s"),
     }
-    profile = np.ones((1, 3))
-    field = xr.Dataset(
-        {
-            name: (("time", "z"), v[:, None] * profile, {"units": u})
-            for name, (v, u) in data.items()
-        },
-        coords={"time": t, "z": [0.016, 0.02, 0.024]},
-        attrs={"channel_m": 0.025},
-    )
-    write_field(field, path)
+    write_field(along_channel(t, [0.016, 0.02, 0.024], data), path)
     return path
 
 

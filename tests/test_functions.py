@@ -59,10 +59,8 @@ def every() -> Library:
     [
         ("v*sin( 2 * x )", "sin(2*x)*v"),
         ("1/(x + 0.5)", "1/(0.5+x)"),
-        ("inverse(x)", "1/x"),
         ("v / x^2", "v/x^2"),
         ("log(1 - 2*x)", "log(1-2*x)"),
-        ("exp(-x)", "exp(-x)"),
         ("sqrt(1e-18*x)*sin(x)^2", "sin(x)^2*sqrt(1e-18*x)"),
         ("sin(<x*v>)*x", "x*sin(<x*v>)"),
     ],
@@ -331,7 +329,6 @@ def test_a_sample_outside_a_domain_is_named(method: ep.Regression | ep.Trajector
     ("function", "x", "message"),
     [
         ("1/x", np.cos(T), r"1/x needs x to stay on one side of 0: x\[0\] = 1 .*\(187 such"),
-        ("sqrt(x)", T, r"sqrt\(x\) needs x > 0: x\[0\] = 0 at t = 0 s; name"),
         ("log(1-2*x)", 0.6 - 0.3 * np.cos(T), r"needs 1-2\*x > 0: x\[124\] .*\(377 such samples\)"),
         ("exp(x)", 800.0 + T, r"exp\(x\) needs x < 709: x\[0\] = 800"),
     ],
@@ -402,7 +399,6 @@ def test_what_a_smoother_moves_out_of_a_domain_stays_with_its_sample() -> None:
     [
         ({"x": {"sqrt(x)": -1.0}}, "sqrt(x)", 2.0),  # x = (1 - t/2)^2
         ({"x": {"1/x": -1.0}}, "1/x", 0.5),  # x^2 = 1 - 2 t
-        ({"x": {"1": -1.0, "1/(2+x)": 1e-9}}, "1/(2+x)", 3.0),
         ({"x": {"1": -1.0, "log(x)": 1e-9}}, "log(x)", 1.0),
         ({"x": {"1": -1.0, "abs(x)": 1e-9, "sin(x)": 1e-9}}, "", 5.0),
     ],
@@ -484,22 +480,20 @@ def test_of_dependent_products_one_is_left_out_and_named() -> None:
             assert not usable_terms(problem)[library.index(f"cos({v})^2")]
 
 
-FAST = {("regression", 0.1), ("joint", 0.0)}
-
-
 @pytest.mark.parametrize(
-    ("search", "noise"),
+    ("recipe", "noise"),
     [
-        pytest.param(search, noise, marks=() if (search, noise) in FAST else pytest.mark.slow)
-        for search in ("regression", "joint")
-        for noise in (0.0, 0.05, 0.1)
+        (None, 0.1),
+        (ep.TrajectorySearch(), 0.0),
+        pytest.param(ep.TrajectorySearch(), 0.1, marks=pytest.mark.slow),
     ],
 )
-def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(search: str, noise: float) -> None:
+def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(
+    recipe: ep.TrajectorySearch | None, noise: float
+) -> None:
     """theta' = w, w' = -g/L sin(theta); its energy w^2/2 - g/L cos(theta) stays."""
     system = ep.pendulum()
     run = system.trajectory(noise=noise, rng=3)
-    recipe = ep.TrajectorySearch() if search == "joint" else None
     library = polynomial(run.names, degree=3, functions=["sin", "cos"])
     found = ep.discover(run, library, recipe)
     assert {s: set(found.model.terms(s)) for s in found.model.states} == {
@@ -541,8 +535,7 @@ def test_intervals_hold_the_truth_where_functions_bend_in_noise(
     assert low < np.std(errors) < high
 
 
-@pytest.mark.parametrize("search", ["regression", pytest.param("joint", marks=pytest.mark.slow)])
-def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
+def test_saturation_is_found_in_units_far_from_one() -> None:
     """Decay with feed, s' = u - b s/(K + s), of some 1e18 and over microseconds."""
     K = 4e17
     truth = model_of({"s": {"u": 1.0, "s/(4e17+s)": -3e24}}, ("u",))
@@ -555,19 +548,14 @@ def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
     library = polynomial(
         ["s", "u"], degree=1, functions=["log(s)", "sqrt(s)"], products=[f"s/({K:g}+s)"]
     )
-    recipe = ep.TrajectorySearch() if search == "joint" else None
-    found = ep.discover(noisy, library, recipe).model
-    expected = {"u": 1.0, "s/(4e+17+s)": -3e24}
-    assert found.terms("s") == pytest.approx(expected, rel=0.05)
+    found = ep.discover(noisy, library).model
+    assert found.terms("s") == pytest.approx({"u": 1.0, "s/(4e+17+s)": -3e24}, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    "selection", [ep.RefinedScore(), pytest.param(ep.FreeRunScore(), marks=pytest.mark.slow)]
-)
-def test_rules_that_run_models_take_functions(selection: object) -> None:
+def test_rules_that_run_models_take_functions() -> None:
     run = ep.pendulum().trajectory(noise=0.02, rng=0)
     library = polynomial(run.names, degree=1, functions=["sin(theta)"])
-    recipe = ep.Regression(search=ep.BestSubset(max_terms=1), selection=selection)
+    recipe = ep.Regression(search=ep.BestSubset(max_terms=1), selection=ep.RefinedScore())
     found = ep.discover(run, library, recipe).model
     assert set(found.terms("w")) == {"sin(theta)"}
 

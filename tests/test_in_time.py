@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import xarray as xr
 
@@ -180,18 +179,6 @@ def test_gaps_are_told_with_their_length() -> None:
     assert words.startswith(
         "3 of 11 samples are missing (NaN) and left out; the longest gap is 3 s"
     )
-
-
-def test_lorenz_is_found_through_gaps() -> None:
-    run = ep.lorenz().trajectory(noise=0.01, rng=0)
-    table = pd.DataFrame(run.states, columns=["x", "y", "z"]).assign(t=run.t)
-    missing = np.random.default_rng(1).choice(len(table), 150, replace=False)
-    table.loc[missing, "y"] = np.nan
-    table.loc[800:830, "x"] = np.nan
-    with pytest.warns(ep.warnings.MissingSamples, match=r"of 3000 samples are missing"):
-        found = ep.discover(table)
-    terms = {state: sorted(found.model.terms(state)) for state in "xyz"}
-    assert terms == {"x": ["x", "y"], "y": ["x", "x*z", "y"], "z": ["x*y", "z"]}
 
 
 def test_gaps_in_the_times_themselves_are_counted() -> None:

@@ -329,13 +329,12 @@ def test_only_what_varies_along_time_is_offered_as_a_signal(tmp_path: Path) -> N
 
 
 def test_time_that_does_not_increase_is_named(tmp_path: Path) -> None:
-    back = tmp_path / "back.csv"
+    back, twice = tmp_path / "back.csv", np.r_[np.arange(20.0), 19.0, np.arange(20.0, 40.0)]
     back.write_text("time,x\n0,1\n1,2\n2,0\n1.5,3\n2.5,1\n")
-    with pytest.raises(
-        ValueError,
-        match=r"'time' does not increase \(1.5 follows 2 at row 4; 0 repeat the one before, 1 run",
-    ):
+    with pytest.raises(ValueError, match=r"\(1.5 follows 2 at row 4; 0 repeat .*, 1 run"):
         ep.open_field(back)
+    with pytest.raises(ValueError, match=r"19 follows 19 at row 21; 1 repeat"):  # no rounding
+        ep.open_field(write_csv(tmp_path / "twice.csv", t_s=twice, x=np.sin(twice)))
     rounded = tmp_path / "rounded.csv"
     rounded.write_text("time,x\n99.9,1\n100,2\n100,0\n100,3\n101,1\n")
     with pytest.raises(ValueError, match=r"\(100 follows 100 at row 3; 2 repeat .*give dt_s"):
@@ -369,15 +368,6 @@ def test_times_rounded_to_few_digits_are_equal_steps_and_said(tmp_path: Path) ->
     steps = np.diff(ep.open_field(path)["time"].values)
     np.testing.assert_allclose(steps, 0.35e-3, rtol=0.05)
     assert np.ptp(steps) < 1e-12
-
-
-def test_a_sample_that_stands_twice_is_no_rounding(tmp_path: Path) -> None:
-    t = np.r_[np.arange(20.0), 19.0, np.arange(20.0, 40.0)]
-    path = write_csv(tmp_path / "a.csv", t_s=t, x=np.sin(t))
-    with pytest.raises(
-        ValueError, match=r"19 follows 19 at row 21; 1 repeat the one before, 0 run"
-    ):
-        ep.open_field(path)
 
 
 @pytest.mark.parametrize("mark", [9.91e37, 9.9e37, 1e30, -999.0, -9999.0, 32767.0])
