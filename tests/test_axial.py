@@ -208,19 +208,21 @@ def test_a_transit_oscillation_is_told_from_breathing(f_Hz, status):
     assert judge_status(4.0 + np.sin(2e0 * np.pi * f_Hz * t), 1.5e-6) == status
 
 
+def verdict_on(current, *, diverged=False):
+    t = 1.5e-6 * np.arange(current.size)
+    field = xr.Dataset({"I_d": ("time", current)}, coords={"time": t})
+    return diagnose(field, diverged=diverged, flow_A=4.0)
+
+
 @pytest.mark.parametrize(("amplitude", "cycle"), [(6.0, "strong"), (2.0, "weak")])
 def test_a_result_names_its_cycle(amplitude, cycle):
-    t = 1.5e-6 * np.arange(4000)
-    current = 4.0 + amplitude * np.sin(2.0 * np.pi * 14e3 * t)
-    field = xr.Dataset({"I_d": ("time", current)}, coords={"time": t})
-    assert diagnose(field, diverged=False, flow_A=4.0)["cycle"] == cycle
+    current = 4.0 + amplitude * np.sin(2.0 * np.pi * 14e3 * 1.5e-6 * np.arange(4000))
+    assert verdict_on(current)["cycle"] == cycle
 
 
 @pytest.mark.parametrize(("late_A", "status"), [(0.0, "out"), (0.39, "out"), (0.41, "steady")])
 def test_a_discharge_that_has_gone_out_is_not_steady(late_A, status):
-    current = np.append(np.full(2000, 4.0), np.full(2000, late_A))
-    field = xr.Dataset({"I_d": ("time", current)}, coords={"time": 1.5e-6 * np.arange(4000)})
-    assert diagnose(field, diverged=False, flow_A=4.0)["status"] == status
+    assert verdict_on(np.repeat([4.0, late_A], 2000))["status"] == status
 
 
 def test_efficiency_is_by_the_mean_power(run):
@@ -266,12 +268,9 @@ def test_rates_that_do_not_cover_the_run_say_so():
     assert brief().attrs["rates"] == "covered"
 
 
-def test_a_discharge_that_falls_to_nothing_has_gone_out():
-    t = 1.5e-6 * np.arange(400)
-    for last, status in ((1e-300, "out"), (4.0, "diverged")):
-        current = np.geomspace(4.0, last, t.size)
-        field = xr.Dataset({"I_d": ("time", current)}, coords={"time": t})
-        assert diagnose(field, diverged=True, flow_A=4.0)["status"] == status
+@pytest.mark.parametrize(("last_A", "status"), [(1e-300, "out"), (4.0, "diverged")])
+def test_a_discharge_that_falls_to_nothing_has_gone_out(last_A, status):
+    assert verdict_on(np.geomspace(4.0, last_A, 400), diverged=True)["status"] == status
 
 
 @pytest.mark.parametrize("m", [1, 2, 3])

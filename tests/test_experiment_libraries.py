@@ -22,7 +22,7 @@ from ep2sindy.studies.library_result import REPLACED
 from ep2sindy.studies.living import run_title
 from ep2sindy.systems.systems import lotka_volterra
 from tests.models import model_of
-from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed, on_file
+from tests.programs import ROOT, Computed, composed, computed, on_file
 
 NO_LIVING = ("living=none", "held_out=null")
 
@@ -125,20 +125,10 @@ def test_a_run_without_a_period_is_not_said_to_keep_none() -> None:
 
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:
     folder = breathing_run
-    files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-    assert {
-        "config.yaml",
-        "provenance.json",
-        "run.log",
-        "summary.json",
-        "report.html",
-        "models/simple.json",
-        "tables/front_velocity.csv",
-        "tables/comparison.csv",
-        "figures/data.png",
-        "figures/trajectories.png",
-    } <= files
-    assert any(name.startswith("tensorboard/events") for name in files)
+    files = ["config.yaml", "provenance.json", "tables/front_velocity.csv", "tables/comparison.csv"]
+    for name in [*files, "figures/data.png", "figures/trajectories.png"]:
+        assert (folder / name).is_file(), name
+    assert list(folder.glob("tensorboard/events*"))
     model = SparseModel.load(folder / "models" / "simple.json")
     assert model.terms("n_i") == summary_of(folder)["models"]["simple"]["equations"]["n_i"]["terms"]
 
@@ -306,12 +296,6 @@ def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> Non
         run_config(config)
     (folder,) = (tmp_path / "breathing").iterdir()
     assert "ended early: ValueError: n_culled must leave" in (folder / "run.log").read_text()
-
-
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_experiment_composes(name: str) -> None:
-    config = composed(f"+exp={name}")
-    assert config.experiment == name
 
 
 def test_a_sweep_can_go_to_slurm() -> None:

@@ -9,14 +9,11 @@ import pytest
 import xarray as xr
 from omegaconf import DictConfig
 
-from ep2sindy.app.runner import run_config, start_run
-from ep2sindy.app.schema import study_of
+from ep2sindy.app.runner import run_config
 from ep2sindy.data.open import write_field
 from ep2sindy.figures.trends import PUBLISHED, trends_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.operating.quantity_law import control_law
-from ep2sindy.report.page import page_html
-from ep2sindy.studies.parametric import Study
 from ep2sindy.studies.views import with_error
 from tests import programs
 from tests.fields import along_channel
@@ -228,7 +225,10 @@ def test_own_files_and_points_that_do_not_oscillate(tmp_path: Path) -> None:
     second = breathing_file(tmp_path / "b.nc", amplitude=0.4, dt_s=2e-6, rate=1.1)
     still = breathing_file(tmp_path / "c.nc", amplitude=1e-3, dt_s=1.5e-6)
     dead = breathing_file(tmp_path / "d.nc", amplitude=0.0, dt_s=1.5e-6)
-    found = programs.computed(composed(*own_files(tmp_path, first, second, still, dead)))
+    given = own_files(tmp_path, first, second, still, dead)
+    found = programs.computed(composed(*given, "thesis=null"))
+    captions = [figure.caption for figure in found.outcome.figures().values()]
+    assert "thesis" not in "".join([found.page, *captions])  # without published values
     summary = found.summary
     assert [p["status"] for p in summary["points"]] == ["oscillating"] * 2 + ["steady"] * 2
     assert [p["dt_s"] for p in summary["points"][:3]] == pytest.approx([1.5e-6, 2e-6, 1.5e-6])
@@ -240,19 +240,6 @@ def test_own_files_and_points_that_do_not_oscillate(tmp_path: Path) -> None:
     said = " ".join(found.log.split())
     assert "V_D_V=400, mdot_mg_s=5: steady; 1000 samples of 1.5 µs; left out of t" in said
     assert "one: 2 points fitted; a law needs 3" in said
-
-
-def test_without_published_values_nothing_speaks_of_a_thesis(tmp_path: Path) -> None:
-    first = breathing_file(tmp_path / "a.nc", amplitude=0.5, dt_s=1.5e-6)
-    second = breathing_file(tmp_path / "b.nc", amplitude=0.4, dt_s=1.5e-6, rate=1.1)
-    config = composed(*own_files(tmp_path, first, second), "thesis=null")
-    with start_run(config) as run:
-        outcome = study_of(Study, config).compute(run)
-        run.screen.show(outcome.sections())
-        log = (run.folder.path / "run.log").read_text()
-    page = page_html(config.experiment, outcome.sections(), {})
-    captions = [each.caption for each in outcome.figures().values()]
-    assert "thesis" not in "".join([page, log, *captions])
 
 
 def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:

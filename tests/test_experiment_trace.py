@@ -105,18 +105,6 @@ def test_a_signal_of_either_sign_can_be_taken(embedding: str, tmp_path: Path) ->
         assert "I_before" in found.log
 
 
-@pytest.mark.slow
-def test_fine_samples_are_averaged_by_default(tmp_path: Path) -> None:
-    t, x = signal(12.0)
-    fine = np.linspace(t[0], t[-1], 4 * len(t))
-    path = scope(tmp_path / "scope.csv", fine, np.interp(fine, t, x))
-    taken = computed(composed(*glance(path, tmp_path)))
-    assert "means over 2 samples" in taken.log
-    assert taken.summary["data"]["n_samples"] == len(fine) // 2
-    kept = computed(composed(*glance(path, tmp_path, "decimate=null")))
-    assert kept.summary["data"]["n_samples"] == len(fine)
-
-
 def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path: Path) -> None:
     run = ep.lorenz().trajectory().window(0, 1500)
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])

@@ -1,4 +1,4 @@
-"""Rows in weak form: their fits on a file, the lengths of windows, and how much data it takes."""
+"""Rows in weak form: their fits on a file, and how long their windows should be."""
 
 from pathlib import Path
 
@@ -37,22 +37,6 @@ def test_weak_forms_find_predator_and_prey(predator_prey: Path, tmp_path: Path) 
     assert "thesis, Eq. 24: n_i' = -1.51e+05 n_i + 4.21e-14 n_i n_n" in found.log
     assert found.page.count("95 % from") == 1  # of the weighted fit
     found.check_figures("trajectories", "phase", "derivatives", "spectra")
-
-
-def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
-    overrides = ["variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]"]
-    config = composed("+exp=frontier", "parallel=serial", *overrides, f"output={tmp_path}")
-    frontier = computed(config)
-    points = frontier.summary["points"]
-    assert len(points) == 8
-    found = {(p["variant"], p["rate_Hz"], p["duration_s"]): p["identified"] for p in points}
-    assert found["STLSQ", 20.0, 40.0]
-    assert found["ours", 20.0, 40.0]
-    assert not found["STLSQ", 1.0, 5.0]
-    assert "STLSQ 1" in frontier.page  # too few samples to smooth
-    lowest = frontier.outcome.tables()["lowest_rates"].set_index("variant")
-    assert lowest.loc["STLSQ", "40 s"] == 20.0
-    frontier.check_figures(*frontier.outcome.figures())
 
 
 def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:

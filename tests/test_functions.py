@@ -574,20 +574,14 @@ def test_a_pendulum_swings_on_closed_orbits() -> None:
     assert cycle.stability.value == "neutral"
 
 
-FIXED = {"free_start": False}
-
-
 @pytest.mark.parametrize(
     ("name", "way"),
     [
         ("sin", {}),
         ("tanh", {}),
-        ("sin", FIXED | {"method": ep.refinement.NelderMead()}),
-        pytest.param(  # torch.optim imports torch's compiler: five seconds
-            "tanh", FIXED | {"method": ep.refinement.GradientDescent()}, marks=pytest.mark.slow
-        ),
+        ("sin", {"free_start": False, "method": ep.refinement.NelderMead()}),
     ],
-    ids=["shooting", "shooting one's own", "simplex", "descent of one's own"],
+    ids=["shooting", "shooting one's own", "simplex"],
 )
 def test_functions_are_refined_and_those_of_ones_own(name: str, way: dict, tanh: str) -> None:
     truth = model_of({"x": {"y": 1.0}, "y": {f"{name}(3*x)": -4.0}})

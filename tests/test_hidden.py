@@ -222,9 +222,7 @@ def test_what_was_not_measured_counts_nothing() -> None:
             "a regression needs samples of every state",
         ),
         (
-            lambda: ep.estimate_states(
-                PLANE.model, Trajectory(np.arange(30.0), np.arange(30.0)[:, None] % 7, ["a"])
-            ),
+            lambda: ep.estimate_states(ep.pendulum().model, only("x")),
             "some of the model's states",
         ),
         (

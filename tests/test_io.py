@@ -120,16 +120,6 @@ def test_every_kind_of_file_gives_the_same_field(tmp_path: Path, name: str) -> N
     assert units == expected
 
 
-def test_csv_is_a_probe_trace(tmp_path: Path) -> None:
-    rows = "\n".join(f"{1e6 * t}, {i}, {2 * i}" for t, i in zip(TIME, I_D, strict=True))
-    (tmp_path / "probe.csv").write_text(f"# scope 4\ntime_us, Id, V\n{rows}\n")
-    variables = {"I_d": Variable("Id", "A"), "V_d": Variable("V", "kV")}
-    field = open_field(tmp_path / "probe.csv", variables=variables, time=Variable("time_us", "us"))
-    assert field["time"].values == pytest.approx(TIME, rel=1e-15)
-    assert field["V_d"].values == pytest.approx(2e3 * I_D, rel=1e-15)
-    assert field["V_d"].attrs["units"] == "V"
-
-
 def test_averaged_hallthruster_output_says_what_to_ask_for(tmp_path: Path) -> None:
     (tmp_path / "mean.json").write_text(json.dumps({"output": {"average": {"Tev": [3.0]}}}))
     with pytest.raises(ValueError, match="no output.frames; run the simulation with save_time_res"):
@@ -353,16 +343,13 @@ KINDS = {
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_the_order_of_readers_decides_nothing(tmp_path: Path, name: str) -> None:
+def test_a_kind_is_told_by_its_content_and_the_order_of_readers_decides_nothing(
+    tmp_path: Path, name: str
+) -> None:
     KINDS[name](tmp_path / name)
     claims = sorted(reader.claim(look_at(tmp_path / name)) for reader in READERS)
     assert claims[-1] > claims[-2]
     assert reader_of(tmp_path / name) is reader_of(tmp_path / name, READERS[::-1])
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_hdf5_is_recognised_as_its_own_library_does(tmp_path: Path, name: str) -> None:
-    KINDS[name](tmp_path / name)
     is_hdf5 = not name.endswith("zarr") and h5py.is_hdf5(tmp_path / name)
     assert (look_at(tmp_path / name).form == "hdf5") is is_hdf5
 
