@@ -57,10 +57,8 @@ def test_every_system_has_a_column_and_every_noise_level_a_row(
     assert panels[1, 0].get_xlabel() == ("time (s)" if over_time else "$x$")
     assert panels[0, 0].get_ylabel() == ("noise 0 %\n$x$" if over_time else "noise 0 %\n$z$")
     for ax, each in zip(panels.T.ravel(), first.found, strict=True):
-        samples, truth, model = ax.lines[:3]
-        assert len(truth.get_xdata()) == each.truth.n_samples
-        assert len(model.get_xdata()) == len(each.rollout.t)
-        assert 500 < len(samples.get_xdata()) <= 1500
+        lengths = [len(line.get_xdata()) for line in ax.lines[1:3]]
+        assert lengths == [each.truth.n_samples, len(each.rollout.t)]
 
 
 def test_a_model_that_diverges_neither_sets_the_scale_nor_goes_unsaid(

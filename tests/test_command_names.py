@@ -65,5 +65,5 @@ def test_what_inspect_prints_is_pasted_into_a_shell_and_runs(tmp_path: Path) -> 
 
     shown = shell(f"{program} inspect {shlex.quote(name)}").splitlines()
     (line,) = (each.strip() for each in shown if "+exp=discover data" in each)
-    found = shell(f"{line.replace('ep2sindy', program, 1)} output=Ergebnisse_für")
+    found = shell(f"{line.replace('ep2sindy', program, 1)} forecasts=0 output=Ergebnisse_für")
     assert "Düse_ä' = " in found

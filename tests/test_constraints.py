@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import reweight
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.library.relations import (
     Constraint,
@@ -18,7 +17,6 @@ from ep2sindy.library.relations import (
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.front import fit_support
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
@@ -295,16 +293,6 @@ def test_noise_free_data_give_the_exact_coefficients(formulation: Formulation) -
     tolerance = 0.1**2 if formulation is DIFFERENTIAL else 1e-9
     np.testing.assert_allclose(model.coef, lotka_volterra().model.coef, atol=tolerance)
     assert model.terms("x")["x*y"] == -model.terms("y")["x*y"]
-
-
-def test_no_relations_reproduce_the_separate_fits_of_weak_rows() -> None:
-    run = noisy_run()
-    model = fitted(WEAK, run)
-    for problem in WEAK.assemble([run], LIBRARY, rng=np.random.default_rng(0)):
-        (state,) = problem.equations
-        alone = reweight(problem, fit_support(problem, state, SUPPORT[state]))
-        found = [model.terms(state)[LIBRARY.names[LIBRARY.index(t)]] for t in alone.terms]
-        np.testing.assert_allclose(found, alone.coef, rtol=1e-6)
 
 
 @FORMULATIONS

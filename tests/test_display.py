@@ -134,17 +134,6 @@ def test_a_library_counts_its_terms_by_degree() -> None:
     assert "1365 of degree 4:" in large
 
 
-def test_a_front_is_a_table_of_size_r2_and_equation(discovery: Discovery) -> None:
-    front = discovery.fronts["x"]
-    lines = repr(front).splitlines()
-    assert lines[1].split() == ["terms", "R2", "equation"]
-    assert lines[2].endswith("x' = 0")
-    assert "x' = 0.666 x - 0.998 x y" in repr(front)
-    assert "<i>x</i> <i>y</i></td>" in front._repr_html_()
-    many = replace(front, candidates=[*front.candidates] * 30)
-    assert_one_screen(repr(many))
-
-
 def test_a_discovery_shows_equations_rule_and_notes(discovery: Discovery) -> None:
     text = repr(discovery)
     assert text.startswith("Discovery of 2 equations, chosen by EBIC(gamma=1.0")

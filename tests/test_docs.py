@@ -39,7 +39,6 @@ from tests.pages import (
     difference,
     is_alike,
     quoted,
-    updated,
 )
 from tests.programs import EXPERIMENTS, composed
 from tests.rerun import ran_blocks, summary_of
@@ -245,18 +244,6 @@ def test_what_a_page_links_to_is_there() -> None:
 )
 def test_what_is_printed_is_compared(came: str, is_right: bool) -> None:
     assert (not difference("x' = 0.665 x - 1 (±0.002) y\n...\nend", came)) == is_right
-
-
-@pytest.mark.parametrize(
-    ("said", "came", "expected"),
-    [
-        ("a 1\nb 2", "a 3\nb 4\nc 5", "a 3\nb 4\nc 5\n"),  # all that came
-        ("...\nx' = 2 x\n...", "y' = 3\nx' = 4 x\nz' = 5", "...\nx' = 4 x\n...\n"),
-        ("...\nx' = 2 x - 3 x y", "note\nx' = 2 x - 3 x^2 y", "...\nx' = 2 x - 3 x^2 y\n"),
-    ],
-)
-def test_what_came_is_put_in_the_place_of_what_is_said(said: str, came: str, expected: str) -> None:
-    assert updated(said, came) == expected
 
 
 def test_the_messages_that_the_faq_quotes_are_those_of_the_package() -> None:

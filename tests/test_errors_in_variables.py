@@ -162,13 +162,7 @@ def test_an_input_may_be_noisy_too() -> None:
     u = np.sin(2 * t)
     x = 0.2 * np.sin(2 * t) - 0.4 * np.cos(2 * t) + 0.4 * np.exp(-t)
     noise = 0.05 * rng.standard_normal((2, len(t)))
-    run = Trajectory(
-        t=t,
-        states=(x + noise[0])[:, None],
-        state_names=["x"],
-        inputs=(u + noise[1])[:, None],
-        input_names=["u"],
-    )
+    run = Trajectory(t, (x + noise[0])[:, None], ["x"], (u + noise[1])[:, None], ["u"])
     library = named_terms(["x", "u"], ["x", "u"])
     (problem,) = EVERY_ROW.assemble([run], library, rng=rng)
     candidate = reweight(problem, fit_support(problem, "x", ["x", "u"]))

@@ -24,7 +24,7 @@ from ep2sindy.systems.systems import lotka_volterra
 from tests.models import model_of
 from tests.programs import ROOT, Computed, composed, computed, on_file
 
-NO_LIVING = ("living=none", "held_out=null")
+NO_LIVING = ("living=none", "held_out=null", "forecasts=0")
 
 
 def breathing(path: Path, output: Path) -> list[str]:
@@ -38,6 +38,7 @@ def breathing(path: Path, output: Path) -> list[str]:
         "+living.selection.n_windows=6",
         "+living.selection.n_folds=2",
         "rollout_s=1.0e-3",
+        "forecasts=2",
     ]
 
 
@@ -173,7 +174,7 @@ def years(tmp_path_factory: pytest.TempPathFactory) -> Computed:
         "data.time.unit=year", "data.variables.n_i.name=null", "data.variables.n_n.name=null",
         "+data.variables.hare.name=hare", "+data.variables.hare.unit=1",
         "+data.variables.lynx.name=lynx", "+data.variables.lynx.unit=1",
-        "trajectory.states=[hare,lynx]", "search=joint", f"output={folder}",
+        "trajectory.states=[hare,lynx]", "search=joint", "forecasts=0", f"output={folder}",
     )  # fmt: skip
     return computed(config)
 
@@ -222,7 +223,7 @@ def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_pa
             "+exp=discover", *on_file(predator_prey, tmp_path),
             "trajectory.states=[n_i,n_n]", "search=best_subset", "search.max_terms=2",
             "selection=free_run", "selection.n_windows=6", "selection.n_folds=2", "depth=1",
-            "bootstraps.n=4",
+            "bootstraps.n=4", "forecasts=0",
         )
     )  # fmt: skip
     model = found.summary["models"]["model"]

@@ -31,7 +31,7 @@ def toy(output: Path) -> list[str]:
     return [
         f"output={output}", f"data.cache={output / 'cache'}", "data.duration_s=2.0e-3",
         "data.warm_up_s=1.0e-3", "data.n_cells=30", "parallel=serial", "degrees=[1]",
-        "windows.n_windows=4", "windows.periods=1.0", "map_points=2", "~models.free",
+        "windows.n_windows=4", "windows.periods=1.0", "map_points=2", "forecasts=4", "~models.free",
         "~models.inflow", "~models.leaving",
     ]  # fmt: skip
 
@@ -125,7 +125,7 @@ def own_records(folder: Path, *values: float) -> list[str]:
         "~parameters.V_D_V", "~parameters.mdot_mg_s", "+parameters.a=null",
         f"points=[{','.join(points)}]", "~models",
         "+models.own.terms={n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}",
-        "degrees=[1]", "windows.n_windows=4", "map_points=2", "parallel=serial",
+        "degrees=[1]", "windows.n_windows=4", "map_points=2", "forecasts=2", "parallel=serial",
     ]  # fmt: skip
 
 

@@ -222,6 +222,7 @@ def test_discover_says_that_one_state_cannot_oscillate(record: Path, tmp_path: P
         "data.variables.n_i.name=null", "data.variables.n_n.name=null",
         "+data.variables.I.name=I", "+data.variables.I.unit=A", "trajectory.states=[I]",
         "search=best_subset", f"output={tmp_path}", "bootstraps.n=4",
+        "forecasts=0",
     )  # fmt: skip
     log = computed(config).log.replace("\n", " ")
     assert "one first-order equation cannot" in log

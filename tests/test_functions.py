@@ -232,16 +232,15 @@ def _square(x: np.ndarray) -> np.ndarray:
     return x * x
 
 
-def _twice(x: np.ndarray) -> np.ndarray:
-    return 2.0 * x
-
-
-def test_a_function_of_ones_own_travels_to_other_processes(kinds: dict[str, registry.Kind]) -> None:
-    ep.register_function("own_square", _square, _twice)
+def test_a_function_of_ones_own_travels_with_its_derivative(
+    kinds: dict[str, registry.Kind],
+) -> None:
+    ep.register_function("own_square", _square)
     sent = pickle.dumps(named_terms(["x"], ["own_square(x)", "sin(x)"]))
     del kinds["own_square"]
     library = pickle.loads(sent)  # as in a worker, where nobody registered it
     assert library.evaluate(np.array([[3.0]]))[0, 0] == 9.0
+    assert library.jacobian(np.array([[3.0]]))[0, 0, 0] == pytest.approx(6.0)
     assert named_terms(["x"], ["own_square(2*x)"]).evaluate(np.array([[3.0]]))[0, 0] == 36.0
 
 
@@ -267,14 +266,6 @@ def test_the_derivative_of_a_formula_is_found_by_itself(
     found, x = kinds[f"own_{name}"], np.linspace(-1.4, 1.5, 60).reshape(3, 20)
     assert found.slope(x) == pytest.approx(slope(x), rel=1e-12, abs=1e-15)
     assert found.slope(x).shape == x.shape
-
-
-def test_a_derived_derivative_travels_with_its_formula(kinds: dict[str, registry.Kind]) -> None:
-    ep.register_function("own_hill", _hill)
-    expected = kinds["own_hill"].slope(np.array([0.3]))
-    sent = pickle.dumps(kinds["own_hill"])
-    del kinds["own_hill"]
-    assert pickle.loads(sent).slope(np.array([0.3])) == expected
 
 
 @pytest.mark.parametrize("value", [lambda x: np.where(x > 0.0, x, 0.0), np.arctanh, np.sum])
@@ -513,26 +504,19 @@ def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(
     assert judged.verdict in (ep.Verdict.LIVES, ep.Verdict.SLIPS)
 
 
-@pytest.mark.parametrize(
-    ("n", "mean", "low", "high"),
-    [(6, 1.4, 0.3, 1.9), pytest.param(16, 0.9, 0.6, 1.5, marks=pytest.mark.slow)],
-    ids=["6", "16"],
-)
-def test_intervals_hold_the_truth_where_functions_bend_in_noise(
-    n: int, mean: float, low: float, high: float
-) -> None:
+def test_intervals_hold_the_truth_where_functions_bend_in_noise() -> None:
     """Without what noise adds to sin on average, errors have a mean of 3.5 standard deviations."""
     library = named_terms(["theta", "w"], ["w", "sin(theta)"])
     known = {"theta": ["w"], "w": ["sin(theta)"]}
     errors = []
-    for seed in range(n):
+    for seed in range(6):
         run = ep.pendulum().trajectory(noise=0.1, rng=seed)
         model = ep.discover(run, library, terms=known).model
         ends = model.intervals("w")["sin(theta)"]
         errors.append((np.mean(ends) + 9.81) / (np.ptp(ends) / 3.92))
-    # 1 / sqrt(n) by chance, three times over, and 0.2 by noise above second order.
-    assert abs(np.mean(errors)) < mean
-    assert low < np.std(errors) < high
+    # 1 / sqrt(6) by chance, three times over, and 0.2 by noise above second order.
+    assert abs(np.mean(errors)) < 1.4
+    assert 0.3 < np.std(errors) < 1.9
 
 
 def test_saturation_is_found_in_units_far_from_one() -> None:
