@@ -11,12 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy as ep
 from ep2sindy.app import program
-from ep2sindy.app.runner import (
-    hparams_of,
-    list_studies,
-    run_config,
-    study_class,
-)
+from ep2sindy.app.runner import hparams_of, list_studies, run_config, study_class
 from ep2sindy.app.schema import Configured, keys_of, study_of, value_of
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.runtime.files import read_json

@@ -9,7 +9,7 @@ import pytest
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Finding, Regression, TrajectorySearch
-from ep2sindy.figures.identified import benchmark_figure, merit_table
+from ep2sindy.figures.identified import merit_table
 from ep2sindy.library.library import Library
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
@@ -180,19 +180,6 @@ def test_a_table_puts_the_published_row_below_its_variant() -> None:
     assert (terms.to_numpy() == 2.5).all()
     alone = merit_table(ours, published.iloc[:0], "on_front")
     assert alone.index.tolist() == [("ours", False), ("STLSQ", False)]
-
-
-def test_the_figure_writes_every_percentage_and_marks_what_is_missing() -> None:
-    ours, published = made_up_cells()
-    figure = benchmark_figure(ours, thesis=published)
-    on_front, selected = (
-        [text.get_text() for text in ax.texts if text.get_text()[0] in "–0123456789"]
-        for ax in figure.axes
-    )
-    assert on_front == ["0", "20", "40", "60", "10", "30", "50", "70", *4 * ["50"]]
-    assert selected == ["–"] * 8 + ["10"] * 4
-    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert names == ["ours", "STLSQ", "thesis"]
 
 
 def test_a_search_of_trajectories_finds_what_its_rule_selects() -> None:

@@ -10,7 +10,6 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.app.compare import main as compare
-from ep2sindy.report.results import LABELS, in_words
 from ep2sindy.runtime.files import write_json
 
 CONFIG = (
@@ -131,18 +130,6 @@ def test_the_jobs_of_a_sweep_are_compared_but_for_those_that_failed(
     write_json(sweep / "jobs" / "3.json", {"folder": 1})
     with pytest.raises(ValueError, match=r"3\.json cannot be read \(folder cannot be 1\)"):
         compare([str(sweep)])
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("simple/n_i/r2_test", "simple, n_i: R2 on held-out rows"),
-        ("simple/living/nrmse", "simple, the model that lives: " + LABELS["nrmse"]),
-        ("mean_of_it", "mean of it"),
-    ],
-)
-def test_headline_figures_read_in_words(name: str, words: str) -> None:
-    assert in_words(name) == words
 
 
 def test_runs_in_years_are_compared_in_years(

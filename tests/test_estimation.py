@@ -30,13 +30,7 @@ from ep2sindy.estimation.likelihood import (
 )
 from ep2sindy.estimation.noise import _shown_by_samples, noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import (
-    EXACT,
-    Solution,
-    from_smooth,
-    smoothed,
-    squares_of_steps,
-)
+from ep2sindy.estimation.solver import EXACT, Solution, from_smooth, smoothed, squares_of_steps
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
@@ -744,8 +738,7 @@ def test_the_time_is_looked_at_within_a_step_of_a_fit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("limit_s", "sizes"),
-    [(60.0, [16_384, 65_536]), (400.0, [16_384, 65_536, 262_144, 1_000_000])],
+    ("limit_s", "sizes"), [(60.0, [16_384, 65_536]), (400.0, [16_384, 65_536, 262_144, 1_000_000])]
 )
 def test_a_search_with_a_limit_takes_parts_of_a_long_record_first(
     limit_s: float, sizes: list[int]

@@ -13,14 +13,11 @@ from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.free_run import free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Text
 from ep2sindy.runtime.files import write_json
 from ep2sindy.studies.libraries import Study
 from ep2sindy.studies.library_result import REPLACED
-from ep2sindy.studies.living import run_title
-from ep2sindy.systems.systems import lotka_volterra
 from tests.models import model_of
 from tests.programs import ROOT, Computed, composed, computed, on_file
 
@@ -106,22 +103,10 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert len(terms) == 4
     assert all(each["without_verdict"] != "lives" for each in terms.values())
     assert found["simple"]["balance"]["processes"] == []
-    page = (breathing_run / "report.html").read_text()
-    assert "spread over windows from" in page
     for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
-        assert f'id="figure-{figure}"' in page
         assert (breathing_run / "figures" / f"{figure}.png").is_file()
-    names = {path.name for path in (breathing_run / "tables").iterdir()}
-    assert {"living.csv", "coefficients_living.csv", "terms_simple.csv"} <= names
-    assert "balance_simple.csv" not in names
-    assert "simple: a model that lives" in (breathing_run / "run.log").read_text()
-
-
-def test_a_run_without_a_period_is_not_said_to_keep_none() -> None:
-    model = lotka_volterra().model
-    run = free_run(model, lotka_volterra().trajectory())
-    assert run_title(run).endswith(f"in phase for {round(run.periods)} periods")
-    assert run_title(replace(run, periods=np.nan)).endswith("over held-out time")
+    for table in ("living", "coefficients_living", "terms_simple"):
+        assert (breathing_run / "tables" / f"{table}.csv").is_file()
 
 
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:

@@ -14,14 +14,10 @@ from ep2sindy.data.open import write_field
 from ep2sindy.figures.trends import PUBLISHED, trends_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.operating.quantity_law import control_law
-from ep2sindy.studies.views import with_error
 from tests import programs
 from tests.fields import along_channel
 
-ESTIMATES = {
-    "constrained": {"L_m", "g_inj", "eps"},
-    "free": {"L_m", "g_inj", "eps_i", "eps_n"},
-}
+ESTIMATES = {"constrained": {"L_m", "g_inj", "eps"}, "free": {"L_m", "g_inj", "eps_i", "eps_n"}}
 THREE = (
     "points=[{V_D_V: 200.0, mdot_mg_s: 5.0, data: {operating_point: {neutral_speed: 320.0}}},"
     "{V_D_V: 300.0, mdot_mg_s: 5.0},"
@@ -61,7 +57,6 @@ def summary_of(folder: Path) -> dict:
 
 def test_the_summary_has_every_point(folder: Path) -> None:
     summary = summary_of(folder)
-    assert (summary["experiment"], summary["seed"]) == ("parametric", 0)
     points = summary["points"]
     assert [(p["V_D_V"], p["mdot_mg_s"]) for p in points] == [(200, 5), (300, 5), (300, 2)]
     for point in points:
@@ -73,14 +68,11 @@ def test_the_summary_has_every_point(folder: Path) -> None:
                 low, high = point["ci95"][case][name]
                 assert low < value < high
             assert set(point["r2"][case]) == {"n_i", "n_n"}
-            refined = point["refined"][case]
-            assert set(refined) == names | {"status", "loss", "ci95", "r2"}
-        assert set(point["searched"]) == {"each point", "all points"}
+            assert set(point["refined"][case]) == names | {"status", "loss", "ci95", "r2"}
         assert set(point["searched"]["each point"]) == {"n_i", "n_n"}
     assert points[2]["constrained"]["g_inj"] < points[1]["constrained"]["g_inj"]
     assert set(summary["laws"]["constrained"]) == ESTIMATES["constrained"]
     for law in summary["laws"]["constrained"].values():
-        assert {"terms", "r2", "loo_error", "search_error"} == set(law)
         assert len(law["terms"]) == 1  # of three points
 
 
@@ -141,20 +133,6 @@ def test_tables_figures_and_page_are_written(folder: Path) -> None:
         assert f'id="figure-trends_{case}"' in page
     assert re.search(r"g_inj = [^=\[]* \[m\^-3 s\^-1\] \(", " ".join(log.split()))
     assert "<msub><mi>L</mi><mrow><mi>m</mi></mrow></msub><mo>=</mo>" in page  # a law
-
-
-@pytest.mark.parametrize(
-    ("value", "reach", "text"),
-    [
-        (0.0364, 2e-5, "0.03640 ±2e-05"),
-        (2.3e23, 1e22, "2.30e+23 ±1e+22"),
-        (-24.0, 9.6, "-24.0 ±1e+01"),
-        (0.99, 9.6e-5, "0.9900 ±0.0001"),
-        (0.0364, np.nan, "0.0364"),
-    ],
-)
-def test_values_have_the_digits_of_their_errors(value: float, reach: float, text: str) -> None:
-    assert with_error(value, reach) == text
 
 
 def breathing_file(path: Path, *, amplitude: float, dt_s: float, rate: float = 1.0) -> Path:

@@ -17,7 +17,7 @@ from ep2sindy.figures.stability import curves_figure, stability_figure
 from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies import parametric
 from ep2sindy.studies.points import point_sources
-from ep2sindy.studies.scan import scan_points, value_text
+from ep2sindy.studies.scan import scan_points
 from ep2sindy.studies.simulate import Outcome
 from ep2sindy.studies.simulated import DivergedError, amiss, check_recorded, compile_kernels, doubts
 from tests import programs
@@ -77,13 +77,11 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_keeps_its_field_and_says_what_it_did(one: Path, field: xr.Dataset) -> None:
     summary = summary_of(one)
-    assert (summary["experiment"], summary["file"]) == ("simulate", "field.nc")
     assert summary["status"] == field.attrs["status"] == "oscillating"
     assert summary["I_d_mean"] == pytest.approx(float(field["I_d"].mean()))
     assert summary["I_beam_mean"] == pytest.approx(float(field["I_beam"].mean()))
     assert summary["thrust_N"] == pytest.approx(float(field["thrust"].mean()))
     assert summary["initial"] == "guessed profiles"
-    assert "warnings" not in summary
     power = summary["power_W"]
     parts = sum(value for name, value in power.items() if name != "P_in")
     assert parts == pytest.approx(power["P_in"])
@@ -94,14 +92,10 @@ def test_a_run_keeps_its_field_and_says_what_it_did(one: Path, field: xr.Dataset
 
 
 def test_every_figure_and_table_of_a_run_is_there(one: Path) -> None:
-    page = (one / "report.html").read_text()
     for name in FIGURES:
         assert (one / "figures" / f"{name}.png").stat().st_size > 8e3
-        assert f'id="figure-{name}"' in page
     profiles = pd.read_csv(one / "tables" / "profiles.csv")
     assert len(profiles) == 24
-    for end in ("low", "high", "min", "max"):
-        assert f"n_n_{end}" in profiles
     assert (profiles["n_i_min"] <= profiles["n_i_low"]).all()
     assert (profiles["n_i_high"] <= profiles["n_i_max"]).all()
     assert {"performance.csv", "power.csv", "spectrum.csv"} <= {
@@ -153,7 +147,6 @@ def test_a_point_that_breaks_keeps_its_row_and_the_others_stand(scan: Path) -> N
     # One of the three that ran has diverged; one never ran.
     assert len(list((scan.parents[2] / "cache").glob("*.nc"))) == 3
     assert (scan / "figures" / "curves.png").stat().st_size > 8e3
-    assert 'id="figure-curves"' in (scan / "report.html").read_text()
 
 
 def test_a_scan_ends_where_its_runs_cannot_be_kept(tmp_path: Path) -> None:
@@ -295,16 +288,3 @@ def test_a_steady_simulation_warns_on_the_page_of_the_study_that_takes_it(tmp_pa
     assert found.warnings == [warning]
     assert f'<p class="warning">{warning}' in found.page
     assert warning in " ".join(found.log.split())
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.0077, "0.0077"),
-        (None, "null"),
-        ([1, 2.5], "[1, 2.5]"),
-        ({"_target_": "ep2sindy.thruster.ColdStart", "n_i": 1e17}, "ColdStart(n_i=1e+17)"),
-    ],
-)
-def test_values_as_tables_have_them(value: object, text: str) -> None:
-    assert value_text(value) == text

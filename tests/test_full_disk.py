@@ -13,12 +13,7 @@ import xarray as xr
 
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
-from ep2sindy.runtime.files import (
-    LEFT_AFTER_S,
-    WriteError,
-    replacing,
-    sweep,
-)
+from ep2sindy.runtime.files import LEFT_AFTER_S, WriteError, replacing, sweep
 
 resource = pytest.importorskip("resource", reason="limits of a process need POSIX")
 

@@ -15,12 +15,7 @@ import torch
 import ep2sindy as ep
 from ep2sindy.data.coerce import keep_inside, noise_inside
 from ep2sindy.library import functions as registry
-from ep2sindy.library.equations import (
-    equation_html,
-    equation_text,
-    latex_term_name,
-    sum_sympy,
-)
+from ep2sindy.library.equations import equation_html, equation_text, latex_term_name, sum_sympy
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.solve import edges_of
 from ep2sindy.refinement.refine import refine

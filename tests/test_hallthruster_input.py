@@ -236,11 +236,7 @@ def test_a_missing_field_says_where_it_was_looked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", r"must be JSON"),
-        ("[]", r"must have the key 'config'"),
-    ],
+    ("content", "message"), [("{", r"must be JSON"), ("[]", r"must have the key 'config'")]
 )
 def test_a_file_that_is_no_input_is_refused(tmp_path: Path, content: str, message: str) -> None:
     path = tmp_path / "input.json"

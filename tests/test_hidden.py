@@ -221,10 +221,7 @@ def test_what_was_not_measured_counts_nothing() -> None:
             lambda: ep.discover(only("x"), method=ep.Regression(), hidden=["g"]),
             "a regression needs samples of every state",
         ),
-        (
-            lambda: ep.estimate_states(ep.pendulum().model, only("x")),
-            "some of the model's states",
-        ),
+        (lambda: ep.estimate_states(ep.pendulum().model, only("x")), "some of the model's states"),
         (
             lambda: ep.estimate_states(ep.lorenz().model, only("z", system=ep.lorenz())),
             "none of .'x', 'y'. does in those of .'z'.; measure one",

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.data.gaps import describe_breaks, describe_gaps, present_rows
+from ep2sindy.data.gaps import describe_breaks, present_rows
 
 T = np.sort(np.random.default_rng(2).uniform(0.0, 1.0, 400))
 T[[0, -1]] = 0.0, 1.0
@@ -172,13 +172,6 @@ def test_samples_that_no_row_holds_together_are_named() -> None:
     x, y = np.where(t < 3, t, np.nan), np.where(t >= 2, t, np.nan)
     with pytest.raises(ValueError, match="of 6 samples x lacks 3, y lacks 2, and 1 are left"):
         present_rows({"x": x, "y": y})
-
-
-def test_gaps_are_told_with_their_length() -> None:
-    words = describe_gaps(np.array([0, 1, 2, 5, 6, 8, 9, 10.0]), 11)
-    assert words.startswith(
-        "3 of 11 samples are missing (NaN) and left out; the longest gap is 3 s"
-    )
 
 
 def test_gaps_in_the_times_themselves_are_counted() -> None:
