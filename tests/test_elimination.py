@@ -16,15 +16,12 @@ LIBRARY = polynomial(["x", "y"], degree=2)
 
 def widened(truth: SparseModel, n_spurious: int, rng: np.random.Generator) -> SparseModel:
     """The truth, off by up to 10 %, with spurious quadratic terms of small coefficients."""
-    library = polynomial(truth.states, degree=2)
-    names = list(dict.fromkeys([*truth.library.names, *library.names]))
-    library = ep.named_terms(truth.states, names)
-    coef = np.zeros((len(library), len(truth.states)))
-    for k, state in enumerate(truth.states):
-        for term, value in truth.terms(state).items():
-            coef[library.index(term), k] = value * (1.0 + 0.1 * rng.uniform(-1.0, 1.0))
-        free = np.flatnonzero(coef[:, k] == 0.0)
-        coef[rng.choice(free, n_spurious, replace=False), k] = 0.02
+    names = dict.fromkeys([*truth.library.names, *polynomial(truth.states, degree=2).names])
+    library = ep.named_terms(truth.states, list(names))
+    coef = ep.coef_matrix(library, [truth.terms(state) for state in truth.states])
+    coef *= 1.0 + 0.1 * rng.uniform(-1.0, 1.0, coef.shape)
+    for column in coef.T:
+        column[rng.choice(np.flatnonzero(column == 0.0), n_spurious, replace=False)] = 0.02
     return SparseModel(library, truth.states, coef)
 
 
@@ -85,9 +82,8 @@ def test_relations_hold_on_the_way_and_bound_terms_go_together() -> None:
 def test_the_path_ends_where_a_state_would_lose_its_last_term() -> None:
     t = np.linspace(0.0, 3.0, 200)
     states = np.column_stack([np.exp(-t), np.exp(-2.0 * t)])
-    run = Trajectory(
-        t, states + 1e-3 * np.random.default_rng(0).normal(size=states.shape), ["x", "y"]
-    )
+    states += 1e-3 * np.random.default_rng(0).normal(size=states.shape)
+    run = Trajectory(t, states, ["x", "y"])
     coef = ep.coef_matrix(LIBRARY, [{"x": -1.0}, {"y": -2.0}])
     model = SparseModel(LIBRARY, ["x", "y"], coef)
     found = ep.eliminate(model, [run], n_settings(), seed=0)

@@ -28,7 +28,7 @@ from ep2sindy.estimation.likelihood import (
     innovations,
     squares,
 )
-from ep2sindy.estimation.noise import _shown_by_samples, noise_beside
+from ep2sindy.estimation.noise import _shown_by_samples
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import EXACT, Solution, from_smooth, smoothed, squares_of_steps
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
@@ -500,38 +500,22 @@ def test_settings_that_do_not_go_with_trajectories_are_refused(
 
 
 RULE = ep.FreeRunScore(n_folds=2)
-NO_ROWS = (ep.WeightedWeak(), ep.Bootstraps(n=0))
 RULED = ep.TrajectorySearch(selection=RULE, depth=2)
 
 
-@pytest.mark.parametrize(
-    ("search", "selection", "depth", "expected"),
-    [
-        (ep.TrajectorySearch(depth=3), ep.Evidence(), 1, ep.TrajectorySearch(depth=3)),
-        (ep.TrajectorySearch(), RULE, 2, RULED),
-        (RULED, ep.Evidence(), 2, RULED),
-    ],
-)
-def test_settings_of_a_given_search_hold(
-    search: ep.TrajectorySearch, selection: object, depth: int, expected: object
-) -> None:
-    formulation, bootstraps = NO_ROWS
-    assert method_of(formulation, search, bootstraps, selection, depth) == expected
+def method_with(search: ep.TrajectorySearch, selection: object, depth: int) -> object:
+    return method_of(ep.WeightedWeak(), search, ep.Bootstraps(n=0), selection, depth)
 
 
-@pytest.mark.parametrize(
-    ("search", "selection", "depth", "name"),
-    [
-        (ep.TrajectorySearch(depth=3), ep.Evidence(), 2, r"search.depth\), and 2 beside"),
-        (ep.TrajectorySearch(selection=RULE), ep.FreeRunScore(n_folds=3), 1, "search.selection"),
-    ],
-)
-def test_a_setting_is_not_given_twice(
-    search: ep.TrajectorySearch, selection: object, depth: int, name: str
-) -> None:
-    formulation, bootstraps = NO_ROWS
-    with pytest.raises(ValueError, match=f"must be set once: .*{name}.*; leave one of them out"):
-        method_of(formulation, search, bootstraps, selection, depth)
+def test_settings_of_a_given_search_hold_and_none_is_given_twice() -> None:
+    deep = ep.TrajectorySearch(depth=3)
+    assert method_with(deep, ep.Evidence(), 1) == deep
+    assert method_with(ep.TrajectorySearch(), RULE, 2) == RULED
+    assert method_with(RULED, ep.Evidence(), 2) == RULED
+    with pytest.raises(ValueError, match=r"must be set once: .*search.depth\), and 2 beside"):
+        method_with(deep, ep.Evidence(), 2)
+    with pytest.raises(ValueError, match="search.selection.*; leave one of them out"):
+        method_with(RULED, ep.FreeRunScore(n_folds=3), 1)
 
 
 def test_evidence_is_refused_for_fronts_of_rows() -> None:
@@ -559,18 +543,6 @@ def test_a_library_without_the_constant_where_a_state_drifts_is_a_misfit() -> No
     library = ep.named_terms(["x", "y"], ["y", "x*y", "y^2"])
     found = ep.estimate([ep.Trajectory(t, states, ["x", "y"])], library)
     assert "no law of this library explains y: a term or a state is missing" in found.misfit
-
-
-def test_noise_that_the_model_leaves_is_measured_by_state() -> None:
-    problem, run = lorenz_problem()
-    fit = fit_of_truth(problem, ep.lorenz().model)
-    clean = ep.lorenz().trajectory().states[:200] / problem.scale
-    fit = TrajectoryFit((clean,), fit.free, fit.support, fit.squares)
-    noise = noise_beside(problem, fit)
-    np.testing.assert_allclose(
-        noise.std * problem.scale, (run.states - clean * problem.scale).std(axis=0), rtol=0.05
-    )
-    assert not noise.memory.any()
 
 
 def many_states(n_states: int) -> ep.Trajectory:

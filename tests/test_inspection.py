@@ -239,16 +239,13 @@ def test_two_names_for_one_quantity_are_asked(tmp_path: Path) -> None:
 
 
 def frames(*, old: bool) -> list[dict]:
-    found = []
-    for k in range(NT):
-        n, u, nn = N_I[k, :, 0].tolist(), U_Z[k, :, 0].tolist(), N_N[k, :, 0].tolist()
-        if old:
-            found.append({"ni": [n], "ui": [u], "nn": nn})
-        else:
-            found.append(
-                {"neutrals": {"Kr": {"n": nn}}, "ions": {"Kr": [{"n": n, "u": u, "Z": 1}]}}
-            )
-    return found
+    columns = zip(*(values[:, :, 0].tolist() for values in (N_I, U_Z, N_N)), strict=True)
+    if old:
+        return [{"ni": [n], "ui": [u], "nn": nn} for n, u, nn in columns]
+    return [
+        {"neutrals": {"Kr": {"n": nn}}, "ions": {"Kr": [{"n": n, "u": u, "Z": 1}]}}
+        for n, u, nn in columns
+    ]
 
 
 def hallthruster(layout: str) -> object:
