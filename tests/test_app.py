@@ -50,9 +50,6 @@ class Toy:
 
 GOOD = """
 experiment: toy
-study: toy
-seed: 0
-output: outputs
 formulation: {_target_: ep2sindy.Differential}
 search: {_target_: ep2sindy.BestSubset}
 bootstraps: {_target_: ep2sindy.Bootstraps, n: 0}

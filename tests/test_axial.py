@@ -93,12 +93,8 @@ def test_the_solver_from_both_ends_solves(size, scale):
     rng = np.random.default_rng(0)
     lower, upper, known = -rng.random((3, size))
     diagonal = 2.5 + rng.random(size)
-    inner = np.arange(1, size - 1)
-    matrix = np.zeros((size, size))
-    matrix[inner, inner - 1], matrix[inner, inner], matrix[inner, inner + 1] = (
-        lower[inner], diagonal[inner], upper[inner],
-    )  # fmt: skip
-    matrix[0, 0] = matrix[-1, -1] = 1.0  # T is given at the ends
+    matrix = np.diag(diagonal) + np.diag(lower[1:], -1) + np.diag(upper[:-1], 1)
+    matrix[[0, -1]] = np.eye(size)[[0, -1]]  # T is given at the ends
     T = np.zeros(size)
     T[0], T[-1] = 3.0, 4.0
     known[0], known[-1] = T[0], T[-1]

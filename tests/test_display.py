@@ -146,10 +146,8 @@ def test_a_discovery_shows_equations_rule_and_notes(discovery: Discovery) -> Non
 
 
 def test_a_refinement_shows_status_loss_and_intervals(refinement: Refinement) -> None:
-    text = repr(refinement)
-    assert text.startswith("Refinement: converged, loss ")
-    assert "4 windows of 60 samples" in text
-    assert "(±" in text
+    assert repr(refinement).startswith("Refinement: converged, loss ")
+    assert "(±" in repr(refinement)
     status = RefinementStatus.NON_FINITE
     failed = replace(refinement, status=status, loss=float("inf"), model=breathing())
     assert "non_finite, loss inf" in repr(failed)

@@ -12,6 +12,7 @@ from ep2sindy.systems.systems import lotka_volterra
 
 PREY = lotka_volterra()
 LIBRARY = polynomial(["x", "y"], degree=2)
+SETTINGS = ep.RefinementSettings(n_windows=10)
 
 
 def widened(truth: SparseModel, n_spurious: int, rng: np.random.Generator) -> SparseModel:
@@ -33,7 +34,7 @@ def support(model: SparseModel) -> dict[str, set[str]]:
 def test_spurious_terms_go_and_the_truth_is_recommended(noise: float) -> None:
     runs = [PREY.trajectory(noise=noise, rng=0)]
     model = widened(PREY.model, 2, np.random.default_rng(1))
-    found = ep.eliminate(model, runs, n_settings(), min_free=2, seed=0)
+    found = ep.eliminate(model, runs, SETTINGS, min_free=2, seed=0)
     assert support(found.model) == support(PREY.model)
     assert found.best == 4
     assert [np.count_nonzero(r.model.coef) for r in found.refinements] == [8, 7, 6, 5, 4, 3, 2]
@@ -41,16 +42,12 @@ def test_spurious_terms_go_and_the_truth_is_recommended(noise: float) -> None:
     assert found.refinement.status == "converged"
 
 
-def n_settings() -> ep.RefinementSettings:
-    return ep.RefinementSettings(n_windows=10)
-
-
 def test_eighteen_terms_of_four_states_come_down_to_the_truth() -> None:
     case = cases()[0]
     run = record(case)
     fitted, later = run.window(0, 700), run.window(700, run.n_samples)
     model = widened(case.truth, 2, np.random.default_rng(1))
-    found = ep.eliminate(model, [fitted], n_settings(), min_free=9, run_over=later, seed=0)
+    found = ep.eliminate(model, [fitted], SETTINGS, min_free=9, run_over=later, seed=0)
     assert len(found.verdicts) == len(found.refinements) == len(found.scores)
     assert support(found.model) == support(case.truth)
     assert found.verdicts[found.best] == "alike"  # two frequencies: no cycle
@@ -86,7 +83,7 @@ def test_the_path_ends_where_a_state_would_lose_its_last_term() -> None:
     run = Trajectory(t, states, ["x", "y"])
     coef = ep.coef_matrix(LIBRARY, [{"x": -1.0}, {"y": -2.0}])
     model = SparseModel(LIBRARY, ["x", "y"], coef)
-    found = ep.eliminate(model, [run], n_settings(), seed=0)
+    found = ep.eliminate(model, [run], SETTINGS, seed=0)
     assert len(found.refinements) == 1
     with pytest.raises(ValueError, match="min_free must be a whole number, one or more: 0 came"):
         ep.eliminate(model, [run], min_free=0, seed=0)

@@ -8,7 +8,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.estimation.hidden import entrances
 from tests import programs
 
-RUN = ep.lotka_volterra().trajectory(noise=0.01, rng=0).window(0, 400)
+RUN = ep.lotka_volterra().trajectory(noise=0.01, rng=0).window(0, 250)
 LIBRARY = ep.polynomial(["x", "y"], degree=2)
 SEARCHES = [
     None,

@@ -85,9 +85,6 @@ def test_every_definition_makes_a_variant() -> None:
     for name, definition in config.definitions.items():
         if not name.startswith("PySINDy"):
             assert isinstance(instantiate(definition), AnyMethod)
-
-
-def test_every_rival_makes_a_variant() -> None:
     pytest.importorskip("pysindy")
     for name, definition in composed("definitions=pysindy").definitions.items():
         if name.startswith("PySINDy"):

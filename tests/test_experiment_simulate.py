@@ -23,7 +23,6 @@ from ep2sindy.studies.simulated import DivergedError, amiss, check_recorded, com
 from tests import programs
 
 VOLTAGES = "scan={operating_point.voltage:[-5.0,250.0,300.0,5000.0]}"
-FIGURES = ("current", "spectrum", "profiles", "maps")
 GOOD = {
     "status": "oscillating", "cycle": "strong", "f_kHz": 14.0, "I_d_mean": 4.0, "I_d_std": 5.0,
     "parameters": "{}", "mass_balance": 1.0, "energy_balance": 0.9996, "rates": "covered",
@@ -92,7 +91,7 @@ def test_a_run_keeps_its_field_and_says_what_it_did(one: Path, field: xr.Dataset
 
 
 def test_every_figure_and_table_of_a_run_is_there(one: Path) -> None:
-    for name in FIGURES:
+    for name in ("current", "spectrum", "profiles", "maps"):
         assert (one / "figures" / f"{name}.png").stat().st_size > 8e3
     profiles = pd.read_csv(one / "tables" / "profiles.csv")
     assert len(profiles) == 24

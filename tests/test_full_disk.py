@@ -7,9 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
-import xarray as xr
 
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
@@ -86,13 +84,3 @@ def test_only_what_killed_processes_left_is_swept(tmp_path: Path) -> None:
         sweep(tmp_path)
         assert living.exists()
     assert sorted(deeper.iterdir()) == sorted([*others, deeper / "a.b.nc"])
-
-
-def test_a_written_field_is_the_same_from_memory(tmp_path: Path) -> None:
-    from ep2sindy.data.fields import write_netcdf
-
-    field = xr.Dataset({"n": (("time",), np.arange(5.0))}, coords={"time": np.arange(5.0)})
-    packed = {"n": {"zlib": True, "complevel": 4}}
-    write_netcdf(field, tmp_path / "a.nc", encoding=packed)
-    with xr.open_dataset(tmp_path / "a.nc") as found:
-        xr.testing.assert_identical(found.load(), field)

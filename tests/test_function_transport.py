@@ -71,12 +71,6 @@ def test_a_function_sees_the_plasma_and_the_time():
     np.testing.assert_allclose(plasma.B, ep.thruster.Thruster().magnetic_field.at(z))
 
 
-def test_transport_may_follow_the_shear_of_the_drift():
-    field = run(by_shear)
-    assert field.attrs["status"] != "diverged"
-    assert field.attrs["mass_balance"] == pytest.approx(1.0, abs=1e-3)
-
-
 @pytest.mark.parametrize(
     ("function", "message"),
     [

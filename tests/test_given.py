@@ -5,8 +5,6 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.data.runs import trajectories_of
-from ep2sindy.runtime.values import check_kind
-from ep2sindy.selection.rule import Selection
 
 T = np.linspace(0.0, 3.0, 31)
 X = np.column_stack([np.exp(-T), np.sin(T)])
@@ -95,13 +93,6 @@ def test_a_model_takes_runs_as_discover_does() -> None:
     assert model.score(table) == model.score(run)
     assert np.array_equal(model.predict(table), model.predict(run))
     assert np.array_equal(model.rollout(table).states, model.rollout(run).states)
-
-
-@pytest.mark.parametrize("value", [ep.BestSubset(), ep.EBIC, "ebic", None])
-def test_what_is_no_selection_is_refused_with_an_example(value: object) -> None:
-    check_kind("selection", ep.EBIC(), Selection, "ep.EBIC()")
-    with pytest.raises(ValueError, match=r"selection must be a Selection, such as ep.EBIC\(\): "):
-        check_kind("selection", value, Selection, "ep.EBIC()")
 
 
 def test_units_in_the_names_of_a_table_are_those_of_a_file() -> None:

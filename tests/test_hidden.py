@@ -201,10 +201,9 @@ def test_what_was_not_measured_counts_nothing() -> None:
     free = np.zeros(problem.n_free)
     fit = TrajectoryFit((path,), free, np.ones(len(free), dtype=bool), np.zeros(2))
     level = Level((0.1 * ones,), 1.0)
-    everything = np.ones(len(free), dtype=bool)
 
     def flow(record, path):
-        return problem.flow(record, path[:-1], free, everything, 1)
+        return problem.flow(record, path[:-1], free, fit.support, 1)
 
     least = hessian(problem, fit, level, flow)[2]
     far = replace(record, samples=record.samples + np.array([0.0, 5.0]))  # a guess is no sample
