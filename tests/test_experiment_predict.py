@@ -50,7 +50,6 @@ def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
     assert branch["exact"][0] == "n_i: n_n == -1 * n_n: n_n"
     assert branch["exact"][3] == "n_n: 1 == 4.58e+22 * mdot_mg_s"
     assert branch["degree"] == 1
-    assert branch["left_out"]["n"] == 4
     forecast = branch["forecast"]
     assert forecast["n_records"] == 4
     assert set(forecast["nrmse"]) >= {"model", "persistence", "autoregression"}
@@ -64,7 +63,6 @@ def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
     median = tables["left_out"]["forecast"].median()
     assert median == pytest.approx(forecast["nrmse"]["model"], rel=0.1)
     assert len(tables["map"]) == 4
-    assert len(tables["coefficients"]) == 36
     assert {p.stem for p in (folder / "figures").glob("*.png")} == {
         "left_out", f"laws_{name}", f"map_{name}",
     }  # fmt: skip

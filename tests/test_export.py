@@ -43,8 +43,6 @@ def test_a_dataset_keeps_units_and_comes_back_as_a_run() -> None:
     np.testing.assert_array_equal(again.states, RUN.states)
     np.testing.assert_array_equal(again.t, RUN.t)
     assert dict(again.units) == {"n_i": "m^-3", "n_n": "m^-3"}
-    few = data[["n_i", "n_n"]].isel(time=slice(0, 30))
-    assert ep.discover([few, data[["n_i", "n_n"]].isel(time=slice(30, 40))]).model.states
 
 
 def test_a_dataset_keeps_the_unit_in_which_times_are_shown() -> None:

@@ -105,19 +105,3 @@ def test_configs_name_what_is_for_configs() -> None:
     assert found
     ours = {name for name in found if not name.startswith("benchmarks.")}  # those of a checkout
     assert ours <= FOR_CONFIGS
-
-
-def test_torch_and_pandas_are_loaded_by_those_alone_who_use_them() -> None:
-    code = (
-        "import sys, ep2sindy as ep\n"
-        "ep.discover, ep.EBIC, ep.SparseModel, ep.refinement, ep.thruster\n"
-        "assert not {'torch', 'pandas', 'xarray', 'matplotlib', 'hydra'} & set(sys.modules)\n"
-        "sys.modules['torch'] = None  # whoever asks for it now is told that there is none\n"
-        "try:\n"
-        "    ep.refine\n"
-        "except ImportError as e:\n"
-        "    assert e.name == 'torch', e\n"
-        "else:\n"
-        "    raise AssertionError('ep.refine does not load torch')\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
