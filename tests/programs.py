@@ -1,5 +1,6 @@
 """Experiments run inside a test, without the command line; and, where asked, without figures."""
 
+import json
 import sys
 from collections.abc import Sequence
 from copy import deepcopy
@@ -87,6 +88,11 @@ def computed(config: DictConfig) -> Computed:
         log = (run.folder.path / "run.log").read_text()
     check_end(log, page, result, run.folder.path)
     return Computed(outcome, log, page, run.folder.path, run.warnings)
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    """What a run left in its folder for other programs."""
+    return json.loads((folder / "summary.json").read_text())
 
 
 def check_end(log: str, page: str, result: Result, folder: Path) -> None:

@@ -161,10 +161,9 @@ def test_what_is_built_later_can_be_changed_by_place() -> None:
 def test_studies_are_found_by_name() -> None:
     assert "libraries" in list_studies()
     assert study_class("libraries").__name__ == "Study"
-    with pytest.raises(ValueError, match=r"study must name a module .* 'librarys' came"):
-        study_class("librarys")
-    with pytest.raises(ValueError, match="'ep2sindy.studies.views' came"):
-        study_class("ep2sindy.studies.views")
+    for name in ("librarys", "ep2sindy.studies.views"):
+        with pytest.raises(ValueError, match=f"study must name a module .* '{name}' came"):
+            study_class(name)
 
 
 def test_runs_are_compared_by_plain_settings() -> None:

@@ -1,4 +1,3 @@
-import json
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.studies.benchmark import Variant, published_cells
 from tests import programs
+from tests.programs import summary_of
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -34,7 +34,7 @@ def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_cell_is_counted(toy_run: Path) -> None:
-    summary = json.loads((toy_run / "summary.json").read_text())
+    summary = summary_of(toy_run)
     places = [(c["system"], c["noise"], c["variant"]) for c in summary["cells"]]
     assert places == [
         (system, noise, variant)
@@ -119,7 +119,7 @@ def test_systems_of_the_collection_are_counted_together(tmp_path: Path) -> None:
         "systems=[Lorenz,SprottA,lorenz]", "variants=[STLSQ]",
     ]  # fmt: skip
     folder = run_config(composed(*overrides))
-    counted = json.loads((folder / "summary.json").read_text())["cells"]
+    counted = summary_of(folder)["cells"]
     assert [(c["system"], c["n"]) for c in counted] == [("dysts", 2), ("lorenz", 1)]
     outcomes = pd.read_csv(folder / "tables" / "outcomes.csv")
     assert set(outcomes["system"]) == {"Lorenz", "SprottA", "lorenz"}

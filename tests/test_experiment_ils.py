@@ -1,4 +1,3 @@
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from ep2sindy.library.relations import constraint
 from ep2sindy.refinement.problem import Iteration
 from ep2sindy.studies.ils import watcher
 from tests import programs
+from tests.programs import summary_of
 from tests.test_experiment_constrained import JUDGED
 
 EXACT = {"n_i": {"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, "n_n": {"n_n": 4.39e4, "n_i*n_n": -4.66e-14}}
@@ -43,7 +43,7 @@ def toy_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_integral_least_squares_returns_predator_and_prey(toy_run: Path) -> None:
-    summary = json.loads((toy_run / "summary.json").read_text())
+    summary = summary_of(toy_run)
     methods = summary["methods"]
     refinements = ("ils", "ils_constrained", "living")
     assert list(methods) == ["base", "weak", "constrained", *refinements]

@@ -1,4 +1,3 @@
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from ep2sindy.runtime.files import write_json
 from ep2sindy.studies.libraries import Study
 from ep2sindy.studies.library_result import REPLACED
 from tests.models import model_of
-from tests.programs import ROOT, Computed, composed, computed, on_file
+from tests.programs import ROOT, Computed, composed, computed, on_file, summary_of
 
 NO_LIVING = ("living=none", "held_out=null", "forecasts=0")
 
@@ -63,10 +62,6 @@ def test_two_densities_alone_leave_out_what_needs_more_and_a_seed_fixes_what_is_
     assert set(found.summary["models"]) == {"simple"}
     assert "the library ionization is left out: the data have no R_ion" in found.log
     assert "the library velocity is left out: the data have no R_ion, u_iz" in found.log
-
-
-def summary_of(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
 
 
 def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:

@@ -1,4 +1,3 @@
-import json
 import os
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from ep2sindy.data.open import write_field
 from ep2sindy.studies import pointwise
 from ep2sindy.studies.resume import pieces_key
 from tests import programs
+from tests.programs import summary_of
 from tests.test_resume import broken_and_resumed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,10 +47,6 @@ def on_file(path: Path, folder: Path) -> list[str]:
         "block_points=5",
         "max_regimes=3",
     ]
-
-
-def summary_of(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
 
 
 @pytest.fixture(scope="module")

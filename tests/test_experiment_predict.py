@@ -1,4 +1,3 @@
-import json
 import re
 from dataclasses import replace
 from decimal import Decimal
@@ -18,6 +17,7 @@ from ep2sindy.studies.points import expand
 from ep2sindy.studies.predict import Outcome
 from tests import programs
 from tests.models import lienard
+from tests.programs import summary_of
 
 POINTS = "points=[{V_D_V: [280.0, 320.0], mdot_mg_s: [5.0, 5.5]}, {V_D_V: 150.0, mdot_mg_s: 2.0}]"
 
@@ -42,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
-    summary = json.loads((folder / "summary.json").read_text())
+    summary = summary_of(folder)
     (name,) = summary["branches"]
     branch = summary["branches"][name]
     assert branch["model"] == "conserving"

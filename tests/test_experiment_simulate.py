@@ -1,6 +1,5 @@
 """`+exp=simulate`: one run, a scan with points that break, and what studies say of simulations."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from ep2sindy.studies.scan import scan_points
 from ep2sindy.studies.simulate import Outcome
 from ep2sindy.studies.simulated import DivergedError, amiss, check_recorded, compile_kernels, doubts
 from tests import programs
+from tests.programs import summary_of
 
 VOLTAGES = "scan={operating_point.voltage:[-5.0,250.0,300.0,5000.0]}"
 GOOD = {
@@ -51,10 +51,6 @@ def toy(folder: Path) -> list[str]:
 
 def log_of(folder: Path) -> str:
     return " ".join((folder / "run.log").read_text().split())
-
-
-def summary_of(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,3 @@
-import json
 import re
 from functools import cache
 from pathlib import Path
@@ -9,7 +8,7 @@ from omegaconf import DictConfig
 
 import ep2sindy as ep
 from ep2sindy.app.runner import run_config
-from tests.programs import composed, computed
+from tests.programs import composed, computed, summary_of
 
 # A growth rate that damps towards a cycle, as those found in the discharge current do.
 CYCLE = {"1": 7.93e9, "I": -2.44e9, "I*g": 1.07e4, "g^3": -1.47e-6}
@@ -62,7 +61,7 @@ def test_hidden_states_that_are_a_misfit_are_shown_if_they_are_asked_for(tmp_pat
 
 def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path: Path) -> None:
     folder = run_config(composed(*toy(record, tmp_path, "embedding=log_rate")))
-    summary = json.loads((folder / "summary.json").read_text())
+    summary = summary_of(folder)
     living = summary["living"]
     assert living["verdict"] == "lives"
     assert living["held_out"] is True
