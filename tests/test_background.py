@@ -85,14 +85,8 @@ def test_a_speed_of_the_neutrals_follows_its_table() -> None:
         (lambda: replace(SHIFT, alpha=1.0), "PressureShift.alpha must be above 1, got 1.0"),
         (lambda: replace(SHIFT, dz=math.nan), "z0 and dz must be finite, in channel lengths"),
         (lambda: ep.thruster.NeutralSpeed([0.0, 0.0], [1.0, 1.0]), "distance must increase"),
-        (
-            lambda: ep.thruster.NeutralSpeed([0.0, 1.0], [1.0]),
-            "speed must have one number for each",
-        ),
-        (
-            lambda: ep.thruster.NeutralSpeed([0.0, 1.0], [1.0, 0.0]),
-            "positive everywhere, got 0 m/s",
-        ),
+        (lambda: ep.thruster.NeutralSpeed([0.0, 1.0], [1.0]), "must have one number for each"),
+        (lambda: ep.thruster.NeutralSpeed([0.0, 1.0], [1.0, 0.0]), "everywhere, got 0 m/s"),
     ],
 )
 def test_what_cannot_be_is_refused(make, message: str) -> None:

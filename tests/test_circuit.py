@@ -14,6 +14,7 @@ from ep2sindy.thruster.axial.starts import GuessedStart
 from ep2sindy.thruster.axial.state_kernels import CURRENT, SUPPLY, VOLTAGE
 from tests.thrusters import POINT, brief
 
+COIL = ep.thruster.Circuit(inductance=1e-4)
 SINE = ep.thruster.ModulatedVoltage(share=0.05, frequency_Hz=2e4)
 
 
@@ -124,9 +125,7 @@ def test_a_voltage_is_read_from_a_file(tmp_path: Path):
         (ep.thruster.Circuit, "an inductance or a capacitance: both are 0"),
         
         (
-            lambda: ep.thruster.Thruster(
-                series_resistance=0.0, circuit=ep.thruster.Circuit(inductance=1e-4)
-            ),
+            lambda: ep.thruster.Thruster(series_resistance=0.0, circuit=COIL),
             "a circuit must have a resistance, .*: series_resistance is 0",
         ),
         (lambda: ep.thruster.ModulatedVoltage(1.2, 1e4), "share must be below 1, .*: 1.2 came"),
@@ -156,7 +155,7 @@ def bohm(z, t, plasma):
 @pytest.mark.parametrize(
     ("thruster", "point", "words"),
     [
-        ({"circuit": ep.thruster.Circuit(inductance=1e-4)}, {}, "a circuit"),
+        ({"circuit": COIL}, {}, "a circuit"),
         ({"transport": ep.thruster.FunctionTransport(bohm)}, {}, "a transport by a function"),
         ({}, {"supply": SINE}, "a supply whose voltage varies"),
         ({}, {"background": ep.thruster.Background(1e-3)}, "a background gas"),

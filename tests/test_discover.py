@@ -27,6 +27,8 @@ from tests.rules import BySize
 PELTS = Trajectory(np.arange(1900.0, 1921.0), hare_lynx().states, ["hare", "lynx"])  # in years
 
 RECIPE = Regression(Differential(), AdaptiveLasso(), Knee("library"), Bootstraps(n=8))
+PLAIN = Regression(Differential(), BestSubset(), bootstraps=Bootstraps(n=0))
+RECIPES = [Regression(WeightedWeak()), PLAIN]
 
 
 def test_predator_and_prey_are_found_in_noisy_data() -> None:
@@ -77,24 +79,24 @@ def test_permuting_the_library_changes_nothing() -> None:
 
 
 # By the joint search, and by regression; what is said where 21 counts are few.
-FEW = {
-    None: "21 samples do not tell which of 6 terms (30 would): 2 an equation at most were tried",
-    Regression(
-        WeightedWeak()
-    ): "13 rows are few for 6 terms: equations of lynx were searched with at most 2",
-}
+FEW = [
+    (None, "21 samples do not tell which of 6 terms (30 would): 2 an equation at most were tried"),
+    (RECIPES[0], "13 rows are few for 6 terms: equations of lynx were searched with at most 2"),
+]
 
 
-@pytest.mark.parametrize("recipe", FEW, ids=["joint", "regression"])
-def test_hare_and_lynx_are_predator_and_prey_in_21_counts(recipe: AnyMethod | None) -> None:
+@pytest.mark.parametrize(("recipe", "said"), FEW, ids=["joint", "regression"])
+def test_hare_and_lynx_are_predator_and_prey_in_21_counts(
+    recipe: AnyMethod | None, said: str
+) -> None:
     """Least squares of whole trajectories gives 0.481, 0.0248, 0.926 and 0.0275."""
     found = discover(PELTS, None, recipe)
     truth = {"hare": {"hare": 0.481, "hare*lynx": -0.0248}}
     truth["lynx"] = {"lynx": -0.926, "hare*lynx": 0.0275}
     for state, terms in truth.items():
         assert found.model.terms(state) == pytest.approx(terms, rel=0.05)
-    said = [found.note, *(a.message for a in found.ambiguities)]
-    assert any(each.startswith(FEW[recipe]) for each in said)
+    notes = [found.note, *(a.message for a in found.ambiguities)]
+    assert any(note.startswith(said) for note in notes)
     run = found.model.rollout(PELTS)
     assert not run.diverged
     assert run.states.max() < 2.0 * PELTS.states.max()
@@ -108,13 +110,7 @@ def test_an_equation_that_is_given_is_not_held_down() -> None:
     assert not any("rows are few" in a.message for a in found.ambiguities)
 
 
-ROWS = [
-    Regression(WeightedWeak()),
-    Regression(Differential(), BestSubset(), bootstraps=Bootstraps(n=0)),
-]
-
-
-@pytest.mark.parametrize("recipe", ROWS, ids=["weighted", "differential"])
+@pytest.mark.parametrize("recipe", RECIPES, ids=["weighted", "differential"])
 def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: AnyMethod) -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     full = polynomial(["x", "y"], degree=2)
@@ -137,11 +133,8 @@ def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: AnyMeth
 def test_an_equation_without_terms_is_a_misfit_where_its_state_moves() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     only_one = polynomial(["x", "y"], degree=0)
-    found = discover(
-        run,
-        only_one,
-        Regression(Differential(), BestSubset(), EBIC(gamma=0.0, coarsening=None), Bootstraps(n=0)),
-    )
+    rule = EBIC(gamma=0.0, coarsening=None)
+    found = discover(run, only_one, replace(PLAIN, selection=rule))
     assert {chosen.terms for chosen in found.chosen.values()} == {()}
     assert "x'" in found.misfit
 
@@ -237,8 +230,7 @@ def test_a_state_whose_rows_cannot_be_whitened_leaves_the_others_tested(
 
     left_of_terms = choice._left_of_terms
     monkeypatch.setattr(choice, "_left_of_terms", fail_for_x)
-    recipe = Regression(Differential(), BestSubset(), bootstraps=Bootstraps(n=0))
-    found = discover(lotka_volterra().trajectory(noise=0.05, rng=0), None, recipe)
+    found = discover(lotka_volterra().trajectory(noise=0.05, rng=0), None, PLAIN)
     assert list(found.noise_test.left) == ["y"]
 
 
@@ -273,7 +265,5 @@ def test_the_test_of_a_trajectory_search_is_not_that_of_another_model() -> None:
 
 def test_samples_too_few_for_weak_rows_are_judged_by_none() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
-    few = Trajectory(t=run.t[:12], states=run.states[:12], state_names=run.state_names)
-    recipe = Regression(Differential(), BestSubset(), bootstraps=Bootstraps(n=0))
-    found = discover(few, polynomial(["x", "y"], degree=1), recipe)
+    found = discover(run.window(0, 12), polynomial(["x", "y"], degree=1), PLAIN)
     assert found.misfit == ""
