@@ -50,6 +50,7 @@ class Toy:
 
 GOOD = """
 experiment: toy
+seed: 0
 formulation: {_target_: ep2sindy.Differential}
 search: {_target_: ep2sindy.BestSubset}
 bootstraps: {_target_: ep2sindy.Bootstraps, n: 0}

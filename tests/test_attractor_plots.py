@@ -55,7 +55,7 @@ def test_every_system_has_a_column_and_every_noise_level_a_row(
     for ax, name in zip(panels[0], ("Lorenz", "damped oscillator"), strict=True):
         assert ax.get_title() == f"{name}\ntrue terms"
     assert panels[1, 0].get_xlabel() == ("time (s)" if over_time else "$x$")
-    assert panels[0, 0].get_ylabel() == ("noise 0 %\n$x$" if over_time else "noise 0 %\n$z$")
+    assert panels[0, 0].get_ylabel() == ("noise 0 %\n\n$x$" if over_time else "noise 0 %\n\n$z$")
     for ax, each in zip(panels.T.ravel(), first.found, strict=True):
         lengths = [len(line.get_xdata()) for line in ax.lines[1:3]]
         assert lengths == [each.truth.n_samples, len(each.rollout.t)]

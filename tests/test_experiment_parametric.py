@@ -198,7 +198,7 @@ def test_own_files_and_points_that_do_not_oscillate(tmp_path: Path) -> None:
     given = own_files(tmp_path, first, second, still, dead)
     found = programs.computed(composed(*given, "thesis=null"))
     captions = [figure.caption for figure in found.outcome.figures().values()]
-    assert "thesis" not in "".join([found.page, *captions])  # without published values
+    assert "thesis" not in "".join([found.log, *captions])  # without published values
     summary = found.summary
     assert [p["status"] for p in summary["points"]] == ["oscillating"] * 2 + ["steady"] * 2
     assert [p["dt_s"] for p in summary["points"][:3]] == pytest.approx([1.5e-6, 2e-6, 1.5e-6])
