@@ -297,9 +297,9 @@ def is_right(model: ep.SparseModel, system: object) -> bool:
     [
         (ep.systems.damped_oscillator(), 0.2),
         (ep.systems.van_der_pol(), 0.0),
-        pytest.param(ep.systems.van_der_pol(), 0.2, marks=pytest.mark.slow),
+        (ep.systems.van_der_pol(), 0.2),
         (ep.lorenz(), 0.05),
-        pytest.param(ep.lorenz(), 0.2, marks=pytest.mark.slow),
+        (ep.lorenz(), 0.2),
     ],
 )
 def test_known_equations_are_found_in_noise(system: ep.systems.System, noise: float) -> None:
