@@ -1,4 +1,3 @@
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -143,16 +142,9 @@ def test_this_packages_path_is_a_variant_and_keeps_the_empty_support() -> None:
     assert all(kept[0] == frozenset() for kept in found.kept.values())
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"n_realizations": 0}, "there must be something to run"),
-        ({"noises": []}, "there must be something to run"),
-        ({"variants": {}}, "there must be something to run"),
-    ],
-)
-def test_a_benchmark_of_nothing_is_refused(settings: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
+@pytest.mark.parametrize("settings", [{"n_realizations": 0}, {"noises": []}, {"variants": {}}])
+def test_a_benchmark_of_nothing_is_refused(settings: dict) -> None:
+    with pytest.raises(ValueError, match="there must be something to run"):
         outcomes_of(**({"variants": {"STLSQ": STLSQ_}} | settings))
 
 
