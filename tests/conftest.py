@@ -51,11 +51,19 @@ def own_simulations(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder, in which the test stands."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
 @pytest.fixture(scope="session")
 def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A field on (time, z) whose average follows the thesis's Eq. 23, in SI units."""
-    import xarray as xr  # here, for each process of a run imports this file
-    from scipy.integrate import solve_ivp
+    from scipy.integrate import solve_ivp  # here, for each process of a run imports this file
+
+    from tests.fields import along_channel
 
     a, b, c = 1.64e5, 4.66e-14, 4.39e4
     time = 1.5e-6 * np.arange(1200)
@@ -65,18 +73,13 @@ def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return [burn - a * x[0], c * x[1] - burn]
 
     found = solve_ivp(slope, time[[0, -1]], [5e17, 4e18], "DOP853", time, rtol=1e-11)
-    states, profile = found.y.T, np.ones((1, 5))
     data = {
-        "n_i": (states[:, :1] * profile, "m^-3"),
-        "n_n": (states[:, 1:] * profile, "m^-3"),
-        "R_ion": (4e-14 * (1 + 0.3 * np.sin(9e4 * time))[:, None] * profile, "m^3/s"),
-        "u_iz": (5e3 * (1 + 0.2 * np.sin(7e4 * time))[:, None] * profile, "m/s"),
+        "n_i": (found.y[0], "m^-3"),
+        "n_n": (found.y[1], "m^-3"),
+        "R_ion": (4e-14 * (1 + 0.3 * np.sin(9e4 * time)), "m^3/s"),
+        "u_iz": (5e3 * (1 + 0.2 * np.sin(7e4 * time)), "m/s"),
     }
-    field = xr.Dataset(
-        {name: (("time", "z"), v, {"units": unit}) for name, (v, unit) in data.items()},
-        coords={"time": time, "z": np.linspace(0.003, 0.027, 5)},
-        attrs={"channel_m": 0.025},
-    )
+    field = along_channel(time, np.linspace(0.003, 0.027, 5), data)
     from ep2sindy.data.open import write_field
 
     path = tmp_path_factory.mktemp("data") / "predator_prey.nc"

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.rows import RegressionRows
@@ -67,3 +68,10 @@ def point_study(
         "r": ("r", np.linspace(0.036, 0.049, lost.shape[1]), {"units": "m"}),
     }
     return xr.Dataset(arrays, coords=coords, attrs={"no_fit": ""})
+
+
+def lienard(a: float) -> Trajectory:
+    """van der Pol's states after Lienard, on their cycle; a period takes seven seconds."""
+    model = model_of({"p": {"p": a, "q": -1.0, "p^3": -0.3}, "q": {"p": 1.0}})
+    t = 0.1 * np.arange(1000)
+    return Trajectory(t[:700], model.simulate(t, [1.0, 0.0]).states[300:], ["p", "q"])

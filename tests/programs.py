@@ -1,5 +1,6 @@
 """Experiments run inside a test, without the command line; and, where asked, without figures."""
 
+import json
 import sys
 from collections.abc import Sequence
 from copy import deepcopy
@@ -28,6 +29,12 @@ ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "exp").glob("*.yaml"))
 
 
+def on_file(path: Path, output: Path, *variables: str) -> list[str]:
+    """Overrides that open a file of densities and of these variables, by the names we use."""
+    names = (f"data.variables.{name}.name={name}" for name in variables)
+    return ["data=file", f"data.path={path}", *names, f"output={output}"]
+
+
 def composed(*overrides: str) -> DictConfig:
     """The config of the command line `ep2sindy OVERRIDES`.
 
@@ -38,11 +45,6 @@ def composed(*overrides: str) -> DictConfig:
     config = deepcopy(composed_of(tuple(str(o.input_line) for o in chosen)))
     ConfigLoaderImpl._apply_overrides_to_config([o for o in parsed if o not in chosen], config)
     return config
-
-
-def on_file(exp: str, path: Path, output: Path, *more: str) -> list[str]:
-    """Overrides that run an experiment on a file."""
-    return [f"+exp={exp}", "data=file", f"data.path={path}", f"output={output}", *more]
 
 
 @cache
@@ -86,6 +88,11 @@ def computed(config: DictConfig) -> Computed:
         log = (run.folder.path / "run.log").read_text()
     check_end(log, page, result, run.folder.path)
     return Computed(outcome, log, page, run.folder.path, run.warnings)
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    """What a run left in its folder for other programs."""
+    return json.loads((folder / "summary.json").read_text())
 
 
 def check_end(log: str, page: str, result: Result, folder: Path) -> None:

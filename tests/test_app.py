@@ -11,12 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy as ep
 from ep2sindy.app import program
-from ep2sindy.app.runner import (
-    hparams_of,
-    list_studies,
-    run_config,
-    study_class,
-)
+from ep2sindy.app.runner import hparams_of, list_studies, run_config, study_class
 from ep2sindy.app.schema import Configured, keys_of, study_of, value_of
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.runtime.files import read_json
@@ -55,9 +50,7 @@ class Toy:
 
 GOOD = """
 experiment: toy
-study: toy
 seed: 0
-output: outputs
 formulation: {_target_: ep2sindy.Differential}
 search: {_target_: ep2sindy.BestSubset}
 bootstraps: {_target_: ep2sindy.Bootstraps, n: 0}
@@ -109,37 +102,27 @@ def test_a_recipe_stands_for_its_groups() -> None:
     [
         ("nn=1", r"unknown keys \['nn'\]; near it is n; there are \["),
         ("n=0", "n must be a whole number, one or more: 0 came"),
-        ("n=1.5", "n must be a whole number, one or more: 1.5 came"),
         ("share=1", "share must be a number between 0 and 1: 1 came"),
         ("span=-1", "span must be a positive number, or null for all: -1 came"),
         ("names=[a,a]", r"names must be a list such as \[a,b\], each once"),
-        ("names=a", r"names must be a list such as \[a,b\], each once: 'a' came"),
         ("lengths=[0]", r"lengths\[0\] must be whole numbers, above zero: 0 came"),
         ("noises=[-1.0]", r"noises\[0\] must be numbers, zero or more: -1.0 came"),
         ("inner.widht=1", r"inner may have \['label', 'width'\] and needs width: \['widht', "),
-        ("many.one.lable=x", r"many.one may have .*: \['label', 'lable', 'width'\] came"),
-        ("many.one.label=1", "many.one.label must be text: 1 came"),
         ("many=1", r"many must be like {name: ...}: 1 came"),
         ("rows=[{width: 1, hight: 2}]", r"rows\[0\] may have .*: \['hight', 'width'\] came"),
         ("rows=[{width: wide}]", r"rows\[0\].width must be a number: 'wide' came"),
         ("rows=1", "rows must be a list: 1 came"),
         ("switch=1", "switch must be true or false: 1 came"),
         ("rule.gama=1", r"rule, EBIC: .* unexpected keyword argument 'gama'; near it is gamma"),
-        ("rule=ebic", "rule must be a Selection, named by its _target_: 'ebic' came"),
         ("search=null", "search must be a Search, named by its _target_: None came"),
-        ("search._target_=null", "search must name a _target_ that there is"),
         ("search.max_terms=???", r"^search.max_terms must be set: it is still '\?\?\?'"),
         ("names=[a,'???']", r"names\[1\] must be set: it is still '\?\?\?'"),
-        ("switch=???", r"switch must be set: it is still '\?\?\?'"),
         ("many.one=null", "many.one may have .*: None came"),
         ("selection._target_=ep2sindy.BestSubset", "selection must name a _target_ that is a Sele"),
         ("later=1", "later must name a _target_: 1 came"),
-        ("search.max_terms=0", "max_terms must be a whole number, one or more: 0 came"),
         ("search.max_terms=1.5", "search.max_terms must be a whole number: 1.5 came"),
-        ("search.max_terms=two", "search.max_terms must be a whole number: 'two' came"),
         ("selection.n_norm=3", "selection.n_norm must be text: 3 came"),
         ("search._target_=ep2sindy.Best", "search must name a _target_ that there is, .*Best'"),
-        ("depth=0", "depth must be a whole number, one or more: 0 came"),
     ],
 )
 def test_a_setting_that_cannot_be_is_refused_by_its_place(change: str, message: str) -> None:
@@ -152,8 +135,6 @@ def test_a_setting_that_cannot_be_is_refused_by_its_place(change: str, message: 
     [
         ("share", "the config of this experiment must have 'share'"),
         ("search", "must have 'search': choose one with search=NAME"),
-        ("formulation", "must have 'formulation': choose one with formulation=NAME"),
-        ("depth", "must have 'depth': choose one with depth=NAME"),
     ],
 )
 def test_a_key_that_is_missing_is_named_and_a_group_does_not_become_another(
@@ -181,10 +162,9 @@ def test_what_is_built_later_can_be_changed_by_place() -> None:
 def test_studies_are_found_by_name() -> None:
     assert "libraries" in list_studies()
     assert study_class("libraries").__name__ == "Study"
-    with pytest.raises(ValueError, match=r"study must name a module .* 'librarys' came"):
-        study_class("librarys")
-    with pytest.raises(ValueError, match="'ep2sindy.studies.views' came"):
-        study_class("ep2sindy.studies.views")
+    for name in ("librarys", "ep2sindy.studies.views"):
+        with pytest.raises(ValueError, match=f"study must name a module .* '{name}' came"):
+            study_class(name)
 
 
 def test_runs_are_compared_by_plain_settings() -> None:
@@ -239,32 +219,30 @@ def test_a_package_without_its_configs_says_so(
 
 @pytest.mark.parametrize("named", [False, True])
 def test_configs_below_the_folder_one_stands_in_are_found(
-    named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    named: bool, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "conf").mkdir()
-    monkeypatch.chdir(tmp_path)
+    (here / "conf").mkdir()
     given = ["--config-dir", "elsewhere", "+exp=mine"] if named else ["+exp=mine"]
     monkeypatch.setattr(sys, "argv", ["ep2sindy", *given])
     program.prepare_arguments(ROOT / "conf")
-    own = ["--config-dir", str(tmp_path / "conf"), "+exp=mine"]
+    own = ["--config-dir", str(here / "conf"), "+exp=mine"]
     assert sys.argv[1:] == (given if named else own)
 
 
-def test_flags_may_stand_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_flags_may_stand_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["ep2sindy", "+exp=discover", "-m", "seed=0,1"])
     program.prepare_arguments(ROOT / "conf")
     assert sys.argv[1:] == ["-m", "+exp=discover", "seed=0,1"]
 
 
 def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    here: Path, capsys: pytest.CaptureFixture
 ) -> None:
     """Three jobs that end early, each for its own reason: no job ends another."""
-    (tmp_path / "conf" / "exp").mkdir(parents=True)
+    (here / "conf" / "exp").mkdir(parents=True)
     own = "# @package _global_\ndefaults: [discover]\nexperiment: mine\n"
-    (tmp_path / "conf" / "exp" / "mine.yaml").write_text(own)
-    monkeypatch.chdir(tmp_path)
+    (here / "conf" / "exp" / "mine.yaml").write_text(own)
     error = ended(
         "-m", "+exp=mine", "data=file", "data.path=none.nc", "trajectory.states=[x,y]", "seed=-1,2"
     )
@@ -272,7 +250,7 @@ def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
     said = capsys.readouterr()
     for text in ("job 0: ", "job 1: ", "ep2sindy compare outputs", "seed must be a whole number"):
         assert text in said.out
-    paths = sorted(tmp_path.glob("outputs/multirun/*/jobs/*.json"))
+    paths = sorted(here.glob("outputs/multirun/*/jobs/*.json"))
     errors = [read_json(path.read_text())["error"] for path in paths]
     assert errors[0] == "seed must be a whole number, zero or more: -1 came"
     assert errors[1].startswith("no such file: ")
@@ -302,20 +280,14 @@ def test_a_launcher_of_an_extra_names_it(tmp_path: Path, monkeypatch: pytest.Mon
     ("overrides", "message"),
     [
         ([], "error: choose an experiment with +exp=NAME; there are benchmark, breathing"),
-        (["+exp=breathing", "sede=1"], "unknown key 'sede'; near it is seed; there"),
         (["+exp=discover", "data=file", "data.path=x"], "trajectory.states must be set: it is"),
-        (["+exp=pointwise", "data=file"], "data.path must be set: it is still '???'"),
         (["+exp=breathing", "search=null"], "Config group override must be a string"),
         (["+exp=breathing", "--config-dir", "nowhere"], "nowhere"),
         (["+exp=breathing", "output=/proc/none"], "choose another with output=PATH"),
     ],
 )
-def test_mistakes_end_in_one_clear_message(
-    overrides: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture,
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
+def test_mistakes_end_in_one_clear_message(overrides: list[str], message: str, here: Path) -> None:
     error = ended(*overrides)
     assert message in error
     assert error.startswith("error: ")
-    assert not list(tmp_path.glob("outputs/*/*"))  # no run folder of a run that never began
+    assert not list(here.glob("outputs/*/*"))  # no run folder of a run that never began

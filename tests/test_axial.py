@@ -10,21 +10,14 @@ from benchmarks.hallthruster import calibrated_run
 from ep2sindy.thruster.axial.electron_kernels import solve_from_both_ends
 from ep2sindy.thruster.axial.model import cell_faces
 from ep2sindy.thruster.verdict import cycle_peaks, diagnose, judge_status, multiplicity
+from tests.thrusters import POINT, brief
 
-POINT = ep.thruster.OperatingPoint(300.0, 5.0)
-BRIEF = {
-    "duration_s": 3e-4, "warm_up_s": 1e-4, "n_cells": 40, "stretch": 1.0, "progress": False,
-}  # fmt: skip
 ZONE = (0.015, 0.025)
-
-
-def simulate(thruster=None, point=POINT, **settings):
-    return ep.thruster.simulate(thruster or ep.thruster.Thruster(), point, **(BRIEF | settings))
 
 
 @pytest.fixture(scope="module")
 def run():
-    return simulate()
+    return brief()
 
 
 def largest(balance):
@@ -33,7 +26,7 @@ def largest(balance):
 
 @pytest.mark.parametrize("settings", [{}, {"stretch": 2.0}, {"reconstruct": False}])
 def test_the_balance_of_a_zone_closes_over_every_sample(settings):
-    balance = ep.thruster.zone_balance(simulate(**settings), ZONE)
+    balance = ep.thruster.zone_balance(brief(**settings), ZONE)
     assert float(np.abs(balance["residual"]).max()) < 1e-6 * largest(balance)  # float32 fields
     ions = balance["change_i"] - balance["inflow_i"] - balance["ionization"] + balance["wall_loss"]
     assert float(np.abs(ions).max()) < 1e-6 * largest(balance)
@@ -50,7 +43,7 @@ def test_the_balance_of_a_zone_closes_over_every_sample(settings):
     ids=["default", "anode sheath", "two charges", "krypton"],
 )
 def test_mass_and_energy_are_conserved(thruster):
-    field = simulate(thruster)
+    field = brief(thruster)
     assert field.attrs["mass_balance"] == pytest.approx(1.0, abs=1e-6)  # float32 fields
     assert field.attrs["energy_balance"] == pytest.approx(1.0, abs=1e-9)
 
@@ -59,15 +52,15 @@ def test_where_the_power_goes_adds_up(run):
     lost = sum(run[name] for name in ("P_inelastic", "P_wall", "P_anode", "P_cathode"))
     heated = run["P_in"] - run["P_ions"]
     assert float(lost.mean()) == pytest.approx(float(heated.mean()), rel=0.3)  # the rest is stored
-    bare = simulate(
+    bare = brief(
         ep.thruster.Thruster(series_resistance=0.0)
     )  # what the cathode leaves to the plasma
     np.testing.assert_allclose(bare["P_in"], 280.0 * bare["I_d"], rtol=1e-9)
 
 
 def test_samples_are_averages_over_their_step():
-    fine = simulate(sample_s=1e-6, duration_s=1e-4, cfl=0.2)
-    coarse = simulate(sample_s=1e-5, duration_s=1.6e-4, cfl=0.2)
+    fine = brief(sample_s=1e-6, duration_s=1e-4, cfl=0.2)
+    coarse = brief(sample_s=1e-5, duration_s=1.6e-4, cfl=0.2)
     blocks = fine["n_i"].values[:100].astype(float).reshape(10, 10, 40).mean(axis=1)
     # each sample is cut into equal steps, so these differ, and the coupled code is of first order
     np.testing.assert_allclose(blocks, coarse["n_i"].values[:10], rtol=2e-2)
@@ -76,10 +69,10 @@ def test_samples_are_averages_over_their_step():
 
 
 def test_instantaneous_samples_on_request():
-    field = simulate(averaged=False)
+    field = brief(averaged=False)
     assert "ionization" not in field
     assert "mass_balance" not in field.attrs
-    assert float(np.abs(field["n_i"] - simulate()["n_i"]).max()) > 0.0
+    assert float(np.abs(field["n_i"] - brief()["n_i"]).max()) > 0.0
     np.testing.assert_array_equal(field["n_i"].values[-1], field["end_n_i"].values.astype("f4"))
 
 
@@ -100,12 +93,8 @@ def test_the_solver_from_both_ends_solves(size, scale):
     rng = np.random.default_rng(0)
     lower, upper, known = -rng.random((3, size))
     diagonal = 2.5 + rng.random(size)
-    inner = np.arange(1, size - 1)
-    matrix = np.zeros((size, size))
-    matrix[inner, inner - 1], matrix[inner, inner], matrix[inner, inner + 1] = (
-        lower[inner], diagonal[inner], upper[inner],
-    )  # fmt: skip
-    matrix[0, 0] = matrix[-1, -1] = 1.0  # T is given at the ends
+    matrix = np.diag(diagonal) + np.diag(lower[1:], -1) + np.diag(upper[:-1], 1)
+    matrix[[0, -1]] = np.eye(size)[[0, -1]]  # T is given at the ends
     T = np.zeros(size)
     T[0], T[-1] = 3.0, 4.0
     known[0], known[-1] = T[0], T[-1]
@@ -119,20 +108,20 @@ def test_the_solver_from_both_ends_solves(size, scale):
 
 
 def test_a_restart_goes_on_to_the_last_digit(tmp_path):
-    whole = simulate(duration_s=6e-4)
-    first = simulate(duration_s=3e-4)
+    whole = brief(duration_s=6e-4)
+    first = brief(duration_s=3e-4)
     first.to_netcdf(tmp_path / "first.nc", engine="h5netcdf")
     for initial in (first, tmp_path / "first.nc", ep.thruster.Restart(first)):
-        rest = simulate(initial=initial, warm_up_s=0.0, duration_s=2e-4)
+        rest = brief(initial=initial, warm_up_s=0.0, duration_s=2e-4)
         after = whole.isel(time=slice(first.sizes["time"], None))
         np.testing.assert_array_equal(rest["n_i"], after["n_i"].values[: rest.sizes["time"]])
         np.testing.assert_array_equal(rest["I_d"], after["I_d"].values[: rest.sizes["time"]])
 
 
 def test_a_restart_on_another_grid_is_interpolated_and_says_so(run):
-    field = simulate(initial=run, n_cells=60, warm_up_s=0.0)
+    field = brief(initial=run, n_cells=60, warm_up_s=0.0)
     assert field.attrs["initial"].endswith("interpolated from 40 to 60 cells")
-    guessed = simulate(n_cells=60, warm_up_s=0.0)
+    guessed = brief(n_cells=60, warm_up_s=0.0)
     for name, near in {"n_i": 0.2, "n_n": 0.1}.items():  # in one sample n_i changes by a tenth
         there = run[name].isel(time=-1).interp(z=field["z"]).dropna("z")
         off = np.abs(field[name].isel(time=0) / there - 1.0).median()
@@ -141,9 +130,9 @@ def test_a_restart_on_another_grid_is_interpolated_and_says_so(run):
 
 
 def test_a_restart_at_another_operating_point_is_a_continuation(run):
-    field = simulate(point=ep.thruster.OperatingPoint(310.0, 5.0), initial=run, warm_up_s=0.0)
+    field = brief(point=ep.thruster.OperatingPoint(310.0, 5.0), initial=run, warm_up_s=0.0)
     assert "interpolated" not in field.attrs["initial"]
-    same = simulate(initial=run, warm_up_s=0.0)
+    same = brief(initial=run, warm_up_s=0.0)
     np.testing.assert_allclose(field["n_n"][0], same["n_n"][0], rtol=3e-3)
     assert 0.0 < float(field["I_d"][0] - same["I_d"][0]) < 0.3
 
@@ -151,17 +140,16 @@ def test_a_restart_at_another_operating_point_is_a_continuation(run):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda run: simulate(ep.thruster.Thruster(inner_radius=0.034), initial=run),
-         r"only in the same thruster: inner_radius was 0\.035 and is 0\.034; start from ColdStart"),
-        (lambda run: simulate(
+        
+        (lambda run: brief(
             ep.thruster.Thruster(propellant=ep.thruster.propellant("krypton")), initial=run),
          r"only in the same thruster: propellant was"),
-        (lambda run: simulate(initial=run.assign_attrs(status="diverged")),
+        (lambda run: brief(initial=run.assign_attrs(status="diverged")),
          r"only from one that lived: this one diverged, .* start from ColdStart or SoftStart"),
-        (lambda run: simulate(initial=run[["n_i"]]), r"must be a run of simulate, which keeps"),
-        (lambda run: simulate(initial="there/is/none.nc"), r"no such run to go on from: /"),
-        (lambda run: simulate(stretch=0.5), r"stretch must be between 1 .* got 0\.5"),
-        (lambda run: simulate(cfl=1.5), r"cfl must be above 0 and at most 1, got 1\.5"),
+        (lambda run: brief(initial=run[["n_i"]]), r"must be a run of simulate, which keeps"),
+        (lambda run: brief(initial="there/is/none.nc"), r"no such run to go on from: /"),
+        
+        (lambda run: brief(cfl=1.5), r"cfl must be above 0 and at most 1, got 1\.5"),
         (lambda run: ep.thruster.SoftStart(resistance=-1.0),
          r"SoftStart\.resistance must be .* positive"),
         (lambda run: ep.thruster.zone_balance(run, (0.03, 0.0498)),
@@ -174,21 +162,11 @@ def test_bad_input_says_the_way_out(run, make, message):
         make(run)
 
 
-@pytest.mark.parametrize(
-    "start",
-    [ep.thruster.ColdStart(), ep.thruster.SoftStart(hold_s=1e-4), ep.thruster.GuessedStart()],
-)
-def test_every_start_runs_and_is_named(start):
-    field = simulate(initial=start)
-    assert field.attrs["status"] != "diverged"
-    assert field.attrs["initial"] == start.label
-
-
 def test_a_soft_start_holds_back_until_it_is_released():
-    held, free = (
-        simulate(initial=start, warm_up_s=0.0)["I_d"].values
-        for start in (ep.thruster.SoftStart(hold_s=5e-4), ep.thruster.ColdStart())
-    )
+    starts = ep.thruster.SoftStart(hold_s=5e-4), ep.thruster.ColdStart()
+    fields = [brief(initial=start, warm_up_s=0.0) for start in starts]
+    assert [field.attrs["initial"] for field in fields] == [start.label for start in starts]
+    held, free = (field["I_d"].values for field in fields)
     assert held[0] < 6.0  # of 280 V over 40 ohm, 7 A, most is the plasma's
     assert held.max() > 2.0 * held[0]  # let go
     assert free.max() > 20.0  # it ignites
@@ -196,9 +174,7 @@ def test_a_soft_start_holds_back_until_it_is_released():
 
 def test_two_charges_are_ionised_further():
     thruster = ep.thruster.Thruster(propellant=ep.thruster.propellant("xenon"), charge_states=2)
-    field = simulate(thruster)
-    balance = ep.thruster.zone_balance(field, ZONE)
-    assert float(np.abs(balance["residual"]).max()) < 1e-6 * largest(balance)
+    field = brief(thruster)
     assert "average_of" not in field["ionization"].attrs  # rates of its own ionise the second
     share = float((field["n_i2"] / field["n_i"]).mean())
     assert 1e-3 < share < 0.3
@@ -207,7 +183,7 @@ def test_two_charges_are_ionised_further():
 
 
 def test_first_order_fluxes_damp():
-    sharp, blunt = (simulate(reconstruct=on, duration_s=1e-3) for on in (True, False))
+    sharp, blunt = (brief(reconstruct=on, duration_s=1e-3) for on in (True, False))
     assert float(blunt["I_d"].std()) < float(sharp["I_d"].std())
 
 
@@ -228,24 +204,26 @@ def test_a_transit_oscillation_is_told_from_breathing(f_Hz, status):
     assert judge_status(4.0 + np.sin(2e0 * np.pi * f_Hz * t), 1.5e-6) == status
 
 
+def verdict_on(current, *, diverged=False):
+    t = 1.5e-6 * np.arange(current.size)
+    field = xr.Dataset({"I_d": ("time", current)}, coords={"time": t})
+    return diagnose(field, diverged=diverged, flow_A=4.0)
+
+
 @pytest.mark.parametrize(("amplitude", "cycle"), [(6.0, "strong"), (2.0, "weak")])
 def test_a_result_names_its_cycle(amplitude, cycle):
-    t = 1.5e-6 * np.arange(4000)
-    current = 4.0 + amplitude * np.sin(2.0 * np.pi * 14e3 * t)
-    field = xr.Dataset({"I_d": ("time", current)}, coords={"time": t})
-    assert diagnose(field, diverged=False, flow_A=4.0)["cycle"] == cycle
+    current = 4.0 + amplitude * np.sin(2.0 * np.pi * 14e3 * 1.5e-6 * np.arange(4000))
+    assert verdict_on(current)["cycle"] == cycle
 
 
 @pytest.mark.parametrize(("late_A", "status"), [(0.0, "out"), (0.39, "out"), (0.41, "steady")])
 def test_a_discharge_that_has_gone_out_is_not_steady(late_A, status):
-    current = np.append(np.full(2000, 4.0), np.full(2000, late_A))
-    field = xr.Dataset({"I_d": ("time", current)}, coords={"time": 1.5e-6 * np.arange(4000)})
-    assert diagnose(field, diverged=False, flow_A=4.0)["status"] == status
+    assert verdict_on(np.repeat([4.0, late_A], 2000))["status"] == status
 
 
 def test_efficiency_is_by_the_mean_power(run):
     """A series resistor lowers the voltage where the current is high."""
-    resistive = simulate(ep.thruster.Thruster(series_resistance=10.0))
+    resistive = brief(ep.thruster.Thruster(series_resistance=10.0))
     for field in (run, resistive):
         power = float((field["I_d"] * field["V_d"]).mean())
         squared = float(field["thrust"].mean()) ** 2
@@ -277,21 +255,18 @@ def test_drift_beyond_the_table_is_no_divergence():
 
 
 def test_rates_that_do_not_cover_the_run_say_so():
-    field = simulate(cold_xenon(12.0))
+    field = brief(cold_xenon(12.0))
     assert "cover T_e up to 12 eV, and the run reached T_e + 2K/3" in field.attrs["rates"]
-    warmest = float(simulate()["T_e_eV"].max()) + 1.0  # not so T_e + 2 K/3
-    field = simulate(cold_xenon(warmest))
+    warmest = float(brief()["T_e_eV"].max()) + 1.0  # not so T_e + 2 K/3
+    field = brief(cold_xenon(warmest))
     assert float(field["T_e_eV"].max()) < warmest
     assert f"cover T_e up to {warmest:g} eV" in field.attrs["rates"]
-    assert simulate().attrs["rates"] == "covered"
+    assert brief().attrs["rates"] == "covered"
 
 
-def test_a_discharge_that_falls_to_nothing_has_gone_out():
-    t = 1.5e-6 * np.arange(400)
-    for last, status in ((1e-300, "out"), (4.0, "diverged")):
-        current = np.geomspace(4.0, last, t.size)
-        field = xr.Dataset({"I_d": ("time", current)}, coords={"time": t})
-        assert diagnose(field, diverged=True, flow_A=4.0)["status"] == status
+@pytest.mark.parametrize(("last_A", "status"), [(1e-300, "out"), (4.0, "diverged")])
+def test_a_discharge_that_falls_to_nothing_has_gone_out(last_A, status):
+    assert verdict_on(np.geomspace(4.0, last_A, 400), diverged=True)["status"] == status
 
 
 @pytest.mark.parametrize("m", [1, 2, 3])

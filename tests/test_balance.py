@@ -11,6 +11,7 @@ from ep2sindy.library.roles import constraint_of, summed
 from ep2sindy.studies.balance import compared_processes, model_balance
 from ep2sindy.studies.fits import split_in_time
 from ep2sindy.studies.source import Zones, told_roles
+from tests.thrusters import brief
 
 STATES = ["n_i", "n_n"]
 CHANNEL = ep.Zone(z="channel")
@@ -18,10 +19,7 @@ CHANNEL = ep.Zone(z="channel")
 
 @pytest.fixture(scope="module")
 def field() -> xr.Dataset:
-    return ep.thruster.simulate(
-        ep.thruster.Thruster(), ep.thruster.OperatingPoint(300.0, 5.0), n_cells=40,
-        duration_s=6e-4, warm_up_s=2e-4, progress=False,
-    )  # fmt: skip
+    return brief(duration_s=6e-4, warm_up_s=2e-4)
 
 
 @pytest.fixture(scope="module")
@@ -102,10 +100,7 @@ def data(field: xr.Dataset) -> ep.Trajectory:
 
 def model_of(ions: dict[str, float], neutrals: dict[str, float]) -> ep.SparseModel:
     library = ep.polynomial(STATES, degree=2)
-    coef = np.zeros((len(library), 2))
-    for column, terms in enumerate((ions, neutrals)):
-        for term, value in terms.items():
-            coef[library.index(term), column] = value
+    coef = ep.coef_matrix(library, [ions, neutrals])
     return ep.SparseModel(library, STATES, coef, dict.fromkeys(STATES, "m^-3"))
 
 
@@ -234,9 +229,7 @@ def test_a_process_left_out_leaves_those_that_share_its_coefficient(data, exact,
 
 def test_a_model_with_functions_has_no_processes(data: ep.Trajectory, exact: xr.Dataset) -> None:
     library = ep.polynomial(STATES, degree=1, functions=["sqrt(n_i)"])
-    coef = np.zeros((len(library), 2))
-    coef[library.index("n_i"), 0] = coef[library.index("n_n"), 1] = -1e5
-    coef[library.index("sqrt(n_i)"), 0] = 1e14
+    coef = ep.coef_matrix(library, [{"n_i": -1e5, "sqrt(n_i)": 1e14}, {"n_n": -1e5}])
     model = ep.SparseModel(library, STATES, coef, dict.fromkeys(STATES, "m^-3"))
     parts = split_in_time(data, 0.25)
     beside = model_balance(

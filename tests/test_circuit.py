@@ -10,19 +10,16 @@ import ep2sindy as ep
 from ep2sindy.thruster.axial.electron_kernels import follow_circuit, thevenin
 from ep2sindy.thruster.axial.model import build_model, cell_faces, lengths_and_centres
 from ep2sindy.thruster.axial.settings import to_json
-from ep2sindy.thruster.axial.simulate import simulate
 from ep2sindy.thruster.axial.starts import GuessedStart
 from ep2sindy.thruster.axial.state_kernels import CURRENT, SUPPLY, VOLTAGE
+from tests.thrusters import POINT, brief
 
-POINT = ep.thruster.OperatingPoint(300.0, 5.0)
-BRIEF = {
-    "duration_s": 3e-4, "warm_up_s": 1e-4, "n_cells": 40, "stretch": 1.0, "progress": False,
-}  # fmt: skip
+COIL = ep.thruster.Circuit(inductance=1e-4)
 SINE = ep.thruster.ModulatedVoltage(share=0.05, frequency_Hz=2e4)
 
 
 def driven(supply, **settings):
-    return simulate(ep.thruster.Thruster(), replace(POINT, supply=supply), **(BRIEF | settings))
+    return brief(point=replace(POINT, supply=supply), **settings)
 
 
 def step_response(circuit, load_ohm, dt, n_steps):
@@ -74,13 +71,13 @@ def test_the_supply_is_recorded_as_it_was_asked_for():
 
 def test_a_table_of_a_constant_voltage_changes_nothing():
     still = ep.thruster.VoltageTable((0.0, 1.0), (300.0, 300.0))
-    plain, tabled = simulate(ep.thruster.Thruster(), POINT, **BRIEF), driven(still)
+    plain, tabled = brief(), driven(still)
     np.testing.assert_array_equal(plain["I_d"], tabled["I_d"])
     assert "V_supply" not in plain
 
 
 def test_the_voltage_is_held_during_the_warm_up():
-    plain, sine = simulate(ep.thruster.Thruster(), POINT, **BRIEF), driven(SINE)
+    plain, sine = brief(), driven(SINE)
     assert float(sine["I_d"][0]) == pytest.approx(float(plain["I_d"][0]), rel=0.02)
     assert float(np.abs(sine["I_d"] - plain["I_d"]).max()) > 0.1
 
@@ -88,7 +85,7 @@ def test_the_voltage_is_held_during_the_warm_up():
 def test_a_large_capacitor_holds_the_voltage_and_a_large_coil_the_current():
     def run(circuit):
         thruster = ep.thruster.Thruster(series_resistance=2.0, circuit=circuit)
-        return simulate(thruster, POINT, **BRIEF)
+        return brief(thruster)
 
     plain = run(None)
     held = run(ep.thruster.Circuit(capacitance=1e-2))
@@ -103,10 +100,9 @@ def test_a_large_capacitor_holds_the_voltage_and_a_large_coil_the_current():
 def test_a_run_goes_on_with_its_circuit():
     thruster = ep.thruster.Thruster(circuit=ep.thruster.Circuit(inductance=1e-4, capacitance=1e-7))
     step = 1.5e-6
-    whole = simulate(thruster, POINT, **(BRIEF | {"duration_s": 200 * step}))
-    first = simulate(thruster, POINT, **(BRIEF | {"duration_s": 99 * step}))
-    rest = {"duration_s": 100 * step, "warm_up_s": 0.0, "initial": first}
-    second = simulate(thruster, POINT, **(BRIEF | rest))
+    whole = brief(thruster, duration_s=200 * step)
+    first = brief(thruster, duration_s=99 * step)
+    second = brief(thruster, duration_s=100 * step, warm_up_s=0.0, initial=first)
     np.testing.assert_array_equal(whole["V_d"][100:], second["V_d"])
 
 
@@ -127,15 +123,13 @@ def test_a_voltage_is_read_from_a_file(tmp_path: Path):
     ("make", "message"),
     [
         (ep.thruster.Circuit, "an inductance or a capacitance: both are 0"),
-        (lambda: ep.thruster.Circuit(-1.0), "inductance must be finite and zero or more"),
+        
         (
-            lambda: ep.thruster.Thruster(
-                series_resistance=0.0, circuit=ep.thruster.Circuit(inductance=1e-4)
-            ),
+            lambda: ep.thruster.Thruster(series_resistance=0.0, circuit=COIL),
             "a circuit must have a resistance, .*: series_resistance is 0",
         ),
         (lambda: ep.thruster.ModulatedVoltage(1.2, 1e4), "share must be below 1, .*: 1.2 came"),
-        (lambda: ep.thruster.ModulatedVoltage(0.1, 0.0), "frequency_Hz must be finite and pos"),
+        
         (lambda: ep.thruster.VoltageTable((0.0, 1.0), (300.0, 0.0)), "must be positive, got 0 V"),
         (
             lambda: driven(ep.thruster.VoltageTable((0.0, 1e-4), (300.0, 300.0))),
@@ -145,22 +139,31 @@ def test_a_voltage_is_read_from_a_file(tmp_path: Path):
             lambda: driven(ep.thruster.VoltageTable((0.0, 1.0), (280.0, 300.0))),
             "must be the supply's at t = 0: it is 300 V, and the table has 280 V",
         ),
-        (
-            lambda: ep.thruster.simulate_2d(
-                replace(ep.thruster.THRUSTER_2D, circuit=ep.thruster.Circuit(inductance=1e-4)),
-                progress=False,
-            ),
-            "does not solve a circuit; simulate along the axis alone",
-        ),
-        (
-            lambda: ep.thruster.simulate_2d(
-                operating_point=replace(ep.thruster.OPERATING_POINT_2D, supply=SINE),
-                progress=False,
-            ),
-            "does not solve a supply whose voltage varies; simulate along the axis alone",
-        ),
+        
+        
     ],
 )  # fmt: skip
 def test_what_no_circuit_can_be_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def bohm(z, t, plasma):
+    return 0.01
+
+
+@pytest.mark.parametrize(
+    ("thruster", "point", "words"),
+    [
+        ({"circuit": COIL}, {}, "a circuit"),
+        ({"transport": ep.thruster.FunctionTransport(bohm)}, {}, "a transport by a function"),
+        ({}, {"supply": SINE}, "a supply whose voltage varies"),
+        ({}, {"background": ep.thruster.Background(1e-3)}, "a background gas"),
+        ({}, {"neutral_speed": ep.thruster.NeutralSpeed([0.0, 1.0], [2e2, 3e2])}, "a neutral spe"),
+    ],
+)
+def test_the_z_r_model_refuses_what_it_does_not_solve(thruster, point, words):
+    shaped = replace(ep.thruster.THRUSTER_2D, **thruster)
+    driven_so = replace(ep.thruster.OPERATING_POINT_2D, **point)
+    with pytest.raises(ValueError, match=f"does not solve {words}"):
+        ep.thruster.simulate_2d(shaped, driven_so, progress=False)

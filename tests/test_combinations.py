@@ -19,17 +19,11 @@ from ep2sindy.systems.systems import lorenz
 
 def front(state: str, deviances: list[float]) -> ParetoFront:
     """Front of an empty candidate, then one for each of the terms a, b, c, ..."""
-    terms = ["", *"abcdefg"]
-    one = np.ones(1)
-    return ParetoFront(
-        state,
-        [
-            Candidate(
-                state, tuple(term), one[: len(term)], 0.0, 0.0, 0.0, one[: len(term)], deviance
-            )
-            for term, deviance in zip(terms, deviances, strict=False)
-        ],
-    )
+    candidates = []
+    for term, deviance in zip(["", *"abcdefg"], deviances, strict=False):
+        one = np.ones(len(term))
+        candidates.append(Candidate(state, tuple(term), one, 0.0, 0.0, 0.0, one, deviance))
+    return ParetoFront(state, candidates)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -81,19 +75,12 @@ def test_a_cap_keeps_the_true_terms_after_a_regression(formulation: Weak | Weigh
 
 
 def test_without_rows_the_best_by_r2_come_first() -> None:
-    fronts = [front("x", [0.0] * 3), front("y", [0.0] * 3)]
     scores = [(0.1, np.nan), (0.8, np.nan), (0.9, 0.2)]
     ranked = [
-        ParetoFront(
-            each.equation,
-            [
-                replace(c, deviance=None, r2_train=train, r2_test=test)
-                for c, (train, test) in zip(each.candidates, scores, strict=True)
-            ],
-        )
-        for each in fronts
+        replace(candidate, deviance=None, r2_train=train, r2_test=test)
+        for candidate, (train, test) in zip(front("x", [0.0] * 3).candidates, scores, strict=True)
     ]
-    assert combinations(ranked, 1).tolist() == [[1, 1]]
+    assert combinations([ParetoFront("x", ranked)], 1).tolist() == [[1]]
 
 
 def test_relations_hold_in_every_combination_that_a_cap_leaves() -> None:

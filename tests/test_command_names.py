@@ -41,18 +41,16 @@ def test_names_in_lists_and_mappings_may_have_any_letters() -> None:
     assert value_of("data.path=${oc.env:HOME}") == "${oc.env:HOME}"
 
 
-def test_a_comma_parts_jobs_of_a_sweep_unless_it_stands_in_a_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_a_comma_parts_jobs_of_a_sweep_unless_it_stands_in_a_name() -> None:
     (found,) = OverridesParser.create().parse_overrides([mend("data.path=a.csv,b.csv")])
     assert found.is_sweep_override()
     Path("a,b.csv").touch()
     assert value_of("data.path=a,b.csv") == "a,b.csv"
 
 
-@pytest.mark.parametrize("name", ["it's (1) ä.csv", "$a&b;日本.csv"])
-def test_what_inspect_prints_is_pasted_into_a_shell_and_runs(name: str, tmp_path: Path) -> None:
+def test_what_inspect_prints_is_pasted_into_a_shell_and_runs(tmp_path: Path) -> None:
+    name = "it's (1) ä$a&b;日本.csv"
     t = 1e-6 * np.arange(300)
     rows = np.column_stack([t, 2.0 + np.sin(1e5 * t), 2.0 + np.cos(1e5 * t)])
     np.savetxt(tmp_path / name, rows, delimiter=",", header="t_s,Düse_ä,b", comments="")
@@ -67,5 +65,5 @@ def test_what_inspect_prints_is_pasted_into_a_shell_and_runs(name: str, tmp_path
 
     shown = shell(f"{program} inspect {shlex.quote(name)}").splitlines()
     (line,) = (each.strip() for each in shown if "+exp=discover data" in each)
-    found = shell(f"{line.replace('ep2sindy', program, 1)} output=Ergebnisse_für")
+    found = shell(f"{line.replace('ep2sindy', program, 1)} forecasts=0 output=Ergebnisse_für")
     assert "Düse_ä' = " in found

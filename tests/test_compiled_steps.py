@@ -25,10 +25,7 @@ def test_compiled_steps_are_those_of_torchdiffeq(
 ) -> None:
     rng, variables = np.random.default_rng(0), sorted({*"xy", *("u" if case == "an input" else "")})
     library = ep.polynomial(variables, degree=3)
-    coef = np.zeros((len(library), 2))
-    for k, terms in enumerate(CASES[case].values()):
-        for name, value in terms.items():
-            coef[library.index(name), k] = value
+    coef = ep.coef_matrix(library, [*CASES[case].values()])
     scale, n_inputs = np.array([2.0, 0.5, 3.0])[: len(variables)], len(variables) - 2
     model = ep.SparseModel(library, ["x", "y"], coef)
     odes = [ODE(model, scale=scale, step_s=0.2) for _ in range(3)]

@@ -42,12 +42,9 @@ def test_leave_one_out_errors_are_those_of_fits_without_the_point(seed: int) -> 
     theta = LIBRARY.evaluate(POINTS) / np.linalg.norm(LIBRARY.evaluate(POINTS), axis=0)
 
     def left_out(columns: np.ndarray) -> np.ndarray:
-        errors = []
-        for k in range(6):
-            rest = np.arange(6) != k
-            coef = np.linalg.lstsq(columns[rest], values[rest], rcond=None)[0]
-            errors.append(values[k] - columns[k] @ coef)
-        return np.array(errors)
+        rest = [np.arange(6) != k for k in range(6)]
+        coef = [np.linalg.lstsq(columns[r], values[r], rcond=None)[0] for r in rest]
+        return values - (columns * coef).sum(axis=1)
 
     every = {}
     for size in (1, 2, 3):
@@ -66,11 +63,8 @@ def test_the_search_is_judged_by_points_it_never_saw() -> None:
     law = control_law(values, POINTS, LIBRARY)
     errors = []
     for k in range(6):
-        rest = np.arange(6) != k
-        errors.append(
-            values[k]
-            - control_law(values[rest], POINTS[rest], LIBRARY).predict(POINTS[k : k + 1])[0]
-        )
+        others = control_law(np.delete(values, k), np.delete(POINTS, k, axis=0), LIBRARY)
+        errors.append(values[k] - others.predict(POINTS[[k]])[0])
     assert law.search_error == pytest.approx(np.sqrt(np.mean(np.square(errors))) / values.mean())
 
 

@@ -105,27 +105,6 @@ def test_missing_interaction_is_learned_and_named() -> None:
 
 
 @pytest.mark.slow
-def test_parts_are_ambiguous_and_their_sum_is_not() -> None:
-    """The network takes a share of the term x, and the sum with the model gives it back."""
-    rng = np.random.default_rng(0)
-    found = refine_with_correction(
-        known_part(), [PREY.trajectory(noise=0.01, rng=rng)], network(2, 2), window=25,
-        n_windows=20, seed=rng,
-    )  # fmt: skip
-    assert found.status == "converged"
-    assert found.loss < 1e-3 * found.loss_before
-    library = polynomial(["x", "y"], degree=2)
-    equations = [dict(found.model.terms(s)) for s in ("x", "y")]
-    for terms, candidate in zip(equations, named(found, library), strict=True):
-        for name, value in candidate.coef_by_term.items():
-            terms[name] = terms.get(name, 0.0) + value
-    whole = SparseModel(library, ["x", "y"], coef_matrix(library, equations))
-    assert (whole.coef != 0.0).tolist() == (PREY.model.coef != 0.0).tolist()
-    used = PREY.model.coef != 0.0
-    np.testing.assert_allclose(whole.coef[used], PREY.model.coef[used], rtol=0.03)
-
-
-@pytest.mark.slow
 def test_rescaled_units_change_the_learned_term_and_nothing_else() -> None:
     model = known_part()
     big = replace(data(), states=data().states * DENSITY, t=data().t * 1e-6)

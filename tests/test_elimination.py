@@ -12,19 +12,17 @@ from ep2sindy.systems.systems import lotka_volterra
 
 PREY = lotka_volterra()
 LIBRARY = polynomial(["x", "y"], degree=2)
+SETTINGS = ep.RefinementSettings(n_windows=10)
 
 
 def widened(truth: SparseModel, n_spurious: int, rng: np.random.Generator) -> SparseModel:
     """The truth, off by up to 10 %, with spurious quadratic terms of small coefficients."""
-    library = polynomial(truth.states, degree=2)
-    names = list(dict.fromkeys([*truth.library.names, *library.names]))
-    library = ep.named_terms(truth.states, names)
-    coef = np.zeros((len(library), len(truth.states)))
-    for k, state in enumerate(truth.states):
-        for term, value in truth.terms(state).items():
-            coef[library.index(term), k] = value * (1.0 + 0.1 * rng.uniform(-1.0, 1.0))
-        free = np.flatnonzero(coef[:, k] == 0.0)
-        coef[rng.choice(free, n_spurious, replace=False), k] = 0.02
+    names = dict.fromkeys([*truth.library.names, *polynomial(truth.states, degree=2).names])
+    library = ep.named_terms(truth.states, list(names))
+    coef = ep.coef_matrix(library, [truth.terms(state) for state in truth.states])
+    coef *= 1.0 + 0.1 * rng.uniform(-1.0, 1.0, coef.shape)
+    for column in coef.T:
+        column[rng.choice(np.flatnonzero(column == 0.0), n_spurious, replace=False)] = 0.02
     return SparseModel(library, truth.states, coef)
 
 
@@ -36,7 +34,7 @@ def support(model: SparseModel) -> dict[str, set[str]]:
 def test_spurious_terms_go_and_the_truth_is_recommended(noise: float) -> None:
     runs = [PREY.trajectory(noise=noise, rng=0)]
     model = widened(PREY.model, 2, np.random.default_rng(1))
-    found = ep.eliminate(model, runs, n_settings(), min_free=2, seed=0)
+    found = ep.eliminate(model, runs, SETTINGS, min_free=2, seed=0)
     assert support(found.model) == support(PREY.model)
     assert found.best == 4
     assert [np.count_nonzero(r.model.coef) for r in found.refinements] == [8, 7, 6, 5, 4, 3, 2]
@@ -44,16 +42,12 @@ def test_spurious_terms_go_and_the_truth_is_recommended(noise: float) -> None:
     assert found.refinement.status == "converged"
 
 
-def n_settings() -> ep.RefinementSettings:
-    return ep.RefinementSettings(n_windows=10)
-
-
 def test_eighteen_terms_of_four_states_come_down_to_the_truth() -> None:
     case = cases()[0]
     run = record(case)
     fitted, later = run.window(0, 700), run.window(700, run.n_samples)
     model = widened(case.truth, 2, np.random.default_rng(1))
-    found = ep.eliminate(model, [fitted], n_settings(), min_free=9, run_over=later, seed=0)
+    found = ep.eliminate(model, [fitted], SETTINGS, min_free=9, run_over=later, seed=0)
     assert len(found.verdicts) == len(found.refinements) == len(found.scores)
     assert support(found.model) == support(case.truth)
     assert found.verdicts[found.best] == "alike"  # two frequencies: no cycle
@@ -64,12 +58,8 @@ def test_relations_hold_on_the_way_and_bound_terms_go_together() -> None:
     truth = PREY.model
     terms = {s: [*truth.terms(s)] for s in truth.states}
     both = {"x": [*terms["x"], "x^2"], "y": [*terms["y"], "x^2"]}
-    coef = np.zeros((len(LIBRARY), 2))
-    for k, state in enumerate(truth.states):
-        for term in both[state]:
-            value = truth.terms(state).get(term, 0.02 * (-1.0) ** k)
-            coef[LIBRARY.index(term), k] = value
-    model = SparseModel(LIBRARY, truth.states, coef)
+    equations = [{**truth.terms("x"), "x^2": 0.02}, {**truth.terms("y"), "x^2": -0.02}]
+    model = SparseModel(LIBRARY, truth.states, ep.coef_matrix(LIBRARY, equations))
     known = truth.terms("x")[terms["x"][0]]
     relations = ep.constraint(
         LIBRARY, both, ["x: x^2 == -1 * y: x^2", f"x: {terms['x'][0]} == {known}"]
@@ -89,13 +79,11 @@ def test_relations_hold_on_the_way_and_bound_terms_go_together() -> None:
 def test_the_path_ends_where_a_state_would_lose_its_last_term() -> None:
     t = np.linspace(0.0, 3.0, 200)
     states = np.column_stack([np.exp(-t), np.exp(-2.0 * t)])
-    run = Trajectory(
-        t, states + 1e-3 * np.random.default_rng(0).normal(size=states.shape), ["x", "y"]
-    )
-    coef = np.zeros((len(LIBRARY), 2))
-    coef[LIBRARY.index("x"), 0], coef[LIBRARY.index("y"), 1] = -1.0, -2.0
+    states += 1e-3 * np.random.default_rng(0).normal(size=states.shape)
+    run = Trajectory(t, states, ["x", "y"])
+    coef = ep.coef_matrix(LIBRARY, [{"x": -1.0}, {"y": -2.0}])
     model = SparseModel(LIBRARY, ["x", "y"], coef)
-    found = ep.eliminate(model, [run], n_settings(), seed=0)
+    found = ep.eliminate(model, [run], SETTINGS, seed=0)
     assert len(found.refinements) == 1
     with pytest.raises(ValueError, match="min_free must be a whole number, one or more: 0 came"):
         ep.eliminate(model, [run], min_free=0, seed=0)

@@ -7,13 +7,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import coef_matrix
-from ep2sindy.systems.systems import (
-    System,
-    damped_oscillator,
-    lorenz,
-    lotka_volterra,
-    van_der_pol,
-)
+from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 
 SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
 

@@ -25,9 +25,7 @@ def driven(u: np.ndarray, noise: float = 0.0) -> Trajectory:
     for k in range(len(T) - 1):
         x[k + 1] = decay * x[k] + 2 * (1 - decay) * u[k]
     x += noise * x.std() * np.random.default_rng(0).standard_normal(len(T))
-    return Trajectory(
-        t=T, states=x[:, None], state_names=["x"], inputs=u[:, None], input_names=["u"]
-    )
+    return Trajectory(T, x[:, None], ["x"], u[:, None], ["u"])
 
 
 def followed(run: Trajectory, form: Weak) -> NoisyRows:

@@ -8,7 +8,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.estimation.hidden import entrances
 from tests import programs
 
-RUN = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
+RUN = ep.lotka_volterra().trajectory(noise=0.01, rng=0).window(0, 250)
 LIBRARY = ep.polynomial(["x", "y"], degree=2)
 SEARCHES = [
     None,
@@ -56,19 +56,18 @@ def test_a_hidden_state_enters_by_no_excluded_term() -> None:
     [
         ({"terms": {"x": {"x": 0.6667}}}, r"relations=\['x: x == 0.6667'\]"),
         ({"terms": {"x": "x"}}, r"the terms of 'x' must be a list: 'x' came; write \['x'\]"),
-        ({"terms": {"x": ["x", 0.5]}}, "terms must hold names of terms, .*: 0.5 came for 'x'"),
-        ({"terms": {"x": 1}}, "terms must be a list for every state: 1 came for 'x'"),
         ({"terms": ["x"]}, r"terms must be lists of terms by state, .*: \['x'\] came"),
-        ({"exclude": ["x"]}, r"exclude must be lists of terms by state, .*: \['x'\] came"),
         ({"exclude": {"x": [1]}}, "exclude must hold names .*: 1 came for 'x'; the constant"),
         ({"exclude": {"z": ["x"]}}, r"unknown state 'z'; there are \['x', 'y'\]"),
+        ({"relations": ["z: x == 1"]}, r"unknown state 'z'; there are \['x', 'y'\]"),
+        ({"terms": {"x": []}}, r"an equation whose terms are given must have some: \['x'\]"),
+        ({"terms": {"x": ["y"]}, "relations": ["x: x == 1"]}, "is not in the support of"),
         ({"exclude": {"x": ["x^3"]}}, r"unknown term 'x\^3'; this library has \["),
         ({"exclude": {"x": LIBRARY.names}}, "exclude must leave terms to every .* all 6 of the"),
         (
             {"exclude": {"x": ["x"]}, "terms": {"x": ["x", "x*y"]}},
             "a term is excluded, or it is named in terms and relations: 'x' of 'x' came in both",
         ),
-        ({"exclude": {"x": ["x"]}, "relations": ["x: x == 1"]}, "'x' of 'x' came in both"),
         (
             {"exclude": {"x": ["x"]}, "roles": ep.Roles(outflow=["x"], inflow={"y": 1.0})},
             "relations, terms or exclude came as well; give roles alone",

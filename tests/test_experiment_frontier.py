@@ -1,21 +1,12 @@
-import re
 from pathlib import Path
 
-import pytest
-from omegaconf import DictConfig
-
-from ep2sindy.app.runner import run_config
-from tests import programs
-
-
-def composed(*overrides: str) -> DictConfig:
-    return programs.composed("+exp=frontier", *overrides)
+from tests.programs import composed, computed
 
 
 def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
     overrides = ["variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]"]
-    config = composed("parallel=serial", *overrides, f"output={tmp_path}")
-    frontier = programs.computed(config)
+    config = composed("+exp=frontier", "parallel=serial", *overrides, f"output={tmp_path}")
+    frontier = computed(config)
     points = frontier.summary["points"]
     assert len(points) == 8
     found = {(p["variant"], p["rate_Hz"], p["duration_s"]): p["identified"] for p in points}
@@ -26,19 +17,3 @@ def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
     lowest = frontier.outcome.tables()["lowest_rates"].set_index("variant")
     assert lowest.loc["STLSQ", "40 s"] == 20.0
     frontier.check_figures(*frontier.outcome.figures())
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["variants=[STLSG]"], "unknown variants ['STLSG']; there are ['"),
-        (["rates_Hz=[0]"], "rates_Hz[0] must be numbers, above zero: 0 came"),
-        (["durations_s=10"], "durations_s must be a list such as [a,b]"),
-        (["parallel.n_jobs=0"], "n_jobs must be a number of processes"),
-    ],
-)
-def test_frontier_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, tmp_path: Path
-) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        run_config(composed(*overrides, f"output={tmp_path}"))

@@ -1,4 +1,3 @@
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -6,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf.errors import OmegaConfBaseException
 
 import ep2sindy as ep
 from ep2sindy.app.runner import run_config
@@ -14,32 +12,29 @@ from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.free_run import free_run
-from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Text
 from ep2sindy.runtime.files import write_json
 from ep2sindy.studies.libraries import Study
 from ep2sindy.studies.library_result import REPLACED
-from ep2sindy.studies.living import run_title
-from ep2sindy.systems.systems import lotka_volterra
-from tests.browser import seen
-from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed, on_file
+from tests.models import model_of
+from tests.programs import ROOT, Computed, composed, computed, on_file, summary_of
 
-NO_LIVING = ("living=none", "held_out=null")
+NO_LIVING = ("living=none", "held_out=null", "forecasts=0")
 
 
 def breathing(path: Path, output: Path) -> list[str]:
     """Overrides that run `+exp=breathing` on a file."""
     return [
-        *on_file("breathing", path, output),
-        "data.variables.R_ion.name=R_ion",
-        "data.variables.u_iz.name=u_iz",
+        "+exp=breathing",
+        *on_file(path, output, "R_ion", "u_iz"),
         "bootstraps.n=4",
         "living=free",  # predator and prey conserve nothing
         "living.search.max_terms=2",  # as many as the truth has
         "+living.selection.n_windows=6",
         "+living.selection.n_folds=2",
         "rollout_s=1.0e-3",
+        "forecasts=2",
     ]
 
 
@@ -56,16 +51,17 @@ def breathing_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory)
     return run_config(composed(*breathing(predator_prey, output)))
 
 
-def test_two_densities_alone_leave_out_what_needs_more(predator_prey: Path, tmp_path: Path) -> None:
+def test_two_densities_alone_leave_out_what_needs_more_and_a_seed_fixes_what_is_found(
+    predator_prey: Path, tmp_path: Path
+) -> None:
     given = [text for text in plain(predator_prey, tmp_path) if "variables" not in text]
-    found = computed(composed(*given))
+    found, again = (computed(composed(*given)) for _ in range(2))
+    for name, each in (("one", found), ("other", again)):
+        write_json(tmp_path / name, each.summary)
+    assert (tmp_path / "one").read_text() == (tmp_path / "other").read_text()
     assert set(found.summary["models"]) == {"simple"}
     assert "the library ionization is left out: the data have no R_ion" in found.log
     assert "the library velocity is left out: the data have no R_ion, u_iz" in found.log
-
-
-def summary_of(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
 
 
 def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
@@ -78,8 +74,6 @@ def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
     assert neutrals["terms"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=0.02)
     assert simple["trajectory"]["f_kHz"] == pytest.approx(summary["data"]["f_kHz"], rel=0.02)
     assert set(summary["models"]) == {"simple", "ionization", "velocity"}
-    for key in ("n_terms", "r2_test", "d_pareto", "text"):
-        assert key in ions
 
 
 def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
@@ -102,130 +96,34 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert len(terms) == 4
     assert all(each["without_verdict"] != "lives" for each in terms.values())
     assert found["simple"]["balance"]["processes"] == []
-    page = (breathing_run / "report.html").read_text()
-    assert "spread over windows from" in page
     for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
-        assert f'id="figure-{figure}"' in page
         assert (breathing_run / "figures" / f"{figure}.png").is_file()
-    names = {path.name for path in (breathing_run / "tables").iterdir()}
-    assert {"living.csv", "coefficients_living.csv", "terms_simple.csv"} <= names
-    assert "balance_simple.csv" not in names
-    assert "simple: a model that lives" in (breathing_run / "run.log").read_text()
-
-
-def test_a_run_without_a_period_is_not_said_to_keep_none() -> None:
-    model = lotka_volterra().model
-    run = free_run(model, lotka_volterra().trajectory())
-    assert run_title(run).endswith(f"in phase for {round(run.periods)} periods")
-    assert run_title(replace(run, periods=np.nan)).endswith("over held-out time")
+    for table in ("living", "coefficients_living", "terms_simple"):
+        assert (breathing_run / "tables" / f"{table}.csv").is_file()
 
 
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:
     folder = breathing_run
-    files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-    assert {
-        "config.yaml",
-        "provenance.json",
-        "run.log",
-        "summary.json",
-        "report.html",
-        "models/simple.json",
-        "tables/front_velocity.csv",
-        "tables/comparison.csv",
-        "figures/data.png",
-        "figures/trajectories.png",
-    } <= files
-    assert any(name.startswith("tensorboard/events") for name in files)
+    files = ["config.yaml", "provenance.json", "tables/front_velocity.csv", "tables/comparison.csv"]
+    for name in [*files, "figures/data.png", "figures/trajectories.png"]:
+        assert (folder / name).is_file(), name
+    assert list(folder.glob("tensorboard/events*"))
     model = SparseModel.load(folder / "models" / "simple.json")
     assert model.terms("n_i") == summary_of(folder)["models"]["simple"]["equations"]["n_i"]["terms"]
-    said = "".join((folder / "run.log").read_text().split())
-    load = re.search(r"load:(.*?)open:", said)
-    assert load is not None
-    assert eval(load[1], {"ep": ep}).states == model.states
-    page = (folder / "report.html").read_text()
-    for image in ("data", "phase", "front_simple"):
-        assert f'id="figure-{image}"' in page
-        assert f"figures/{image}.png" in files
-
-
-@pytest.mark.parametrize("width_px", [1280, 390])
-def test_a_page_is_whole_and_readable_in_a_browser(breathing_run: Path, width_px: int) -> None:
-    page = breathing_run / "report.html"
-    questions = {
-        "hovers": "document.querySelectorAll('figure svg title').length",
-        "first": "document.querySelector('figure svg title').textContent",
-        "equations": "document.querySelectorAll('math').length",
-        "ends": "document.querySelector('#found').getBoundingClientRect().bottom + scrollY",
-        "flat": "[...document.querySelectorAll('math')].filter(m => !m.clientHeight && "
-        "!m.getBoundingClientRect().height).length",
-    }
-    found = seen(page, width_px, questions=questions)
-    assert [url for url in found.asked if not url.startswith("data:")] == [page.as_uri()]
-    assert found.console == []
-    assert (found.figures, found.empty) == (12, 0)
-    assert found.scroll_px <= width_px  # what is wider scrolls in itself
-    assert found.answers["hovers"] > 20
-    assert found.answers["first"].startswith("n_i' of 0 terms: none\n1 - R2 = ")
-    assert found.answers["equations"] > 20
-    assert found.answers["flat"] == 0
-    assert found.answers["ends"] < (
-        900 if width_px > 700 else 2 * 900
-    )  # on the first screen or two
 
 
 def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) -> None:
     page = (breathing_run / "report.html").read_text()
-    for words in (
-        "Discover a model with every library",  # the study's own words
-        "1200 samples of 1.5 µs",
-        "BestSubset (max_terms 4",
-        "How to reproduce",
-        "max_terms: 4",  # the whole config
-    ):
-        assert words in page
+    assert "BestSubset (max_terms 4" in page
+    assert "max_terms: 4" in page  # the whole config
     summary = summary_of(breathing_run)
     assert summary["headline"]["simple/f_kHz"] == summary["models"]["simple"]["trajectory"]["f_kHz"]
 
 
-def test_a_fixed_seed_gives_the_same_summary(predator_prey: Path, tmp_path: Path) -> None:
-    small = ["~libraries.ionization", "~libraries.velocity"]
-    texts = []
-    for seed in (0, 0, 1):
-        given = [*plain(predator_prey, tmp_path), *small, f"seed={seed}"]
-        write_json(tmp_path / "summary.json", computed(composed(*given)).summary)
-        texts.append((tmp_path / "summary.json").read_text())
-    assert texts[0] == texts[1] != texts[2]
-
-
-def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
-    t = np.linspace(0.0, 20.0, 1001)
-    damped = 3.0 * np.sqrt(1 - 0.01)
-    x = np.exp(-0.3 * t) * np.cos(damped * t)
-    v = -0.3 * x - damped * np.exp(-0.3 * t) * np.sin(damped * t)
-    table = np.column_stack([t, x, v])
-    path = tmp_path / "run.csv"
-    np.savetxt(path, table, delimiter=",", header="time,x,v", comments="")
-    config = composed(
-        *on_file("discover", path, tmp_path),
-        "data.z.name=null",
-        "data.variables.n_i.name=null",
-        "data.variables.n_n.name=null",
-        "+data.variables.x.name=x",
-        "+data.variables.x.unit=1",
-        "+data.variables.v.name=v",
-        "+data.variables.v.unit=1",
-        "trajectory.states=[x,v]",
-        "search=best_subset",
-    )
-    found = computed(config).summary["models"]["model"]["equations"]
-    assert found["x"]["terms"] == pytest.approx({"v": 1.0}, rel=0.01)
-    assert found["v"]["terms"]["x"] == pytest.approx(-9.0, rel=0.05)
-
-
 def test_a_record_too_short_for_forecasts_is_searched_without(tmp_path: Path) -> None:
     t = np.arange(21.0)
-    table = np.column_stack([t, np.cos(0.5 * t), np.sin(0.5 * t)])
-    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="time_s,x,y", comments="")
+    run = ep.Trajectory(t, np.column_stack([np.cos(0.5 * t), np.sin(0.5 * t)]), ["x", "y"])
+    run.to_dataframe().to_csv(tmp_path / "run.csv")
     found = computed(
         composed(
             "+exp=discover", "data=recognised", f"data.path={tmp_path / 'run.csv'}",
@@ -241,9 +139,8 @@ def test_a_record_too_short_for_forecasts_is_searched_without(tmp_path: Path) ->
 @pytest.fixture(scope="module")
 def years(tmp_path_factory: pytest.TempPathFactory) -> Computed:
     """Predator and prey over thirty years, counted three times a year with 2 % of noise."""
-    library = polynomial(["hare", "lynx"], degree=2)
-    terms = [{"hare": 0.6, "hare*lynx": -0.03}, {"lynx": -0.9, "hare*lynx": 0.03}]
-    model = SparseModel(library, ["hare", "lynx"], coef_matrix(library, terms))
+    terms = {"hare": {"hare": 0.6, "hare*lynx": -0.03}, "lynx": {"lynx": -0.9, "hare*lynx": 0.03}}
+    model = model_of(terms)
     t = np.linspace(0.0, 30.0, 91)
     states = model.simulate(t, [20.0, 10.0]).states
     states = states + 0.02 * states.std(axis=0) * np.random.default_rng(0).normal(size=states.shape)
@@ -255,7 +152,7 @@ def years(tmp_path_factory: pytest.TempPathFactory) -> Computed:
         "data.time.unit=year", "data.variables.n_i.name=null", "data.variables.n_n.name=null",
         "+data.variables.hare.name=hare", "+data.variables.hare.unit=1",
         "+data.variables.lynx.name=lynx", "+data.variables.lynx.unit=1",
-        "trajectory.states=[hare,lynx]", "search=joint", f"output={folder}",
+        "trajectory.states=[hare,lynx]", "search=joint", "forecasts=0", f"output={folder}",
     )  # fmt: skip
     return computed(config)
 
@@ -266,8 +163,7 @@ def test_a_record_in_years_reads_in_years_and_is_kept_in_seconds(years: Computed
     # The estimator's own standard error at this noise is about one per cent.
     assert found == pytest.approx({"hare": 0.6 / year, "hare*lynx": -0.03 / year}, rel=0.05)
     assert years.summary["data"]["dt_s"] == pytest.approx(year / 3.0)
-    for words in ("91 samples of 0.3333 years", " per year", "candidates for hare' [year^-1]"):
-        assert words in years.log
+    assert "91 samples of 0.3333 years" in years.log
     assert "Hz" not in years.log
     mine = re.search(r"hare' = (\S+) hare - (\S+) hare lynx  <- selected", years.log)
     assert mine is not None
@@ -283,12 +179,8 @@ def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
     noise = [found["noise_std"][name] / s for name, s in zip(("hare", "lynx"), spread, strict=True)]
     assert noise == pytest.approx([0.02, 0.02], rel=0.25)
     assert (found["flow_error"], found["misfit"], found["few"]) == (0.0, None, None)
-    for text in (years.log, years.page):
-        for words in ("what the samples say", "noise of the samples", "memory"):
-            assert words in text
     said = " ".join(years.log.split())
     assert "The model explains the samples as far as their noise" in said
-    assert "share" not in said  # there are no bootstraps
     assert "95 % from" in years.page
 
 
@@ -301,21 +193,13 @@ def test_a_report_says_if_the_samples_speak_of_another_model(years: Computed) ->
     assert REPLACED in [block.text for block in other.blocks if isinstance(block, Text)]
 
 
-@pytest.mark.parametrize("search", ["adaptive_lasso", "stlsq", "best_subset"])
-def test_every_search_runs(search: str, predator_prey: Path, tmp_path: Path) -> None:
-    more = ("trajectory.states=[n_i,n_n]", f"search={search}")
-    config = composed(*on_file("discover", predator_prey, tmp_path, *more))
-    equations = computed(config).summary["models"]["model"]["equations"]
-    assert set(equations["n_i"]["terms"]) == {"n_i", "n_i*n_n"}
-
-
 def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_path: Path) -> None:
     found = computed(
         composed(
-            "+exp=discover", "data=file", f"data.path={predator_prey}", f"output={tmp_path}",
+            "+exp=discover", *on_file(predator_prey, tmp_path),
             "trajectory.states=[n_i,n_n]", "search=best_subset", "search.max_terms=2",
             "selection=free_run", "selection.n_windows=6", "selection.n_folds=2", "depth=1",
-            "bootstraps.n=4",
+            "bootstraps.n=4", "forecasts=0",
         )
     )  # fmt: skip
     model = found.summary["models"]["model"]
@@ -326,23 +210,20 @@ def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("formulation", "selection"),
+    ("formulation", "search", "selection"),
     [
-        ("differential", "knee"),
-        ("kalman", "log_knee"),
-        ("kalman", "ebic"),
-        ("weak", "knee"),
-        ("weak", "ebic"),
-        ("weighted_weak", "ebic"),
-        ("weak_boxes", "knee"),
+        ("differential", "adaptive_lasso", "knee"),
+        ("kalman", "best_subset", "log_knee"),
+        ("weak", "stlsq", "ebic"),
+        ("weighted_weak", "best_subset", "ebic"),
+        ("weak_boxes", "best_subset", "knee"),
     ],
 )
-def test_every_formulation_and_selection_finds_predator_and_prey(
-    formulation: str, selection: str, predator_prey: Path, tmp_path: Path
+def test_every_formulation_search_and_selection_finds_predator_and_prey(
+    formulation: str, search: str, selection: str, predator_prey: Path, tmp_path: Path
 ) -> None:
-    config = composed(
-        *breathing(predator_prey, tmp_path), f"formulation={formulation}", f"selection={selection}"
-    )
+    chosen = (f"formulation={formulation}", f"search={search}", f"selection={selection}")
+    config = composed(*plain(predator_prey, tmp_path), *chosen)
     study = study_of(Study, config)
     run = study.source.trajectory.trajectory(study.source.field(), inputs=[], label="")
     found = discover(run, polynomial(["n_i", "n_n"], degree=2), study.method, seed=0)
@@ -368,85 +249,22 @@ def test_a_selection_on_the_command_line_is_every_librarys(rule: str, tmp_path: 
 def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
     predator_prey: Path, tmp_path: Path
 ) -> None:
-    result = computed(
-        composed(
-            *plain(predator_prey, tmp_path),
-            "formulation=weak",
-            "selection=ebic",
-            "depth=2",
-            "~libraries.ionization",
-            "~libraries.velocity",
-        )
-    )
+    chosen = ["formulation=weak", "selection=ebic", "depth=2"]
+    left_out = ["~libraries.ionization", "~libraries.velocity"]
+    result = computed(composed(*plain(predator_prey, tmp_path), *chosen, *left_out))
     found = result.summary["models"]["simple"]["equations"]
-    # The field was integrated to 1e-8; bumps add no error of their own.
-    assert found["n_i"]["terms"] == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=1e-6)
     assert np.isnan(found["n_i"]["r2_test"])
     front = result.outcome.tables()["front_simple"]
     for state, rows in front.groupby("equation"):
         assert rows.loc[rows["selected"], "EBIC"].item() == rows["EBIC"].min()
         assert found[state]["EBIC"] == pytest.approx(rows["EBIC"].min())
         assert rows["n_terms"].value_counts().max() == 2
-    for words in ("selection: EBIC(gamma=1.0", "R2 train", "weighted: n_i' = -1.64e+05 n_i"):
-        assert words in result.log
+    assert "weighted: n_i' = -1.64e+05 n_i" in result.log
 
 
 def test_a_library_may_have_a_knee_norm_of_its_own(breathing_run: Path) -> None:
     log = (breathing_run / "run.log").read_text()
-    assert "6 terms in n_i, n_n; selection: Knee(n_norm='library', scale='linear')" in log
     assert log.count("selection: Knee(n_norm='max_terms', scale='linear')") == 2
-
-
-def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
-    config = composed(
-        "+exp=breathing",
-        "data.duration_s=0.3e-3",
-        "data.warm_up_s=0.0",
-        "data.n_cells=30",
-        "data.progress=false",
-        f"data.cache={tmp_path / 'cache'}",
-        "bootstraps.n=4",
-        "libraries.ionization.degree=2",
-        *NO_LIVING,
-        f"output={tmp_path}",
-    )
-    found = computed(config)
-    assert found.summary["data"]["n_samples"] == 201
-    assert "simulation: " in found.log
-    assert len(list((tmp_path / "cache").iterdir())) == 1
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["+search.max_term=3"], "unexpected keyword argument 'max_term'"),
-        (["selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
-        (["+libraries.simple.degre=3"], "libraries.simple may have"),
-        (["libraries.simple.degree=-1"], "degree must be a whole number, zero or more: -1"),
-        (["+seeds=1"], "unknown keys ['seeds']; near it is seed; there are "),
-        (["seed=abc"], "seed must be a whole number"),
-        (["depth=0"], "depth must be a whole number, one or more: 0 came"),
-        (["depth=1.5"], "depth must be a whole number: 1.5 came"),
-        (["libraries.simple.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
-        (["rollout_s=-1"], "rollout_s must be a positive number"),
-        (["trajectory.zone.z=[0.5,0.6]"], "a zone must hold grid points"),
-        (["libraries.simple.variables=[n_i,q]"], "unknown variables ['q']; this field has"),
-        (["bootstraps.n_culled=6"], "n_culled must leave a term: 6 of 6 would go"),
-        (
-            ["prepare=[{_target_:ep2sindy.prepare.crop,start:1}]"],
-            "prepare[0], crop: got an unexpected keyword argument 'start'",
-        ),
-        (["output=Makefile"], "choose another with output=PATH"),
-        (["~trajectory.states", "+trajectory.states=???"], "trajectory.states"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed(*breathing(predator_prey, tmp_path), *overrides)
-    with pytest.raises((ValueError, OSError, OmegaConfBaseException)) as caught:
-        run_config(config)
-    assert message in str(caught.value)
 
 
 def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> None:
@@ -455,12 +273,6 @@ def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> Non
         run_config(config)
     (folder,) = (tmp_path / "breathing").iterdir()
     assert "ended early: ValueError: n_culled must leave" in (folder / "run.log").read_text()
-
-
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_experiment_composes(name: str) -> None:
-    config = composed(f"+exp={name}")
-    assert config.experiment == name
 
 
 def test_a_sweep_can_go_to_slurm() -> None:

@@ -1,7 +1,5 @@
 """`+exp=simulate`: one run, a scan with points that break, and what studies say of simulations."""
 
-import json
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,13 +16,13 @@ from ep2sindy.figures.breathing import curves_figure, stability_figure
 from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies import parametric
 from ep2sindy.studies.points import point_sources
-from ep2sindy.studies.scan import Point, Simulated, run_point, scan_points, value_text
-from ep2sindy.studies.simulate import Outcome, Study
+from ep2sindy.studies.scan import scan_points
+from ep2sindy.studies.simulate import Outcome
 from ep2sindy.studies.source import DivergedError, amiss, check_recorded, compile_kernels, doubts
 from tests import programs
+from tests.programs import summary_of
 
 VOLTAGES = "scan={operating_point.voltage:[-5.0,250.0,300.0,5000.0]}"
-FIGURES = ("current", "spectrum", "profiles", "maps")
 GOOD = {
     "status": "oscillating", "cycle": "strong", "f_kHz": 14.0, "I_d_mean": 4.0, "I_d_std": 5.0,
     "parameters": "{}", "mass_balance": 1.0, "energy_balance": 0.9996, "rates": "covered",
@@ -55,10 +53,6 @@ def log_of(folder: Path) -> str:
     return " ".join((folder / "run.log").read_text().split())
 
 
-def summary_of(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
-
-
 @pytest.fixture(scope="module")
 def one(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_config(composed(*toy(tmp_path_factory.mktemp("one"))))
@@ -78,34 +72,24 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_keeps_its_field_and_says_what_it_did(one: Path, field: xr.Dataset) -> None:
     summary = summary_of(one)
-    assert (summary["experiment"], summary["file"]) == ("simulate", "field.nc")
     assert summary["status"] == field.attrs["status"] == "oscillating"
     assert summary["I_d_mean"] == pytest.approx(float(field["I_d"].mean()))
-    assert summary["I_beam_mean"] == pytest.approx(float(field["I_beam"].mean()))
     assert summary["thrust_N"] == pytest.approx(float(field["thrust"].mean()))
     assert summary["initial"] == "guessed profiles"
-    assert "warnings" not in summary
     power = summary["power_W"]
     parts = sum(value for name, value in power.items() if name != "P_in")
     assert parts == pytest.approx(power["P_in"])
     assert power["stored"] == pytest.approx(0.0, abs=0.02 * power["P_in"])  # nothing is lost
     log = log_of(one)
     assert f"oscillating, {summary['cycle']} cycle, from guessed profiles" in log
-    assert re.search(r"breathing frequency │ \d+\.\d\d kHz", log)
-    assert re.search(r"thrust │ \d+\.\d mN", log)
     assert "out/in mass 1.0000, energy 1.0000" in log
-    assert "work of the field on the ions" in log
 
 
 def test_every_figure_and_table_of_a_run_is_there(one: Path) -> None:
-    page = (one / "report.html").read_text()
-    for name in FIGURES:
+    for name in ("current", "spectrum", "profiles", "maps"):
         assert (one / "figures" / f"{name}.png").stat().st_size > 8e3
-        assert f'id="figure-{name}"' in page
     profiles = pd.read_csv(one / "tables" / "profiles.csv")
     assert len(profiles) == 24
-    for end in ("low", "high", "min", "max"):
-        assert f"n_n_{end}" in profiles
     assert (profiles["n_i_min"] <= profiles["n_i_low"]).all()
     assert (profiles["n_i_high"] <= profiles["n_i_max"]).all()
     assert {"performance.csv", "power.csv", "spectrum.csv"} <= {
@@ -113,19 +97,10 @@ def test_every_figure_and_table_of_a_run_is_there(one: Path) -> None:
     }
 
 
-def test_every_panel_of_a_run_shows_something(field: xr.Dataset) -> None:
+def test_figures_show_the_last_periods(field: xr.Dataset) -> None:
     window = breathing.last_periods(field["time"].values, field.attrs["f_kHz"], 3.0)
     seconds = float(np.ptp(field["time"].values[window]))
     assert seconds == pytest.approx(3e-3 / field.attrs["f_kHz"], abs=4e-6)
-    drawn = [
-        breathing.current_figure(field, window),
-        breathing.current_spectrum_figure(field, f_kHz=14.0, f_max_Hz=3e5, transit_Hz=6e4),
-        breathing.profile_figure(field),
-        breathing.space_time_figure(field, window),
-    ]
-    for figure in drawn:
-        assert figure.axes
-        assert all(ax.has_data() for ax in figure.axes)
 
 
 def test_fields_over_r_are_averaged_by_area(field: xr.Dataset) -> None:
@@ -140,7 +115,7 @@ def test_fields_over_r_are_averaged_by_area(field: xr.Dataset) -> None:
     np.testing.assert_allclose(breathing.along_z(both["n_i"]), expected, rtol=1e-5)
     outcome = Outcome(both, periods=3.0, f_max_Hz=None)
     for name, figure in outcome.figures().items():
-        assert figure.draw().axes
+        assert all(ax.has_data() for ax in figure.draw().axes)
         assert ("Averaged over r" in figure.caption) == (name in ("profiles", "maps"))
     assert outcome.tables()["profiles"]["n_i_mean"].to_numpy() == pytest.approx(
         expected.mean(axis=0), rel=1e-5
@@ -163,13 +138,9 @@ def test_a_point_that_breaks_keeps_its_row_and_the_others_stand(scan: Path) -> N
     log = log_of(scan)
     assert "4 points: 1 failed, 2 oscillating, 1 diverged" in log
     assert "operating_point.voltage=-5: OperatingPoint.voltage must be finite" in log
+    # One of the three that ran has diverged; one never ran.
+    assert len(list((scan.parents[2] / "cache").glob("*.nc"))) == 3
     assert (scan / "figures" / "curves.png").stat().st_size > 8e3
-    assert 'id="figure-curves"' in (scan / "report.html").read_text()
-
-
-def test_scanned_runs_are_kept(scan: Path) -> None:
-    (kept,) = [path for path in scan.parents if (path / "cache").exists()][:1]
-    assert len(list((kept / "cache").glob("*.nc"))) == 3  # one of them diverged, one never ran
 
 
 def test_a_scan_ends_where_its_runs_cannot_be_kept(tmp_path: Path) -> None:
@@ -184,25 +155,6 @@ def test_a_scan_where_nothing_can_be_run_is_an_error(tmp_path: Path) -> None:
     config = composed(*toy(tmp_path), "scan={operating_point.voltage:[-5.0,-6.0]}")
     with pytest.raises(ValueError, match="a scan needs a point that can be run: .*got -5"):
         run_config(config)
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("scan={operating_point.volts:[1]}", "data.operating_point.volts must be there"),
-        ("scan={thruster.transport.c:[1]}", "data.thruster.transport.c must be there"),
-        ("scan={n_cells:[]}", "scan must be like {operating_point.voltage: [250,300]}"),
-        ("scan={n_cells:30}", "scan must be like"),
-        ("scan={}", "scan must be like"),
-        ("scan={n_cells:[30,30]}", "each value once"),
-        ("figures.periods=0", "figures.periods must be a positive number"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused_before_a_run(
-    override: str, message: str, tmp_path: Path
-) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        study_of(Study, composed(*toy(tmp_path), override))
 
 
 def test_a_place_that_the_config_leaves_to_its_default_can_be_scanned() -> None:
@@ -232,28 +184,12 @@ def test_data_that_are_no_simulation_are_refused(predator_prey: Path, tmp_path: 
         run_config(composed(*on_file))
 
 
-def test_a_point_of_a_scan_without_a_simulation_says_the_way_out(
-    predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed("data=file", f"data.path={predator_prey}", f"output={tmp_path}")
-    found = run_point(Point({}, Configured(plain(config.data), "data")))
-    assert found.status == "failed"
-    assert "open_field gave none; choose data=simulation" in found.message
-
-
 def test_a_run_that_breaks_at_once_is_reported(tmp_path: Path) -> None:
     folder = run_config(composed(*toy(tmp_path), "data.operating_point.voltage=5000.0"))
     summary = summary_of(folder)
     assert (summary["status"], summary["n_samples"]) == ("diverged", 0)
     assert summary["warnings"] == ["the simulation diverged: the end of its record is no physics"]
-    assert "The run broke after 0 samples: there is nothing to draw." in log_of(folder)
     assert 'class="warning">the simulation diverged' in (folder / "report.html").read_text()
-
-
-def test_whoever_studies_a_run_that_broke_is_told_why(tmp_path: Path) -> None:
-    broken = [*toy(tmp_path)[:-1], "data.operating_point.voltage=5000.0"]
-    with pytest.raises(DivergedError, match="200 samples or more .* it diverged after 0; try"):
-        run_config(programs.composed("+exp=weak", *broken))
 
 
 def test_an_operating_point_that_broke_has_a_row_of_its_own(tmp_path: Path) -> None:
@@ -283,12 +219,8 @@ def test_a_stability_map_names_every_cell() -> None:
     texts = [text.get_text() for text in panel.texts]
     assert texts[0] == "0.00 A\n14.0 kHz\nweak"
     assert [text.splitlines()[-1] for text in texts[1:]] == list(STATUSES[1:])
-    assert texts[3] == "1.50 A\n14.0 kHz\ntransit"
     assert not any("A" in text for text in texts[5:])  # their current says nothing
-    hatches = [patch.get_hatch() for patch in panel.patches]
-    assert hatches[0] is None
-    assert len(set(hatches)) == len(STATUSES)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(STATUSES[1:])
+    assert len({patch.get_hatch() for patch in panel.patches}) == len(STATUSES)
 
 
 def test_more_parameters_have_a_panel_each() -> None:
@@ -300,10 +232,9 @@ def test_more_parameters_have_a_panel_each() -> None:
     assert all(len(ax.texts) == 4 for ax in panels)
 
 
-@pytest.mark.parametrize("along", ["x", "I_d_std"])
-def test_curves_tell_statuses_by_markers(along: str) -> None:
+def test_curves_tell_statuses_by_markers() -> None:
     points = rows([(s, "0", "a", s, 0.5 * k) for k, s in enumerate(STATUSES)])
-    figure = curves_figure(points, along, "voltage (V)")
+    figure = curves_figure(points, "x", "voltage (V)")
     assert all(ax.has_data() for ax in figure.axes)
     assert [t.get_text() for t in figure.legends[0].get_texts()] == list(STATUSES)
 
@@ -313,13 +244,10 @@ def test_curves_tell_statuses_by_markers(along: str) -> None:
     [
         ({}, None),
         ({"status": "steady"}, "the simulation is steady: there is no oscillation"),
-        ({"status": "decaying"}, "dies out"),
-        ({"status": "diverged"}, "the simulation diverged"),
         ({"status": "out"}, "the discharge has gone out"),
         ({"status": "transit", "f_kHz": 150.0}, "oscillates at 150 kHz, above 60 kHz"),
         ({"rates": "the rates of krypton cover T_e up to 100 eV"}, "the rates of krypton"),
         ({"mass_balance": 1.002}, "mass balance does not close: (out + stored)/in is 1.0020"),
-        ({"energy_balance": float("nan")}, "energy balance does not close"),
     ],
 )
 def test_what_is_amiss_with_a_simulation_is_said(change: dict, message: str | None) -> None:
@@ -354,23 +282,3 @@ def test_a_steady_simulation_warns_on_the_page_of_the_study_that_takes_it(tmp_pa
     assert found.warnings == [warning]
     assert f'<p class="warning">{warning}' in found.page
     assert warning in " ".join(found.log.split())
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (250.0, "250"),
-        (0.0077, "0.0077"),
-        ("BN", "BN"),
-        (None, "null"),
-        ([1, 2.5], "[1, 2.5]"),
-        ({"_target_": "ep2sindy.thruster.ColdStart"}, "ColdStart"),
-        ({"_target_": "ep2sindy.thruster.ColdStart", "n_i": 1e17}, "ColdStart(n_i=1e+17)"),
-    ],
-)
-def test_values_as_tables_have_them(value: object, text: str) -> None:
-    assert value_text(value) == text
-
-
-def test_a_failed_point_has_no_numbers() -> None:
-    assert dict(Simulated("failed", message="why").numbers) == {}

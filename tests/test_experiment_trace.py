@@ -1,4 +1,3 @@
-import json
 import re
 from functools import cache
 from pathlib import Path
@@ -9,7 +8,7 @@ from omegaconf import DictConfig
 
 import ep2sindy as ep
 from ep2sindy.app.runner import run_config
-from tests.programs import composed, computed
+from tests.programs import composed, computed, summary_of
 
 # A growth rate that damps towards a cycle, as those found in the discharge current do.
 CYCLE = {"1": 7.93e9, "I": -2.44e9, "I*g": 1.07e4, "g^3": -1.47e-6}
@@ -50,31 +49,8 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return scope(tmp_path_factory.mktemp("scope") / "scope.csv", *signal(24.0))
 
 
-def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_path: Path) -> None:
-    folder = run_config(composed(*toy(record, tmp_path)))
-    summary = json.loads((folder / "summary.json").read_text())
-    assert summary["signal"]["embedding"] == "HiddenStates"
-    assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
-    assert summary["states"]["2"]["unexplained"] is None
-    assert not summary["misfit"]
-    found = summary["model"]["equations"]
-    assert found["I"] == pytest.approx({"I*g": 1.0})
-    assert found["g"] == pytest.approx(CYCLE, rel=0.02)
-    for term, (low, high) in summary["model"]["intervals"]["g"].items():
-        assert low < CYCLE[term] < high
-    assert summary["living"]["verdict"] == "lives"
-    assert summary["living"]["waveform_error"] < 0.01
-    log = " ".join((folder / "run.log").read_text().split())
-    for words in ("explain the signal to its noise", "95 % from", "what the samples say"):
-        assert words in log
-    assert "smoothing" not in log
-    page = (folder / "report.html").read_text()
-    assert "supports that were weighed against each other" in page
-    assert "Error of the derivative" not in page
-
-
 def test_hidden_states_that_are_a_misfit_are_shown_if_they_are_asked_for(tmp_path: Path) -> None:
-    t = np.linspace(0.0, 60.0, 1201)
+    t = np.linspace(0.0, 50.0, 501)
     path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)  # no linear equations make it
     found = computed(composed(*glance(path, tmp_path, "embedding=hidden", "degree=1")))
     assert found.summary["signal"]["embedding"] == "HiddenStates"
@@ -84,9 +60,8 @@ def test_hidden_states_that_are_a_misfit_are_shown_if_they_are_asked_for(tmp_pat
 
 
 def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path: Path) -> None:
-    own = ("selection.n_starts=2", "embedding=log_rate")
-    folder = run_config(composed(*toy(record, tmp_path, *own)))
-    summary = json.loads((folder / "summary.json").read_text())
+    folder = run_config(composed(*toy(record, tmp_path, "embedding=log_rate")))
+    summary = summary_of(folder)
     living = summary["living"]
     assert living["verdict"] == "lives"
     assert living["held_out"] is True
@@ -99,9 +74,7 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
     assert summary["signal"]["embedding"] == "LogRate"
     assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
     log = (folder / "run.log").read_text()
-    for words in ("its growth rate, I and g (set)", "known: I' = 1 I g", "attracting", "1 known"):
-        assert words in log
-    page = (folder / "report.html").read_text()
+    assert "known: I' = 1 I g" in log
     assert "intervals are not given" in " ".join(log.split())  # of smoothed states
     assert summary["misfit"]
     forecast = summary["forecast"]
@@ -110,7 +83,6 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
     assert summary["states"]["2"]["error"] < 0.3
     for name in ("free_run", "plane", "waveform", "front", "forecast"):
         assert (folder / "figures" / f"{name}.png").exists()
-        assert f'id="figure-{name}"' in page
 
 
 @pytest.mark.parametrize("embedding", ["rate", "delays"])
@@ -131,26 +103,11 @@ def test_a_signal_of_either_sign_can_be_taken(embedding: str, tmp_path: Path) ->
         assert "I_before" in found.log
 
 
-@pytest.mark.slow
-def test_fine_samples_are_averaged_by_default(tmp_path: Path) -> None:
-    t, x = signal(12.0)
-    fine = np.linspace(t[0], t[-1], 4 * len(t))
-    path = scope(tmp_path / "scope.csv", fine, np.interp(fine, t, x))
-    taken = computed(composed(*glance(path, tmp_path)))
-    assert "means over 2 samples" in taken.log
-    assert taken.summary["data"]["n_samples"] == len(fine) // 2
-    kept = computed(composed(*glance(path, tmp_path, "decimate=null")))
-    assert kept.summary["data"]["n_samples"] == len(fine)
-
-
 def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path: Path) -> None:
-    run = ep.lorenz().trajectory()
+    run = ep.lorenz().trajectory().window(0, 2500)
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
-    smoothed = ("degree=2", "embedding=rate")
-    found = computed(composed(*glance(path, tmp_path, *smoothed)))
+    found = computed(composed(*glance(path, tmp_path, "degree=2", "embedding=rate")))
     assert set(found.summary["states"]) == {"2", "3"}
-    set_to_two = computed(composed(*glance(path, tmp_path, *smoothed, "n_states=2")))
-    assert set(set_to_two.summary["states"]) == {"2"}
 
 
 @pytest.mark.slow
@@ -180,10 +137,7 @@ def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
         (lambda t, x: (t[:200], x[:200]), [], "must hold 6 periods or more"),
         (lambda t, x: (t, np.random.default_rng(0).random(len(t))), [], "must oscillate"),
         (lambda t, x: (t, x - 1.0), ["embedding=log_rate"], "needs a positive signal: I falls"),
-        (lambda t, x: (t, x), ["embedding=log"], "embedding must be auto, hidden or log_rate or"),
         (lambda t, x: (t, x), ["n_states=some"], "n_states must be auto or a number: 'some' came"),
-        (lambda t, x: (t, x), ["decimate=0"], "decimate must be auto, null or a whole number"),
-        (lambda t, x: (t, x), ["signal=V"], "has no variable 'V'"),
     ],
 )
 def test_what_cannot_be_taken_is_refused(change, more, message, tmp_path: Path) -> None:
@@ -228,6 +182,21 @@ def test_a_mean_that_was_lost_is_asked_for_and_given_back(tmp_path: Path) -> Non
     assert "offset=MEAN" not in given.log
 
 
+def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_path: Path) -> None:
+    trace = computed(composed(*toy(record, tmp_path)))
+    found = trace.summary
+    assert found["signal"]["embedding"] == "HiddenStates"
+    assert found["states"]["2"]["unexplained"] is None
+    assert not found["misfit"]
+    assert found["model"]["equations"]["I"] == pytest.approx({"I*g": 1.0})
+    assert found["model"]["equations"]["g"] == pytest.approx(CYCLE, rel=0.02)
+    for term, (low, high) in found["model"]["intervals"]["g"].items():
+        assert low < CYCLE[term] < high
+    assert found["living"]["verdict"] == "lives"
+    assert "explain the signal to its noise" in " ".join(trace.log.split())
+    assert "smoothing" not in trace.log
+
+
 def test_a_mean_that_was_lost_is_fitted_with_its_interval(tmp_path: Path) -> None:
     t, x = signal(12.0)
     noisy = x + 0.02 * x.std() * np.random.default_rng(0).standard_normal(len(x))
@@ -242,7 +211,7 @@ def test_a_mean_that_was_lost_is_fitted_with_its_interval(tmp_path: Path) -> Non
 
 
 def test_an_offset_that_no_equations_tell_is_refused(tmp_path: Path) -> None:
-    t = np.linspace(0.0, 60.0, 1201)
+    t = np.linspace(0.0, 50.0, 501)
     path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)
     with pytest.raises(ValueError, match=r"offset=fit asks for equations .* write offset=NUMBER"):
         computed(composed(*toy(path, tmp_path, "offset=fit", "degree=1")))
@@ -256,6 +225,7 @@ def test_discover_says_that_one_state_cannot_oscillate(record: Path, tmp_path: P
         "data.variables.n_i.name=null", "data.variables.n_n.name=null",
         "+data.variables.I.name=I", "+data.variables.I.unit=A", "trajectory.states=[I]",
         "search=best_subset", f"output={tmp_path}", "bootstraps.n=4",
+        "forecasts=0",
     )  # fmt: skip
     log = computed(config).log.replace("\n", " ")
     assert "one first-order equation cannot" in log

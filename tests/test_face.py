@@ -76,7 +76,6 @@ def test_editors_and_type_checkers_see_the_names(tmp_path: Path) -> None:
             "Eebic",
             r"no attribute 'Eebic'; see dir\(ep2sindy\); near it (is|are) ep2sindy.EBIC",
         ),
-        ("ep2sindy", "Trajectry", r"see dir\(ep2sindy\); near it (is|are) ep2sindy.Trajectory"),
         ("ep2sindy.thruster", "crop", r"see dir\(ep2sindy.thruster\); near it is .*prepare.crop$"),
         ("ep2sindy", "_nothing", r"no attribute '_nothing'; see dir\(ep2sindy\)$"),
     ],
@@ -106,19 +105,3 @@ def test_configs_name_what_is_for_configs() -> None:
     assert found
     ours = {name for name in found if not name.startswith("benchmarks.")}  # those of a checkout
     assert ours <= FOR_CONFIGS
-
-
-def test_torch_and_pandas_are_loaded_by_those_alone_who_use_them() -> None:
-    code = (
-        "import sys, ep2sindy as ep\n"
-        "ep.discover, ep.EBIC, ep.SparseModel, ep.refinement, ep.thruster\n"
-        "assert not {'torch', 'pandas', 'xarray', 'matplotlib', 'hydra'} & set(sys.modules)\n"
-        "sys.modules['torch'] = None  # whoever asks for it now is told that there is none\n"
-        "try:\n"
-        "    ep.refine\n"
-        "except ImportError as e:\n"
-        "    assert e.name == 'torch', e\n"
-        "else:\n"
-        "    raise AssertionError('ep.refine does not load torch')\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

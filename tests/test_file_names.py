@@ -10,17 +10,10 @@ import pytest
 
 from ep2sindy.app.arguments import mend
 from ep2sindy.app.schema import study_of
-from ep2sindy.library.library import polynomial
-from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.file_names import FilePattern, propose_pattern
 from ep2sindy.studies import parametric, predict
+from tests.models import lienard
 from tests.programs import Computed, composed, computed, ended
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 def touch(*paths: str) -> None:
@@ -29,7 +22,7 @@ def touch(*paths: str) -> None:
         path.touch()
 
 
-def test_each_file_is_a_point_in_the_order_of_its_quantities(folder: Path) -> None:
+def test_each_file_is_a_point_in_the_order_of_its_quantities(here: Path) -> None:
     names = ["V1000_m5.csv", "V200_m-4.5e0.csv", "V200_m5.csv", "V200_mold.csv", "V200_m5.csv.gz"]
     touch(*(f"runs/{name}" for name in names))
     points, others = FilePattern("runs/V{V}_m{m}.csv").points()
@@ -41,7 +34,7 @@ def test_each_file_is_a_point_in_the_order_of_its_quantities(folder: Path) -> No
     assert others == ["runs/V200_mold.csv"]
 
 
-def test_a_pattern_takes_signs_of_the_shell_and_a_quantity_twice(folder: Path) -> None:
+def test_a_pattern_takes_signs_of_the_shell_and_a_quantity_twice(here: Path) -> None:
     touch("V200/a_V200.csv", "V300/b_V300.csv", "V300/b_V200.csv", "V[1]/c_V4.csv")
     points, others = FilePattern("V{V}/?_V{V}.csv").points()
     assert [each["V"] for each in points.values()] == [200.0, 300.0]
@@ -54,19 +47,16 @@ def test_a_pattern_takes_signs_of_the_shell_and_a_quantity_twice(folder: Path) -
     [
         (["runs/V200_m4.5.csv", "runs/V300_m5.csv"], "runs/V{V_D_V}_m{mdot_mg_s}.csv"),
         (["200V_5mgs.csv", "300V_5mgs.csv"], "{V_D_V}V_5mgs.csv"),
-        (["200V-5mgs.csv", "300V-6mgs.csv"], "{V_D_V}V-{mdot_mg_s}mgs.csv"),
         (["run_V=200,m=4.csv", "run_V=300,m=5.csv"], "run_V={V_D_V},m={mdot_mg_s}.csv"),
         (["a_-1.csv", "a_2.5e-3.csv"], "a_{a}.csv"),
-        (["1.5.csv", "2.csv"], "{p}.csv"),
         (["x1_1.csv", "x2_2.csv"], "x{x}_{p}.csv"),
         (["data1.csv", "data2.csv"], "data{p}.csv"),  # `data` is a key of every point
         (["a.csv", "b.csv"], None),
         (["a1.csv"], None),
-        (["a1.csv", "b2.csv"], None),
     ],
 )
 def test_a_pattern_is_proposed_where_names_differ_in_numbers(
-    files: list[str], pattern: str | None, folder: Path
+    files: list[str], pattern: str | None, here: Path
 ) -> None:
     touch(*files)
     found = propose_pattern(files)
@@ -79,15 +69,12 @@ def test_a_pattern_is_proposed_where_names_differ_in_numbers(
     ("text", "message"),
     [
         ("runs/a.csv", "need a pattern with a placeholder for each quantity, like 'points.files="),
-        ("runs/{V.csv", "need a pattern with a placeholder for each quantity"),
         ("runs/{a b}.csv", "a placeholder must be the name of a quantity, .*: 'a b' came"),
         ("runs/{data}.csv", "a placeholder must be .* and not 'data', .*: 'data' came"),
         ("runs/W{V}.csv", r"no file fits .* 1 files beside it: runs/V1.csv \.\.\."),
-        ("none/{V}.csv", "no file fits the pattern 'none/{V}.csv' in .* there are 0 files beside"),
-        ("runs/V1{V}.csv", "no file fits the pattern .* a number in the place of each"),
     ],
 )
-def test_a_pattern_that_cannot_be_is_refused(text: str, message: str, folder: Path) -> None:
+def test_a_pattern_that_cannot_be_is_refused(text: str, message: str, here: Path) -> None:
     touch("runs/V1.csv")
     with pytest.raises(ValueError, match=message):
         FilePattern(text).points()
@@ -110,15 +97,10 @@ def test_the_pattern_may_be_typed_in_any_form(typed: str) -> None:
 
 
 def swing(folder: Path, *values: float) -> None:
-    """Lienard's van der Pol over one parameter, by its name; a period takes seven seconds."""
-    library = polynomial(["n_i", "n_n"], degree=3)
+    """Lienard's van der Pol over one parameter, by its name."""
     for a in values:
-        terms = [{"n_i": a, "n_n": -1.0, "n_i^3": -0.3}, {"n_i": 1.0}]
-        model = SparseModel(library, ["n_i", "n_n"], coef_matrix(library, terms))
-        states = model.simulate(0.1 * np.arange(1000), [1.0, 0.0]).states[300:]
-        table = pd.DataFrame(states, columns=["n_i [m^-3]", "n_n [m^-3]"])
-        table.insert(0, "time [s]", 0.1 * np.arange(700))
-        table.to_csv(folder / f"a{a}.csv", index=False)
+        table = lienard(a).to_dataframe().set_axis(["n_i [m^-3]", "n_n [m^-3]"], axis=1)
+        table.to_csv(folder / f"a{a}.csv", index_label="time [s]")
 
 
 def predicted(folder: Path, terms: str, *more: str) -> Computed:
@@ -132,38 +114,33 @@ def predicted(folder: Path, terms: str, *more: str) -> Computed:
     )  # fmt: skip
 
 
-def test_files_make_a_law_over_the_quantity_of_their_names(folder: Path) -> None:
-    swing(folder, 0.6, 0.9, 1.2)
+def test_files_make_a_law_over_the_quantity_of_their_names(here: Path) -> None:
+    swing(here, 0.6, 0.9, 1.2)
     touch("aold.csv")
-    found = predicted(folder, "{n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}")
+    found = predicted(
+        here, "{n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}", "+models.own.known={n_n:{n_i:{1:1.0}}}"
+    )
     assert found.outcome.tables()["points"]["a"].tolist() == [0.6, 0.9, 1.2]
     (branch,) = found.outcome.branches.values()
     assert branch.law.model_at({"a": 1.0}).terms("n_i")["n_i"] == pytest.approx(1.0, abs=1e-3)
     assert "left out, for their names hold no number there: aold.csv" in found.log
     assert not [text for text in found.warnings if "lives by the law" in text]
-    assert "known inflow" not in found.log
+    said = "models hold a known inflow, models.own.known.n_n.n_i.1=1, which as shipped is"
+    assert said in " ".join(found.log.split())
 
 
-def test_known_coefficients_beside_files_are_said_with_the_way_to_change_them(folder: Path) -> None:
-    swing(folder, 0.6, 0.9, 1.2)
-    terms = "{n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}"
-    log = " ".join(predicted(folder, terms, "+models.own.known={n_i:{n_i:{a:1.0}}}").log.split())
-    assert "models hold a known inflow, models.own.known.n_i.n_i.a=1, which as shipped is" in log
-    assert "leave such models out: ~models.own" in log
-
-
-def test_a_law_of_which_no_point_lives_says_what_to_try(folder: Path) -> None:
-    swing(folder, 0.6, 0.9, 1.2)
-    found = predicted(folder, "{n_i: [n_i,'n_i^3'], n_n: [n_i]}")
+def test_a_law_of_which_no_point_lives_says_what_to_try(here: Path) -> None:
+    swing(here, 0.6, 0.9, 1.2)
+    found = predicted(here, "{n_i: [n_i,'n_i^3'], n_n: [n_i]}")
     (advice,) = [text for text in found.warnings if "lives by the law" in text]
     assert "none of 3 points left out lives" in advice
     assert "try points that lie closer together, other models, or models=null" in advice
 
 
 def test_an_inspection_of_a_glob_writes_the_list_and_the_command(
-    folder: Path, capsys: pytest.CaptureFixture
+    here: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    swing(folder, 0.6, 0.9, 1.2)
+    swing(here, 0.6, 0.9, 1.2)
     assert not ended("inspect", "a*.csv")
     said = capsys.readouterr().out
     assert "3 operating points, if the numbers in the names are such (a; " in said
@@ -180,13 +157,13 @@ def test_an_inspection_of_a_glob_writes_the_list_and_the_command(
 
 
 def test_points_of_a_thruster_are_proposed_to_both_studies_of_points(
-    folder: Path, capsys: pytest.CaptureFixture
+    here: Path, capsys: pytest.CaptureFixture
 ) -> None:
     for V in (200, 300, 400):
         columns = np.random.default_rng(V).uniform(1.0, 2.0, (50, 4)) * [1e17, 1e18, 1e-14, 1e4]
         table = pd.DataFrame(columns, columns=["n_i", "n_n", "R_ion", "u_iz"])
         table.insert(0, "time [s]", 1e-6 * np.arange(50))
-        table.to_csv(folder / f"V{V}_m5.csv", index=False)
+        table.to_csv(here / f"V{V}_m5.csv", index=False)
     assert not ended("inspect", "V*.csv", "--plasma")
     assert re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out) == [
         "+exp=parametric data=recognised 'points.files=V{V_D_V}_m5.csv' data.plasma=true "
@@ -204,7 +181,7 @@ def test_points_of_a_thruster_are_proposed_to_both_studies_of_points(
     ],
 )
 def test_settings_that_do_not_go_with_files_are_refused(
-    more: list[str], message: str, folder: Path
+    more: list[str], message: str, here: Path
 ) -> None:
     touch("a1.csv", "a2.csv")
     typed = ["+exp=parametric", mend("points.files=a{a}.csv"), *more]

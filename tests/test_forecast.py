@@ -59,32 +59,31 @@ def test_a_start_is_the_kalman_filter_of_the_window() -> None:
 
 
 def test_nothing_but_the_past_enters() -> None:
-    run = LORENZ.trajectory(noise=0.05, rng=0)
+    run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 900)
     changed = run.states.copy()
-    changed[2000:] = changed[2000:][::-1]
+    changed[600:] = changed[600:][::-1]
     other = replace(run, states=changed)
     ours, theirs = (
-        ep.forecast(LORENZ.model, each.window(0, 2000), 0.5, n_draws=20) for each in (run, other)
+        ep.forecast(LORENZ.model, each.window(0, 600), 0.5, n_draws=20) for each in (run, other)
     )
     np.testing.assert_array_equal(ours.draws, theirs.draws)
     skills = [
-        ep.forecast_skill(LORENZ.model, each, n_fitted=2000, starts=1, horizon_s=0.2)
+        ep.forecast_skill(LORENZ.model, each, n_fitted=600, starts=1, horizon_s=0.2)
         for each in (run, other)
     ]
     np.testing.assert_array_equal(skills[0].example.states, skills[1].example.states)
 
 
-@pytest.mark.parametrize("noise", [0.05, 0.2])
-@pytest.mark.parametrize("system", [ep.lorenz(), ep.lotka_volterra()], ids=lambda s: s.name)
+@pytest.mark.parametrize(("system", "noise"), [(ep.lorenz(), 0.05), (ep.lotka_volterra(), 0.2)])
 def test_bands_hold_what_they_say(system, noise) -> None:
     run = system.trajectory(noise=noise, rng=1)
     n = round(0.75 * run.n_samples)
     skill = ep.forecast_skill(system.model, run, n_fitted=n, starts=20)
     assert 0.85 <= skill.coverage_90 <= 0.95
     assert (skill.nrmse["model"] < skill.nrmse["autoregression"]).mean() > 0.9
-    assert skill.better_until_periods == pytest.approx(
-        skill.horizons_s[-1] / skill.period_s, rel=1e-9
-    )
+    furthest = skill.horizons_s[-1] / skill.period_s
+    assert skill.better_until_periods == pytest.approx(furthest, rel=1e-9)
+    assert skill.summary()["horizons_periods"][-1] == pytest.approx(furthest, rel=1e-9)
     assert skill.text.startswith("better than an autoregression (AR ")
     assert skill.text.endswith("periods and more")
 
@@ -94,12 +93,8 @@ def test_bands_grow_where_the_record_is_pushed() -> None:
     low, high = ep.forecast(SPRING, run, 30.0).band()
     width = (high - low)[:, 0]
     assert width[-20:].mean() > 3.0 * width[:5].mean()
-    held = [
-        ep.forecast_skill(
-            SPRING, spring(0.02, push=0.05, seed=seed), n_fitted=900, starts=30
-        ).coverage_90
-        for seed in range(4)
-    ]
+    runs = (spring(0.02, push=0.05, seed=seed) for seed in range(2))
+    held = [ep.forecast_skill(SPRING, run, n_fitted=900, starts=30).coverage_90 for run in runs]
     assert 0.82 <= np.mean(held) <= 0.97  # 300 samples are few when pushes last
 
 
@@ -220,11 +215,6 @@ def test_where_the_mean_cycle_is_nearer_it_is_said() -> None:
     slow = replace(SPRING, coef=0.97 * SPRING.coef)
     skill = ep.forecast_skill(slow, spring(0.02), n_fitted=900, starts=20)
     assert "the mean cycle, going on, is nearer" in skill.text
-    summary = skill.summary()
-    assert set(summary) == {"horizons_periods", "nrmse", "better_until_periods", "coverage_90"}
-    assert summary["horizons_periods"][-1] == pytest.approx(
-        skill.horizons_s[-1] / skill.period_s, rel=1e-9
-    )
 
 
 def test_a_gap_is_no_obstacle() -> None:
@@ -243,10 +233,6 @@ def test_a_gap_is_no_obstacle() -> None:
         (lambda: ep.forecast(SPRING, spring(0.05), -1.0), "a positive duration in s, or incr"),
         (lambda: ep.forecast(SPRING, spring(0.05), [5.0, 6.0]), "after the history's end at 119.9"),
         (lambda: ep.forecast(SPRING, spring(0.05), 1.0, measured=["z"]), "measured must name some"),
-        (lambda: ep.forecast(ep.pendulum().model, spring(0.05), 1.0), "some of the model's states"),
-        (lambda: ep.forecast(SPRING, spring(0.05), 1.0, n_draws=0), "n_draws must be a whole"),
-        (lambda: ep.forecast(SPRING, spring(0.05), 1.0).band(1.0), "level must lie between 0 and"),
-        (lambda: ep.forecast(SPRING, spring(0.05), 1.0).amplitude("z"), "unknown state 'z'"),
         (lambda: ep.forecast_skill(SPRING, spring(0.05), n_fitted=1200), "and leave four"),
         (
             lambda: ep.forecast_skill(SPRING, spring(0.05), n_fitted=900, horizon_s=40.0),

@@ -13,6 +13,7 @@ from ep2sindy.model.free_run import FreeCycle, free_run, samples_in
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.studies.views import found_model, worst_run
 from ep2sindy.systems.systems import lorenz
+from tests.models import model_of
 
 LIBRARY = polynomial(["x", "y"], degree=3)
 
@@ -137,31 +138,6 @@ def test_the_true_model_of_a_chaotic_record_is_alike_and_a_wrong_one_is_not(numb
     assert free_run(periodic, run).verdict is Verdict.WRONG_CYCLE
 
 
-def shifted(radius: float, unit: str) -> tuple[SparseModel, Trajectory]:
-    """A cycle about (1.2, 1.2): below zero if its radius is larger."""
-    t = np.linspace(0.0, 80.0 * np.pi, 2001)
-    states = 1.2 + np.column_stack([np.cos(t), np.sin(t)])
-    # u = x - 1.2 turns and is drawn to the radius: the terms of hopf, expanded.
-    pull, c = 1.0 / radius**2, 1.2
-    cubed = {"1": -(c**3), "x": 3 * c**2, "x^2": -3 * c, "x^3": 1.0}
-    x_y2 = {"1": -(c**3), "x": c**2, "y": 2 * c**2, "x*y": -2 * c, "y^2": -c, "x*y^2": 1.0}
-    swap = {"1": "1", "x": "y", "y": "x", "x^2": "y^2", "y^2": "x^2", "x^3": "y^3",
-            "x*y": "x*y", "x*y^2": "x^2*y"}  # fmt: skip
-    ours = dict.fromkeys({*cubed, *x_y2, "y"}, 0.0)
-    for terms in (cubed, x_y2):
-        for term, value in terms.items():
-            ours[term] -= pull * value
-    theirs = {swap[term]: value for term, value in ours.items()}
-    ours["x"] += 1.0
-    ours["y"] -= 1.0
-    theirs["x"] += 1.0
-    theirs["y"] += 1.0
-    theirs["1"] -= 2.0 * c
-    units = dict.fromkeys(("x", "y"), unit)
-    model = SparseModel(LIBRARY, ["x", "y"], coef_matrix(LIBRARY, [ours, theirs]), units)
-    return model, Trajectory(t, states, ("x", "y"), units=units)
-
-
 @pytest.mark.parametrize(
     ("radius", "unit", "verdict"),
     [
@@ -171,7 +147,12 @@ def shifted(radius: float, unit: str) -> tuple[SparseModel, Trajectory]:
     ],
 )
 def test_a_density_below_zero_is_a_verdict_of_its_own(radius, unit, verdict) -> None:
-    found = free_run(*shifted(radius, unit))
+    """On circles about (1.2, 1.2): they pass below zero where their radius is larger."""
+    t, units = np.linspace(0.0, 80.0 * np.pi, 2001), dict.fromkeys(("x", "y"), unit)
+    run = Trajectory(t, 1.2 + np.column_stack([np.cos(t), np.sin(t)]), ("x", "y"), units=units)
+    circles = model_of({"x": {"1": 1.2, "y": -1.0}, "y": {"1": -1.2, "x": 1.0}})
+    start = np.array([1.2 + radius, 1.2])
+    found = free_run(replace(circles, units=units), run, initial=start)
     assert found.verdict is verdict
     if verdict is Verdict.NEGATIVE:
         assert found.text == "turns negative"

@@ -12,17 +12,14 @@ from ep2sindy.library.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.selection.free_run import Confirmed, Trial
 from ep2sindy.selection.systems import folds_of, living_among, others_of
+from tests.models import model_of
 
 PREY = replace(ep.lotka_volterra(), rate_Hz=5.0)  # 69 samples a period
-THRUSTER = [
-    {"n_i": -3.92e5, "n_n": 4.83e3, "n_i*n_n": 4.57e-14},
-    {"1": -7.82e22, "n_i": -4.78e5, "n_n": 6.86e4},
-]
+THRUSTER = {
+    "n_i": {"n_i": -3.92e5, "n_n": 4.83e3, "n_i*n_n": 4.57e-14},
+    "n_n": {"1": -7.82e22, "n_i": -4.78e5, "n_n": 6.86e4},
+}
 LIBRARY = ep.polynomial(["n_i", "n_n"], degree=2)
-
-
-def model_of(terms, states=("n_i", "n_n"), library=LIBRARY):
-    return ep.SparseModel(library, list(states), ep.coef_matrix(library, terms))
 
 
 def record(n_periods=24.0, *, noise=0.0, seed=0):
@@ -50,7 +47,7 @@ def found():
 
 
 def test_the_truth_is_found_refined_and_handed_on(found):
-    for state, terms in zip(("n_i", "n_n"), THRUSTER, strict=True):
+    for state, terms in THRUSTER.items():
         # One Runge-Kutta step per sample: (omega dt)^4 / 120 for a sine, and six harmonics.
         assert found.model.terms(state) == pytest.approx(terms, rel=1e-3)
         chosen = found.chosen[state]
@@ -125,14 +122,8 @@ def test_where_nothing_lives_the_best_comes_back_with_its_verdict():
 @pytest.mark.parametrize(
     ("run", "reason"),
     [
-        (
-            record(4.5),
-            r"the record holds \d\.\d periods, not six: chosen by windows held out instead",
-        ),
-        (
-            ep.systems.damped_oscillator().trajectory(),
-            "record 'damped oscillator' has no period: chosen by windows held out",
-        ),
+        (record(4.5), r"the record holds \d\.\d periods, not six: chosen by windows held out"),
+        (ep.systems.damped_oscillator().trajectory(), "record 'damped oscillator' has no period"),
     ],
 )
 def test_a_record_without_a_cycle_is_judged_by_windows(run, reason):
@@ -166,10 +157,8 @@ def test_units_change_nothing(found):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"n_folds": 1}, "n_folds must be a whole number, two or more: 1 came"),
         ({"window_periods": 0.0}, "window_periods must be positive: 0.0 came"),
         ({"margin": 1.5}, "margin must lie between 0 and 1: 1.5 came"),
-        ({"n_starts": 0}, "n_starts must be a whole number, one or more: 0 came"),
     ],
 )
 def test_settings_are_checked(settings, message):
@@ -200,13 +189,7 @@ SHARED = "x: x*y == -1 * y: x*y"
 )
 def test_relations_hold_to_the_last_digit(rule):
     run = PREY.trajectory(noise=0.02, rng=0)
-    how = ep.Regression(
-        ep.WeightedWeak(),
-        ep.BestSubset(max_terms=2),
-        rule,
-        ep.Bootstraps(n=0),
-        depth=1,
-    )
+    how = replace(recipe(max_terms=2, n_best=1, formulation=ep.WeightedWeak()), selection=rule)
     library = ep.polynomial(["x", "y"], degree=2)
     tied = ep.discover(run, library, how, relations=[SHARED]).model
     assert tied.terms("x")["x*y"] == -tied.terms("y")["x*y"]
@@ -233,20 +216,6 @@ def test_a_known_equation_is_not_searched():
     assert known.model.terms("x") == {"v": 1.0}
     assert [c.terms for c in known.fronts["x"].candidates][1:] == [("v",)]
     assert known.model.terms("v") == pytest.approx({"x": -9.0, "v": -0.3}, rel=0.05)
-
-
-@pytest.mark.parametrize(
-    ("asked", "message"),
-    [
-        ({"relations": ["z: x == 1"]}, r"unknown state 'z'; there are \['x', 'y'\]"),
-        ({"relations": ["x: w == 1"]}, "unknown variable 'w'"),
-        ({"terms": {"x": []}}, r"an equation whose terms are given must have some: \['x'\]"),
-        ({"terms": {"x": ["y"]}, "relations": ["x: x == 1"]}, "is not in the support of"),
-    ],
-)
-def test_what_cannot_be_asked_is_refused(asked, message):
-    with pytest.raises(ValueError, match=message):
-        ep.discover(ep.lotka_volterra().trajectory(), ep.polynomial(["x", "y"], degree=2), **asked)
 
 
 def test_supports_are_completed_by_what_relations_ask():
@@ -318,25 +287,18 @@ def test_where_the_truth_is_in_the_library_no_other_counts_as_equal(least, names
 
 def test_the_other_systems_that_live_are_kept() -> None:
     """Other terms of van der Pol's equations live on its cycle, too."""
-    oscillator = replace(ep.systems.van_der_pol(), duration_s=120.0, rate_Hz=10.0)
-    run = oscillator.trajectory(noise=0.02, rng=1).window(200, 1200)
+    oscillator = replace(ep.systems.van_der_pol(), duration_s=90.0, rate_Hz=10.0)
+    run = oscillator.trajectory(noise=0.02, rng=1).window(200, 900)
     library = ep.polynomial(run.state_names, degree=3)
-    search = ep.BestSubset(max_terms=4, n_best=3)
-    found = ep.discover(
-        run, library, ep.Regression(search=search, selection=ep.FreeRunScore(), depth=3)
-    )
+    found = ep.discover(run, library, recipe(max_terms=4, n_best=3))
     size = int((found.model.coef != 0.0).sum())
     ours = {f"{state}'": tuple(found.model.terms(state)) for state in found.model.states}
     for other in found.others:
         assert sum(map(len, other.terms.values())) == size
         assert other.terms != ours
         bounds = ep.FreeRunBounds()
-        assert other.deviation <= 1.0
-        assert other.deviation == max(
-            other.f_error / bounds.frequency,
-            other.amplitude / bounds.amplitude,
-            other.waveform / bounds.waveform,
-        )
+        shares = other.f_error / bounds.frequency, other.amplitude / bounds.amplitude
+        assert other.deviation == max(*shares, other.waveform / bounds.waveform) <= 1.0
     assert [o.waveform for o in found.others] == sorted(o.waveform for o in found.others)
     again = ep.Discovery.from_json(found.to_json())
     assert [each.terms for each in again.others] == [each.terms for each in found.others]

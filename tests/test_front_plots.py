@@ -16,9 +16,11 @@ from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.systems.systems import lotka_volterra
 
+Searched = tuple[ParetoFront, np.ndarray]
+
 
 @pytest.fixture(scope="module")
-def searched() -> tuple[ParetoFront, np.ndarray]:
+def searched() -> Searched:
     """A front of three candidates per size, and the supports that it was taken from."""
     system = lotka_volterra()
     run = system.trajectory(noise=0.05, rng=np.random.default_rng(0))
@@ -29,8 +31,8 @@ def searched() -> tuple[ParetoFront, np.ndarray]:
     return equation.front, equation.supports.masks
 
 
-def drawn(front: ParetoFront, *, index: int = 1) -> Axes:
-    scores = np.where(np.arange(len(front.candidates)) == index, 0.25, 1.0)
+def drawn(front: ParetoFront) -> Axes:
+    scores = np.where(np.arange(len(front.candidates)) == 1, 0.25, 1.0)
     figure = front_figure({front.equation: front.with_scores(scores)}, label="d_pareto")
     return figure.axes[0]
 
@@ -40,9 +42,7 @@ def line(ax: Axes, label: str) -> Line2D:
     return found
 
 
-def test_the_cloud_holds_the_error_of_every_support_that_was_proposed(
-    searched: tuple[ParetoFront, np.ndarray],
-) -> None:
+def test_the_cloud_holds_the_error_of_every_support_that_was_proposed(searched: Searched) -> None:
     front, masks = searched
     assert front.cloud is not None
     fits = fit_supports(front.problem, front.equation, masks)
@@ -53,7 +53,7 @@ def test_the_cloud_holds_the_error_of_every_support_that_was_proposed(
 
 
 def test_errors_are_drawn_on_a_logarithmic_scale_with_all_supports_behind(
-    searched: tuple[ParetoFront, np.ndarray],
+    searched: Searched,
 ) -> None:
     front, masks = searched
     ax = drawn(front)
@@ -64,22 +64,14 @@ def test_errors_are_drawn_on_a_logarithmic_scale_with_all_supports_behind(
     assert len(np.asarray(every.get_xdata())) == len(masks) > len(front.candidates)
     best, others = line(ax, "best of size"), line(ax, "runners-up")
     assert every.get_zorder() < others.get_zorder() < best.get_zorder()
+    star = np.asarray(line(ax, "selected").get_xydata()).ravel()
+    assert star.tolist() == [front.sizes[1], front.errors[1]]
     low, high = ax.get_ylim()
     assert low < front.errors.min()
     assert high > front.errors.max()
 
 
-def test_the_star_is_the_selected_candidate(searched: tuple[ParetoFront, np.ndarray]) -> None:
-    front, _ = searched
-    ax = drawn(front, index=4)
-    star = line(ax, "selected")
-    assert star.get_xydata().ravel().tolist() == [front.sizes[4], front.errors[4]]  # type: ignore[union-attr]
-    assert r"$d_\mathrm{pareto}$ = 0.25" in ax.get_title()
-
-
-def test_errors_of_exact_fits_stand_on_a_line_that_says_so(
-    searched: tuple[ParetoFront, np.ndarray],
-) -> None:
+def test_errors_of_exact_fits_stand_on_a_line_that_says_so(searched: Searched) -> None:
     front, _ = searched
     exact = [
         replace(each, r2_test=1.0 + 1e-15) if each.n_terms == 2 else each
@@ -92,25 +84,10 @@ def test_errors_of_exact_fits_stand_on_a_line_that_says_so(
     assert not drawn(front).texts
 
 
-def test_supports_far_worse_than_none_are_marked_at_the_edge(
-    searched: tuple[ParetoFront, np.ndarray],
-) -> None:
+def test_supports_far_worse_than_none_are_marked_at_the_edge(searched: Searched) -> None:
     front, _ = searched
     assert front.cloud is not None
-    worse = front.cloud.errors.copy()
-    worse[-1] = 1e6
-    ax = drawn(replace(front, cloud=replace(front.cloud, errors=worse)))
-    assert ax.get_ylim()[1] == TOP
+    errors = np.append(front.cloud.errors[:-1], 1e6)
+    ax = drawn(replace(front, cloud=replace(front.cloud, errors=errors)))
     (carets,) = [each for each in ax.lines if np.asarray(each.get_ydata()).tolist() == [TOP]]
     assert np.asarray(carets.get_xdata()).tolist() == [front.cloud.sizes[-1]]
-
-
-def test_many_equations_stand_in_rows_without_empty_panels(
-    searched: tuple[ParetoFront, np.ndarray],
-) -> None:
-    front, _ = searched
-    names = [f"x_{k}" for k in range(7)]
-    scored = front.with_scores(np.arange(float(len(front.candidates))))
-    figure = front_figure(dict.fromkeys(names, scored), label="EBIC")
-    assert len(figure.axes) == 7
-    assert figure.get_figwidth() < 20.0

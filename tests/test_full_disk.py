@@ -7,20 +7,11 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
-import xarray as xr
 
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
-from ep2sindy.runtime.files import (
-    LEFT_AFTER_S,
-    WriteError,
-    replacing,
-    sweep,
-    write_bytes,
-    write_text,
-)
+from ep2sindy.runtime.files import LEFT_AFTER_S, WriteError, replacing, sweep
 
 resource = pytest.importorskip("resource", reason="limits of a process need POSIX")
 
@@ -59,12 +50,6 @@ def test_no_netcdf_writer_falls_over_on_a_full_disk(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["field.nc"]
 
 
-def test_an_error_says_path_reason_and_way_out(tmp_path: Path) -> None:
-    (tmp_path / "taken").write_text("a file")
-    with pytest.raises(WriteError, match=r"taken/x.txt could not be written \(.*\).*make room"):
-        write_text(tmp_path / "taken" / "x.txt", "text")
-
-
 def test_an_error_of_a_worker_arrives_whole() -> None:
     sent = WriteError(Path("kept/x.nc"), OSError(28, "No space left on device"))
     arrived = pickle.loads(pickle.dumps(sent))
@@ -99,18 +84,3 @@ def test_only_what_killed_processes_left_is_swept(tmp_path: Path) -> None:
         sweep(tmp_path)
         assert living.exists()
     assert sorted(deeper.iterdir()) == sorted([*others, deeper / "a.b.nc"])
-
-
-def test_bytes_are_written_whole(tmp_path: Path) -> None:
-    write_bytes(tmp_path / "x.bin", memoryview(b"\0\1"))
-    assert (tmp_path / "x.bin").read_bytes() == b"\0\1"
-
-
-def test_a_written_field_is_the_same_from_memory(tmp_path: Path) -> None:
-    from ep2sindy.data.fields import write_netcdf
-
-    field = xr.Dataset({"n": (("time",), np.arange(5.0))}, coords={"time": np.arange(5.0)})
-    packed = {"n": {"zlib": True, "complevel": 4}}
-    write_netcdf(field, tmp_path / "a.nc", encoding=packed)
-    with xr.open_dataset(tmp_path / "a.nc") as found:
-        xr.testing.assert_identical(found.load(), field)

@@ -1,6 +1,6 @@
 """Transport by a user's function: what it gets, what it may give, and how it is told apart."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -9,11 +9,9 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.thruster.axial.settings import to_json
+from tests.thrusters import brief
 
-POINT = ep.thruster.OperatingPoint(300.0, 5.0)
-BRIEF = {
-    "duration_s": 9e-5, "warm_up_s": 3e-5, "n_cells": 30, "stretch": 1.0, "progress": False,
-}  # fmt: skip
+BRIEF = {"duration_s": 9e-5, "warm_up_s": 3e-5, "n_cells": 30}
 
 
 def default_c(z, t, plasma):
@@ -42,13 +40,11 @@ class Level:
 
 def run(function, **settings):
     transport = ep.thruster.FunctionTransport(function)
-    return ep.thruster.simulate(
-        ep.thruster.Thruster(transport=transport), POINT, **(BRIEF | settings)
-    )
+    return brief(ep.thruster.Thruster(transport=transport), **(BRIEF | settings))
 
 
 def test_the_default_as_a_function_changes_nothing():
-    plain = ep.thruster.simulate(ep.thruster.Thruster(), POINT, **BRIEF)
+    plain = brief(**BRIEF)
     np.testing.assert_allclose(run(default_c)["I_d"], plain["I_d"], rtol=1e-12)
 
 
@@ -75,27 +71,14 @@ def test_a_function_sees_the_plasma_and_the_time():
     np.testing.assert_allclose(plasma.B, ep.thruster.Thruster().magnetic_field.at(z))
 
 
-def test_transport_may_follow_the_shear_of_the_drift():
-    field = run(by_shear)
-    assert field.attrs["status"] != "diverged"
-    assert field.attrs["mass_balance"] == pytest.approx(1.0, abs=1e-3)
-
-
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        (
-            gives_nan,
-            r"everywhere: .*gives_nan \w+ gave nan at 0\.833 mm .* t = 2\.1e-05",
-        ),
+        (gives_nan, r"everywhere: .*gives_nan \w+ gave nan at 0\.833 mm .* t = 2\.1e-05"),
         (Level(-0.1), r"everywhere: .*Level \w+ gave -0\.1 at -24\.2 mm from the exit"),
         (gives_too_few, r"one coefficient for each of 30 distances, .* gave the shape \(3,\)"),
         (partial(default_c), r"must be known by its source, .*: functools\.partial.* frozen data"),
-        (3.0, r"must be a function c\(z, t, plasma\), or the dotted name of one: 3\.0 came"),
-        (
-            "no_such_module.c",
-            r"must be a function of yours, as my_module\.c, .* has no no_such",
-        ),
+        ("no_such_module.c", r"must be a function of yours, as my_module\.c, .* has no no_such"),
     ],
 )
 def test_what_is_no_transport_is_refused(function, message):
@@ -124,10 +107,10 @@ def test_two_functions_are_two_simulations(tmp_path: Path):
     assert len(list(tmp_path.glob("*.nc"))) == 2
 
 
-def test_a_config_names_a_marked_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.usefixtures("here")
+def test_a_config_names_a_marked_function():
     text = "import ep2sindy as ep\n\n\n@ep.for_configs\ndef c(z, t, plasma):\n    return {}\n\n\n"
     text += "def bare(z, t, plasma):\n    return 1.0\n"
-    monkeypatch.chdir(tmp_path)
     Path("bohm_of_mine.py").write_text(text.format(0.02))
     made = ep.thruster.FunctionTransport("bohm_of_mine.c")
     plasma = ep.thruster.Plasma(*np.zeros((6, 2)))
@@ -137,9 +120,3 @@ def test_a_config_names_a_marked_function(tmp_path: Path, monkeypatch: pytest.Mo
         ep.thruster.FunctionTransport("bohm_of_mine.bare")
     Path("bohm_of_mine.py").write_text(text.format(0.03))
     assert ep.thruster.FunctionTransport("bohm_of_mine.c").identity != made.identity
-
-
-def test_the_z_r_model_refuses_a_function():
-    thruster = replace(ep.thruster.THRUSTER_2D, transport=ep.thruster.FunctionTransport(default_c))
-    with pytest.raises(ValueError, match=r"does not solve a transport by a function"):
-        ep.thruster.simulate_2d(thruster, progress=False)

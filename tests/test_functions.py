@@ -15,12 +15,7 @@ import torch
 import ep2sindy as ep
 from ep2sindy.data.coerce import keep_inside, noise_inside
 from ep2sindy.library import functions as registry
-from ep2sindy.library.equations import (
-    equation_html,
-    equation_text,
-    latex_term_name,
-    sum_sympy,
-)
+from ep2sindy.library.equations import equation_html, equation_text, latex_term_name, sum_sympy
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.solve import edges_of
 from ep2sindy.refinement.refine import refine
@@ -59,10 +54,8 @@ def every() -> Library:
     [
         ("v*sin( 2 * x )", "sin(2*x)*v"),
         ("1/(x + 0.5)", "1/(0.5+x)"),
-        ("inverse(x)", "1/x"),
         ("v / x^2", "v/x^2"),
         ("log(1 - 2*x)", "log(1-2*x)"),
-        ("exp(-x)", "exp(-x)"),
         ("sqrt(1e-18*x)*sin(x)^2", "sin(x)^2*sqrt(1e-18*x)"),
         ("sin(<x*v>)*x", "x*sin(<x*v>)"),
     ],
@@ -149,10 +142,6 @@ def test_a_library_takes_functions_of_every_variable_or_of_one() -> None:
         ({"functions": ["x*sin(v)"]}, "go into products"),
         ({"functions": ["sin(x)^2"]}, "come with function_degree=2"),
         ({"function_degree": 2}, r"function_degree=2 needs functions, such as \['sin'\]"),
-        (
-            {"functions": ["sin"], "function_degree": 0},
-            "must be a whole number, one or more: 0 came",
-        ),
     ],
 )
 def test_wrong_functions_of_a_library_are_refused(setting: dict, message: str) -> None:
@@ -188,10 +177,8 @@ def test_equations_are_written_in_every_language() -> None:
     expected = 1.0 * x - 2.0 * x * sympy.sin(2 * v) / (n + 0.5) ** 2 + 3.0 / x
     assert sympy.simplify(sum_sympy(terms) - expected) == 0
     values = {x: 0.7, v: -0.3, n: 1.9}
-    own = sum_sympy({"tanh(x)": 1.0})
-    (tanh,) = own.atoms(sympy.Function)
-    assert str(tanh) == "tanh(x)"
-    assert tanh != sympy.tanh(x)  # what it means is the user's
+    (own,) = sum_sympy({"tanh(x)": 1.0}).atoms(sympy.Function)
+    assert (str(own), own == sympy.tanh(x)) == ("tanh(x)", False)  # what it means is the user's
     number = 0.7 - 2 * 0.7 * np.sin(-0.6) / 2.4**2 + 3 / 0.7
     assert float(sum_sympy(terms).subs(values)) == pytest.approx(number, rel=1e-12)
 
@@ -238,16 +225,15 @@ def _square(x: np.ndarray) -> np.ndarray:
     return x * x
 
 
-def _twice(x: np.ndarray) -> np.ndarray:
-    return 2.0 * x
-
-
-def test_a_function_of_ones_own_travels_to_other_processes(kinds: dict[str, registry.Kind]) -> None:
-    ep.register_function("own_square", _square, _twice)
+def test_a_function_of_ones_own_travels_with_its_derivative(
+    kinds: dict[str, registry.Kind],
+) -> None:
+    ep.register_function("own_square", _square)
     sent = pickle.dumps(named_terms(["x"], ["own_square(x)", "sin(x)"]))
     del kinds["own_square"]
     library = pickle.loads(sent)  # as in a worker, where nobody registered it
     assert library.evaluate(np.array([[3.0]]))[0, 0] == 9.0
+    assert library.jacobian(np.array([[3.0]]))[0, 0, 0] == pytest.approx(6.0)
     assert named_terms(["x"], ["own_square(2*x)"]).evaluate(np.array([[3.0]]))[0, 0] == 36.0
 
 
@@ -275,14 +261,6 @@ def test_the_derivative_of_a_formula_is_found_by_itself(
     assert found.slope(x).shape == x.shape
 
 
-def test_a_derived_derivative_travels_with_its_formula(kinds: dict[str, registry.Kind]) -> None:
-    ep.register_function("own_hill", _hill)
-    expected = kinds["own_hill"].slope(np.array([0.3]))
-    sent = pickle.dumps(kinds["own_hill"])
-    del kinds["own_hill"]
-    assert pickle.loads(sent).slope(np.array([0.3])) == expected
-
-
 @pytest.mark.parametrize("value", [lambda x: np.where(x > 0.0, x, 0.0), np.arctanh, np.sum])
 def test_what_is_no_formula_needs_a_derivative(value: Callable[..., object]) -> None:
     message = r"derivative is found by itself for a formula of .*'odd' is none.*'odd', value, deri"
@@ -299,7 +277,6 @@ def test_what_is_no_formula_needs_a_derivative(value: Callable[..., object]) -> 
         ("root", np.sqrt, lambda x: 0.5 / np.sqrt(x), None, "value of 'root' must give a finite"),
         ("of_one", math.tanh, np.cos, None, "must take and return NumPy arrays: .* not math.tanh"),
         ("sums", np.sum, np.cos, None, "value of 'sums' must give a finite number for each"),
-        ("turned", np.sin, np.cos, (1.0, -1.0), r"interval \(low, high\): \(1.0, -1.0\) came"),
     ],
 )
 def test_functions_that_cannot_be_are_refused(
@@ -336,7 +313,6 @@ def test_a_sample_outside_a_domain_is_named(method: ep.Regression | ep.Trajector
     ("function", "x", "message"),
     [
         ("1/x", np.cos(T), r"1/x needs x to stay on one side of 0: x\[0\] = 1 .*\(187 such"),
-        ("sqrt(x)", T, r"sqrt\(x\) needs x > 0: x\[0\] = 0 at t = 0 s; name"),
         ("log(1-2*x)", 0.6 - 0.3 * np.cos(T), r"needs 1-2\*x > 0: x\[124\] .*\(377 such samples\)"),
         ("exp(x)", 800.0 + T, r"exp\(x\) needs x < 709: x\[0\] = 800"),
     ],
@@ -407,7 +383,6 @@ def test_what_a_smoother_moves_out_of_a_domain_stays_with_its_sample() -> None:
     [
         ({"x": {"sqrt(x)": -1.0}}, "sqrt(x)", 2.0),  # x = (1 - t/2)^2
         ({"x": {"1/x": -1.0}}, "1/x", 0.5),  # x^2 = 1 - 2 t
-        ({"x": {"1": -1.0, "1/(2+x)": 1e-9}}, "1/(2+x)", 3.0),
         ({"x": {"1": -1.0, "log(x)": 1e-9}}, "log(x)", 1.0),
         ({"x": {"1": -1.0, "abs(x)": 1e-9, "sin(x)": 1e-9}}, "", 5.0),
     ],
@@ -489,22 +464,20 @@ def test_of_dependent_products_one_is_left_out_and_named() -> None:
             assert not usable_terms(problem)[library.index(f"cos({v})^2")]
 
 
-FAST = {("regression", 0.1), ("joint", 0.0)}
-
-
 @pytest.mark.parametrize(
-    ("search", "noise"),
+    ("recipe", "noise"),
     [
-        pytest.param(search, noise, marks=() if (search, noise) in FAST else pytest.mark.slow)
-        for search in ("regression", "joint")
-        for noise in (0.0, 0.05, 0.1)
+        (None, 0.1),
+        (ep.TrajectorySearch(), 0.0),
+        pytest.param(ep.TrajectorySearch(), 0.1, marks=pytest.mark.slow),
     ],
 )
-def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(search: str, noise: float) -> None:
+def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(
+    recipe: ep.TrajectorySearch | None, noise: float
+) -> None:
     """theta' = w, w' = -g/L sin(theta); its energy w^2/2 - g/L cos(theta) stays."""
     system = ep.pendulum()
     run = system.trajectory(noise=noise, rng=3)
-    recipe = ep.TrajectorySearch() if search == "joint" else None
     library = polynomial(run.names, degree=3, functions=["sin", "cos"])
     found = ep.discover(run, library, recipe)
     assert {s: set(found.model.terms(s)) for s in found.model.states} == {
@@ -524,42 +497,22 @@ def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(search: str, noise: fl
     assert judged.verdict in (ep.Verdict.LIVES, ep.Verdict.SLIPS)
 
 
-@pytest.mark.parametrize(
-    ("n", "mean", "low", "high"),
-    [(6, 1.4, 0.3, 1.9), pytest.param(16, 0.9, 0.6, 1.5, marks=pytest.mark.slow)],
-    ids=["6", "16"],
-)
-def test_intervals_hold_the_truth_where_functions_bend_in_noise(
-    n: int, mean: float, low: float, high: float
-) -> None:
+def test_intervals_hold_the_truth_where_functions_bend_in_noise() -> None:
     """Without what noise adds to sin on average, errors have a mean of 3.5 standard deviations."""
     library = named_terms(["theta", "w"], ["w", "sin(theta)"])
     known = {"theta": ["w"], "w": ["sin(theta)"]}
     errors = []
-    for seed in range(n):
+    for seed in range(6):
         run = ep.pendulum().trajectory(noise=0.1, rng=seed)
         model = ep.discover(run, library, terms=known).model
         ends = model.intervals("w")["sin(theta)"]
         errors.append((np.mean(ends) + 9.81) / (np.ptp(ends) / 3.92))
-    # 1 / sqrt(n) by chance, three times over, and 0.2 by noise above second order.
-    assert abs(np.mean(errors)) < mean
-    assert low < np.std(errors) < high
+    # 1 / sqrt(6) by chance, three times over, and 0.2 by noise above second order.
+    assert abs(np.mean(errors)) < 1.4
+    assert 0.3 < np.std(errors) < 1.9
 
 
-def test_a_joint_search_takes_a_function_of_ones_own(tanh: str) -> None:
-    truth = model_of({"x": {"y": 1.0}, "y": {"tanh(3*x)": -4.0, "y": -0.05}})
-    clean = truth.simulate(np.linspace(0.0, 20.0, 1001), [1.5, 0.0]).trajectory()
-    noisy = clean.states + 0.03 * np.random.default_rng(1).standard_normal(clean.states.shape)
-    run = ep.Trajectory(clean.t, noisy, ["x", "y"])
-    library = polynomial(["x", "y"], degree=3, functions=["tanh(3*x)"])
-    found = ep.discover(run, library, ep.TrajectorySearch()).model
-    assert found.terms("x") == pytest.approx({"y": 1.0}, rel=0.02)
-    assert set(found.terms("y")) == {"tanh(3*x)", "y"}
-    assert found.terms("y")["tanh(3*x)"] == pytest.approx(-4.0, rel=0.02)
-
-
-@pytest.mark.parametrize("search", ["regression", pytest.param("joint", marks=pytest.mark.slow)])
-def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
+def test_saturation_is_found_in_units_far_from_one() -> None:
     """Decay with feed, s' = u - b s/(K + s), of some 1e18 and over microseconds."""
     K = 4e17
     truth = model_of({"s": {"u": 1.0, "s/(4e17+s)": -3e24}}, ("u",))
@@ -572,19 +525,14 @@ def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
     library = polynomial(
         ["s", "u"], degree=1, functions=["log(s)", "sqrt(s)"], products=[f"s/({K:g}+s)"]
     )
-    recipe = ep.TrajectorySearch() if search == "joint" else None
-    found = ep.discover(noisy, library, recipe).model
-    expected = {"u": 1.0, "s/(4e+17+s)": -3e24}
-    assert found.terms("s") == pytest.approx(expected, rel=0.05)
+    found = ep.discover(noisy, library).model
+    assert found.terms("s") == pytest.approx({"u": 1.0, "s/(4e+17+s)": -3e24}, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    "selection", [ep.RefinedScore(), pytest.param(ep.FreeRunScore(), marks=pytest.mark.slow)]
-)
-def test_rules_that_run_models_take_functions(selection: object) -> None:
+def test_rules_that_run_models_take_functions() -> None:
     run = ep.pendulum().trajectory(noise=0.02, rng=0)
     library = polynomial(run.names, degree=1, functions=["sin(theta)"])
-    recipe = ep.Regression(search=ep.BestSubset(max_terms=1), selection=selection)
+    recipe = ep.Regression(search=ep.BestSubset(max_terms=1), selection=ep.RefinedScore())
     found = ep.discover(run, library, recipe).model
     assert set(found.terms("w")) == {"sin(theta)"}
 

@@ -1,5 +1,4 @@
 import json
-import os
 import re
 from pathlib import Path
 
@@ -13,11 +12,9 @@ from nptdms import ChannelObject, TdmsWriter
 from scipy.io import savemat
 
 from ep2sindy.data.mapping import Variable
-from ep2sindy.data.open import inspect_file, open_field, read_field, write_field
-from ep2sindy.data.prepare import keep_where
+from ep2sindy.data.open import open_field, read_field, write_field
 from ep2sindy.data.quantities import conversion, same_unit
 from ep2sindy.data.readers.source import look_at
-from ep2sindy.data.zones import Zone, zone_average
 from tests.programs import composed
 
 RNG = np.random.default_rng(3)
@@ -121,63 +118,10 @@ def test_every_kind_of_file_gives_the_same_field(tmp_path: Path, name: str) -> N
     assert units == expected
 
 
-def test_csv_is_a_probe_trace(tmp_path: Path) -> None:
-    rows = "\n".join(f"{1e6 * t}, {i}, {2 * i}" for t, i in zip(TIME, I_D, strict=True))
-    (tmp_path / "probe.csv").write_text(f"# scope 4\ntime_us, Id, V\n{rows}\n")
-    variables = {"I_d": Variable("Id", "A"), "V_d": Variable("V", "kV")}
-    field = open_field(tmp_path / "probe.csv", variables=variables, time=Variable("time_us", "us"))
-    assert field["time"].values == pytest.approx(TIME, rel=1e-15)
-    assert field["V_d"].values == pytest.approx(2e3 * I_D, rel=1e-15)
-    assert field["V_d"].attrs["units"] == "V"
-
-
-def frame(k: int) -> dict:
-    """One frame in the layout of HallThruster.jl 0.19 to 0.22."""
-    ion = {"n": N_I[k, :, 0].tolist(), "u": N_I[k, :, 1].tolist(), "Z": 1}
-    return {
-        "t": TIME[k],
-        "z": Z.tolist(),
-        "discharge_current": I_D[k],
-        "Tev": T_E[k].tolist(),
-        "neutrals": {"Xe": {"n": N_I[k, :, 2].tolist()}},
-        "ions": {"Xe": [ion, {**ion, "Z": 2}]},
-        "anom_variables": [],
-    }
-
-
-JSON_MAPPING = {
-    "n_i": Variable("ions.Xe.0.n", "m^-3"),
-    "n_n": Variable("neutrals.Xe.n", "m^-3"),
-    "T_e_eV": Variable("Tev", "eV"),
-    "I_d": Variable("discharge_current", "A"),
-}
-
-
-def test_hallthruster_frames_become_a_field(tmp_path: Path) -> None:
-    frames = [frame(k) for k in range(NT)]
-    content = {"input": {}, "output": {"retcode": "success", "error": "", "frames": frames}}
-    (tmp_path / "out.json").write_text(json.dumps(content))
-    field = open_field(
-        tmp_path / "out.json", variables=JSON_MAPPING, time=AXES["time"], z=AXES["z"]
-    )
-    assert np.array_equal(field["n_i"].values, N_I[:, :, 0])
-    assert np.array_equal(field["n_n"].values, N_I[:, :, 2])
-    assert np.array_equal(field["T_e_eV"].values, T_E)
-    assert np.array_equal(field["I_d"].values, I_D)
-
-
-def test_older_hallthruster_output_is_a_bare_list_of_frames(tmp_path: Path) -> None:
-    frames = [{"t": TIME[k], "z": Z.tolist(), "ni_1": N_I[k, :, 0].tolist()} for k in range(NT)]
-    (tmp_path / "old.json").write_text(json.dumps(frames))
-    variables = {"n_i": Variable("ni_1", "m^-3")}
-    field = open_field(tmp_path / "old.json", variables=variables, time=AXES["time"], z=AXES["z"])
-    assert np.array_equal(field["n_i"].values, N_I[:, :, 0])
-
-
 def test_averaged_hallthruster_output_says_what_to_ask_for(tmp_path: Path) -> None:
-    (tmp_path / "mean.json").write_text(json.dumps({"output": {"average": frame(0)}}))
+    (tmp_path / "mean.json").write_text(json.dumps({"output": {"average": {"Tev": [3.0]}}}))
     with pytest.raises(ValueError, match="no output.frames; run the simulation with save_time_res"):
-        open_field(tmp_path / "mean.json", variables=JSON_MAPPING, time=AXES["time"])
+        open_field(tmp_path / "mean.json", **SETTINGS)
 
 
 def test_structs_and_groups_are_paths(tmp_path: Path) -> None:
@@ -224,24 +168,16 @@ def test_axes_of_length_one_may_be_missing_in_the_file(tmp_path: Path) -> None:
 
 def test_units_become_si_and_suffixes_keep_theirs(tmp_path: Path) -> None:
     write_npz(tmp_path / "a.npz")
-    variables = {
-        "n_i": Variable("ni", "1e12 cm^-3"),
-        "u_iz": Variable("ni", "km/s"),
-        "T_e_eV": Variable("Te", "keV"),
-        "T_K": Variable("Te", "degC"),
-        "mdot_mg_s": Variable("Id", "kg/s"),
-    }
+    units = {"n_i": ("ni", "1e12 cm^-3"), "T_K": ("Te", "degC"), "mdot_mg_s": ("Id", "kg/s")}
+    variables = {ours: Variable(*theirs) for ours, theirs in units.items()}
     axes = {"time": Variable("t", "ms"), "z": Variable("z", "cm"), "r": Variable("r", "mm")}
     field = open_field(tmp_path / "a.npz", variables=variables, **axes)
     for ours, values, unit in (
         ("n_i", 1e18 * N_I, "m^-3"),
-        ("u_iz", 1e3 * N_I, "m s^-1"),
-        ("T_e_eV", 1e3 * T_E, "eV"),
         ("T_K", T_E + 273.15, "K"),
         ("mdot_mg_s", 1e6 * I_D, "mg s^-1"),
         ("time", 1e-3 * TIME, "s"),
         ("z", 1e-2 * Z, "m"),
-        ("r", 1e-3 * R, "m"),
     ):
         assert field[ours].values == pytest.approx(values, rel=1e-15), ours
         assert field[ours].attrs["units"] == unit
@@ -250,13 +186,9 @@ def test_units_become_si_and_suffixes_keep_theirs(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("ours", "unit", "factor", "target"),
     [
-        ("n", "cm-3", 1e6, "m^-3"),
         ("R_ion", "cm3/s", 1e-6, "m^3 s^-1"),
-        ("V_d", "kV", 1e3, "V"),
-        ("I_d", "mA", 1e-3, "A"),
         ("f_kHz", "Hz", 1e-3, "kHz"),
         ("B", "1e-4 T", 1e-4, "T"),
-        ("E", "V/m", 1.0, "V m^-1"),
         ("x", "1", 1.0, "1"),
         ("x", "percent", 0.01, "1"),
         ("x", "1000 mm", 1.0, "m"),
@@ -272,14 +204,10 @@ def test_conversion_factors(ours: str, unit: str, factor: float, target: str) ->
     [
         ("p", "furlongg^-3", "the unit of p must be one that converts to SI: 'furlongg"),
         ("n_i", "s", "the unit of n_i must be one that converts to m\\^-3: 's' came"),
-        ("n_n", "cm^3", "the unit of n_n must be one that converts to m\\^-3: 'cm\\^3' came"),
-        ("n_i", "m(", r"'m\(' came"),
         ("n_i", "", "'' came"),
         ("T_e_eV", "m", "the unit of T_e_eV must be one that converts to eV: 'm' came"),
-        ("time", "m", "the unit of time must be one that converts to s: 'm' came"),
         ("B", "gauss", "'gauss' is not; write a gauss as '1e-4 T'"),
         ("P", "dBm", "'dBm' is not"),
-        ("T", "degC/s", "'degC/s' came"),
     ],
 )
 def test_units_without_a_factor_to_si_are_refused(ours: str, unit: str, message: str) -> None:
@@ -340,7 +268,6 @@ def npz(path: Path, **changes: np.ndarray) -> Path:
             {"variables": {"n_i": Variable("nii", "m^-3")}},
             r"no variable 'nii' .*; near it .*'ni'.*; it holds t \(6\), z \(4\), r \(3\), ",
         ),
-        ({}, {"z": Variable("x", "m")}, r"has no variable 'x' \(wanted as z\)"),
         ({}, {"variables": {"n_i": Variable(None, "m^-3")}}, "none of .* has a name"),
         ({}, {"variables": {"n_i": {"nmae": "ni", "unit": "m^-3"}}}, "n_i needs a name, a unit"),
         ({}, {"time": None}, "name the file's time or give its step dt_s; .* holds"),
@@ -354,16 +281,8 @@ def npz(path: Path, **changes: np.ndarray) -> Path:
             {"variables": {"n_i": Variable("ni", "m^-3", ["time", "r", "z"])}},
             r"dims given: \['time', 'r', 'z'\]; give data.variables.n_i.dims in the order",
         ),
-        (
-            {},
-            {"variables": {"n_i": Variable("ni", "m^-3", ["time", "x", "r"])}},
-            "must fit the grid",
-        ),
-        ({"t": TIME[:5]}, {}, "n_i must fit the grid"),
         ({"t": np.r_[TIME[:5], 3e-6]}, {}, r"t must increase: t\[5\] = 3e-06 s follows 5e-06 s"),
-        ({"t": TIME[[0, 1, 2, 3, 4, 4]]}, {}, r"t\[5\] = 5e-06 s follows 5e-06 s"),
         ({"z": np.tile(Z, (2, 1))}, {}, r"z must be a vector: 'z' has shape \(2, 4\)"),
-        ({"z": Z[::-1]}, {}, "z must increase"),
         ({"ni": N_I.astype(str)}, {}, "'ni' in .* must be real numbers, not <U"),
         ({"ni": N_I.astype(object)}, {}, "cannot be read: Object arrays cannot be loaded"),
     ],
@@ -432,10 +351,6 @@ KNOWN = (
         ("none.h5", None, "no such file: {folder}/none.h5"),
         ("", None, "a folder that ends in .zarr: .* is a folder"),
         ("a.xyz", "text", f"a file must be {KNOWN}"),
-        *(
-            (f"a.{end}", "t,ni\n0", f"a.{end} begins with b't,ni")
-            for end in ["nc", "h5", "mat", "npz"]
-        ),
         ("a.json", '{"output": {"frames": [{"t": 0.0', "a.json (cannot be read|has no variable)"),
         ("b.csv", "\0", "b.csv (cannot be read|has no variable)"),
     ],
@@ -478,23 +393,6 @@ def test_a_field_is_written_and_read_back_whole(tmp_path: Path) -> None:
     assert again["n_i"].identical(field["n_i"])
 
 
-def test_a_failed_write_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    field = open_field(npz(tmp_path), **SETTINGS)
-    write_field(field, tmp_path / "field.nc")
-
-    def interrupted(path: Path, content: bytes) -> None:
-        path.open("wb").write(content[: len(content) // 2])
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Path, "write_bytes", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write_field(field.isel(time=slice(2)), tmp_path / "field.nc")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "field.nc"]
-    assert read_field(tmp_path / "field.nc").sizes["time"] == NT
-
-
 def test_a_written_field_is_netcdf(tmp_path: Path) -> None:
     field = open_field(npz(tmp_path), **SETTINGS)
     with pytest.raises(ValueError, match=r"to a name that ends in .nc: .*field.h5 came"):
@@ -530,59 +428,13 @@ def test_the_config_group_opens_a_file_without_code(tmp_path: Path) -> None:
     path = npz(tmp_path, nn=N_I.T)
     field = opened(
         f"data.path={path}",
-        "data.variables.n_i.name=ni",
-        "data.variables.n_i.unit=cm-3",
-        "data.variables.n_n.name=nn",
-        "data.variables.n_n.unit='1e19 m^-3'",
-        "data.variables.n_n.dims=[r,z,time]",
-        "data.variables.T_e_eV.name=Te",
-        "+data.variables.x.name=Id",
-        "+data.variables.x.unit=1",
-        "data.time.name=t",
-        "data.time.unit=us",
+        "data.variables.n_i.name=null",
+        "data.variables.n_n={name: nn, unit: '1e19 m^-3', dims: [r,z,time]}",
+        "+data.variables.x={name: Id, unit: 1}",
+        "data.time={name: t, unit: us}",
         "data.r.name=r",
     )
-    assert sorted(map(str, field.data_vars)) == ["T_e_eV", "n_i", "n_n", "x"]
+    assert sorted(map(str, field.data_vars)) == ["n_n", "x"]
     assert field["x"].attrs["units"] == "1"
-    assert field["n_i"].values == pytest.approx(1e6 * N_I, rel=1e-15)
     assert field["n_n"].values == pytest.approx(1e19 * N_I, rel=1e-15)
     assert field["time"].values == pytest.approx(1e-6 * TIME, rel=1e-15)
-
-
-def test_the_config_group_takes_a_step_instead_of_time(tmp_path: Path) -> None:
-    field = opened(
-        f"data.path={npz(tmp_path)}",
-        "data.variables.n_i.name=ni",
-        "data.variables.n_n.name=null",
-        "data.dt_s=1.5e-6",
-        "data.r.name=r",
-    )
-    assert field["time"].values[-1] == 1.5e-6 * (NT - 1)
-
-
-REAL = Path(os.environ.get("EP2SINDY_DATA", ".")) / "thruster_2d_300V_5mgs.npz"
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not REAL.exists(), reason="the two-dimensional field is not at hand")
-def test_a_field_of_real_size_opens_and_averages() -> None:
-    variables = {
-        "n_i": Variable("n_i", "m^-3"),
-        "n_n": Variable("n_n", "m^-3"),
-        "T_e_eV": Variable("T_e", "eV"),
-        "R_ion": Variable("R_ion", "m^3/s"),
-        "I_d": Variable("I_d", "A"),
-    }
-    field = open_field(REAL, variables=variables, **AXES)
-    assert field["n_i"].shape == (2668, 41, 49)
-    plasma = keep_where(field, condition="(z > 0.025) | ((r > 0.035) & (r < 0.05))")
-    run = zone_average(
-        plasma,
-        Zone(z=(0.015, 0.025)),
-        states=["n_i", "n_n"],
-        inputs=["R_ion", "I_d"],
-        products=["n_i*n_n*R_ion"],
-    )
-    means = run.values.mean(axis=0)
-    assert 1e17 < means[0] < 1e19
-    assert 0.3 < means[4] / (means[0] * means[1] * means[2]) < 3.0

@@ -1,0 +1,94 @@
+"""Settings that cannot work end an experiment before it simulates, and before it keeps a model."""
+
+import re
+from pathlib import Path
+
+import pytest
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+from ep2sindy.app.runner import run_config
+from tests.programs import composed
+from tests.test_pages import TOYS
+
+LIBRARY_KEYS = "library may have ['degree', 'products', 'variables'] and needs variables and degree"
+TWICE = "points=[{V_D_V: 300, mdot_mg_s: 5},{V_D_V: 300.0, mdot_mg_s: 5}]"
+ALIKE = "points=[{V_D_V: 1, mdot_mg_s: 5},{V_D_V: 2, mdot_mg_s: 5}]"
+LINE = "{V_D_V: 300, mdot_mg_s: [4, 5, 6, 7]}"
+FEW = "{V_D_V: 300, mdot_mg_s: [4, 5]}, {V_D_V: 310, mdot_mg_s: 4}"
+STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in range(4))
+
+
+@pytest.mark.parametrize(
+    ("experiment", "changes", "message"),
+    [
+        ("benchmark", ["n_realizations=0"], "n_realizations must be a whole number, one or more"),
+        ("benchmark", ["noises=[0.1,-0.1]"], "noises[1] must be numbers, zero or more: -0.1 came"),
+        ("benchmark", ["variants=[our]"], "unknown variants ['our']; there are "),
+        ("benchmark", ["definitions.ours.selection.gamma=-1.0"], "gamma must be zero or more"),
+        ("benchmark", ["definitions.ours={_target_:builtins.dict}"], "must name a _target_"),
+        ("breathing", ["depth=0"], "depth must be a whole number, one or more: 0 came"),
+        ("breathing", ["libraries.simple.n_norm=libary"], "must be 'library' or 'max_terms'"),
+        ("breathing", ["trajectory.zone.z=[0.5,0.6]"], "a zone must hold grid points"),
+        ("breathing", ["libraries.simple.variables=[n_i,q]"], "unknown variables ['q']; this fie"),
+        ("constrained", ["models=null"], "models must be like {name: {terms: {x: [x, x*y]}, "),
+        ("constrained", ["models.velocity.relations=null"], "velocity.relations must be a list"),
+        ("constrained", ["~models.velocity.terms.n_i"], "velocity.terms must list the terms"),
+        ("constrained", ["models.velocity.relations=['n_i: 2']"], "joined by one '=='"),
+        ("frontier", ["variants=[STLSG]"], "unknown variants ['STLSG']; there are ['"),
+        ("frontier", ["rates_Hz=[0]"], "rates_Hz[0] must be numbers, above zero: 0 came"),
+        ("ils", ["held_out=0.001"], "held_out=0.001 must leave 20 samples on either side"),
+        ("ils", ["window=901"], "window must hold 5 samples or more and fit the first part"),
+        ("ils", ["relations=[]"], "relations must be a list of relations, such as"),
+        ("ils", ["relations=['n_i: n_n == 1']"], "'n_n' is not in the support of 'n_i'"),
+        ("ils", ["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
+        ("ils", ["+figures.colour=1"], "figures may have duration_s and f_max_Hz alone"),
+        ("parametric", ["points=[{V_D_V: 300}]"], "a point must have ['V_D_V', 'mdot_mg_s']"),
+        ("parametric", ["points=[{V_D_V: a, mdot_mg_s: 5}]"], "V_D_V as a number: 'a' came"),
+        ("parametric", [TWICE], "an operating point may come once: V_D_V=300, mdot_mg_s=5 comes"),
+        ("parametric", ["parameters.V_D_V=null", ALIKE], "points must differ in their data: V_D"),
+        ("parametric", ["parameters.V_D_V=operating_point.volts"], "volts must be there"),
+        ("parametric", ["cases=null"], "cases must be like {free: {relations: [], quantities:"),
+        ("parametric", ["cases.free.quantities.L_m.power=3"], "the power 1 or -1"),
+        ("parametric", ["bootstrap.n_draws=5"], "a 95 % interval needs 40 draws or more"),
+        ("parametric", ["+library.variables_if_present=[u_ir]"], LIBRARY_KEYS),
+        ("parametric", ["trends=[{along: V_D_V, at: {}}]"], "a trend goes along one parameter"),
+        ("parametric", ["+figures.panels=[[L]]"], "figures may have labels alone: ['labels', "),
+        ("pointwise", ["bootstraps.n=0"], "a pointwise study needs bootstraps for its spread"),
+        ("pointwise", ["outline.inner_radius=0.06"], "inner_radius must be below outer_radius"),
+        ("pointwise", ["terms=[n_i-n_n]"], "a term is variables joined by *"),
+        ("pointwise", ["terms=[n_i*B]"], "unknown variables ['B']; this field has"),
+        ("pointwise", ["bootstraps.block=100000"], "no point could be fitted: a block must hold"),
+        ("predict", ["models.conserving.terms.n_i=[n_i,u_iz]"], "runs freely, on its states ['n_i"),
+        ("predict", ["models.conserving.terms.n_n=[]"], "must list the terms of every state"),
+        (
+            "predict",
+            ["+models.conserving.known.n_n.1={flow: 4.58e22}"],
+            "functions of ['V_D_V', ",
+        ),
+        ("predict", ["+models.conserving.relations=['n_i: n_i == n_n: n_n^2']"], "unknown term"),
+        ("predict", [f"points=[{LINE}]"], "'V_D_V' is 300 at all 4 operating points; give it mor"),
+        ("predict", [f"points=[{FEW}]"], "a law of 3 functions of ['V_D_V', 'mdot_mg_s'] needs m"),
+        ("predict", [f"points=[{STRAIGHT}]"], "4 points do not tell the 3 terms of a law apart"),
+        ("simulate", ["scan={operating_point.volts:[1]}"], "operating_point.volts must be there"),
+        ("simulate", ["scan={n_cells:[]}"], "scan must be like {operating_point.voltage: [250,"),
+        ("simulate", ["scan={n_cells:[30,30]}"], "each value once"),
+        ("weak", ["boxes.test_functions.n_points=70"], "test_functions.n_points is what n_points"),
+        ("weak", ["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
+        ("weak", ["model.n_n=[q]"], "unknown variables ['q']"),
+        ("weak", ["n_points=[10,1201]"], "n_points=1201 was asked of 1200 samples; lower n_points"),
+        ("weak_windows", ["n_points=[10,3001]"], "n_points=3001 was asked of 3000 samples"),
+        ("weak_windows", ["boxes.test_functions.n_windows=9"], "n_windows is what n_windows"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(
+    experiment: str, changes: list[str], message: str, predator_prey: Path, tmp_path: Path
+) -> None:
+    toy = TOYS[experiment](predator_prey, tmp_path)
+    own = [text for text in toy if not text.startswith("+exp=")]
+    config = composed(f"+exp={experiment}", *own, *changes)
+    refused = (ValueError, HydraException, OmegaConfBaseException)
+    with pytest.raises(refused, match=re.escape(message)):
+        run_config(config)
+    assert not (tmp_path / "cache").exists()
+    assert not list(tmp_path.glob("*/*/models"))
