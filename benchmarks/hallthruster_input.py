@@ -24,7 +24,6 @@ from ep2sindy.thruster.parameters import Background, OperatingPoint, Thruster
 from ep2sindy.thruster.plume import ThermalPlume
 from ep2sindy.thruster.propellant_files import propellant
 from ep2sindy.thruster.propellants import PropellantTable
-from ep2sindy.thruster.tables import Node
 from ep2sindy.thruster.transport import (
     AnomalousTransport,
     BohmTransport,
@@ -41,6 +40,56 @@ from ep2sindy.thruster.walls import (
     Wall,
     wall_material,
 )
+
+NEEDED: Any = object()
+
+
+class Node:
+    """A mapping and its place in the file. `end()` refuses the keys that were not taken."""
+
+    def __init__(self, values: Any, place: str) -> None:
+        if not isinstance(values, Mapping):
+            raise ValueError(f"{place} must be a mapping: {values!r} came")
+        self.place = place
+        self._left = dict(values)
+
+    def take(self, key: str, default: Any = NEEDED) -> Any:
+        """The value of a key, or the default; raises ValueError if a required key is missing."""
+        if key in self._left:
+            return self._left.pop(key)
+        if default is NEEDED:
+            raise ValueError(f"{self.place} must have the key {key!r}: it is not there")
+        return default
+
+    def number(self, key: str, default: Any = NEEDED) -> float:
+        """Take a number."""
+        value = self.take(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"{self.place}.{key} must be a number: {value!r} came")
+        return float(value)
+
+    def node(self, key: str, default: Any = NEEDED) -> Node:
+        """Take a nested mapping."""
+        return Node(self.take(key, default), f"{self.place}.{key}")
+
+    def at_rest(self, values: Mapping[str, Any]) -> None:
+        """Take keys that are supported at a single value only."""
+        for key, value in values.items():
+            if (came := self.take(key, value)) != value:
+                raise ValueError(
+                    f"{self.place}.{key} is not supported here but at {value!r}: {came!r} came"
+                )
+
+    def idle(self, *keys: str) -> None:
+        """Take keys that have no effect here."""
+        for key in keys:
+            self.take(key, None)
+
+    def end(self) -> None:
+        """Raise ValueError for the remaining keys."""
+        if self._left:
+            raise ValueError(f"{self.place} has keys that are not supported: {sorted(self._left)}")
+
 
 TORR = 101325.0 / 760.0  # Pa
 

@@ -75,7 +75,6 @@ from ep2sindy.forecasting.tracking import estimate_states as estimate_states
 # Refinement
 from ep2sindy.refinement.refine import refine as refine
 from ep2sindy.refinement.refine import Refinement as Refinement
-from ep2sindy.refinement.elimination import eliminate as eliminate
 from ep2sindy.refinement.problem import RefinementSettings as RefinementSettings
 from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
 from ep2sindy.library.relations import constraint as constraint
