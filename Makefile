@@ -8,7 +8,7 @@ TYPED := $(patsubst %,tests/test_%.py,types files numbers fields inspection kalm
 	propellants axial plane thruster model simulation forecast datasets weak constraints search systems given \
 	control_law refine_law operating_plots map_plots plots sklearn report compare experiment_frontier)
 
-.PHONY: breathing test test-fast test-slow test-docs lint types docs docs-numbers benchmark clean
+.PHONY: breathing test test-fast test-slow test-lowest test-docs lint types docs docs-numbers benchmark clean
 
 # The stamp is written last: an interrupted installation is taken up again.
 .venv/installed: pyproject.toml constraints.txt
@@ -38,6 +38,15 @@ test-fast: .venv/installed
 # EP2SINDY_DATA=folder adds the checks against files that are not shipped.
 test-slow: lint
 	$(BIN)/python -m pytest -q
+
+# The fast suite with the lowest versions that pyproject.toml admits; of torch the tested one.
+test-lowest:
+	$(PYTHON) -m venv .venv-lowest
+	.venv-lowest/bin/python -m pip install --quiet -c constraints.txt torch uv
+	grep '^torch==' constraints.txt > .venv-lowest/torch.txt
+	.venv-lowest/bin/uv pip install --python .venv-lowest/bin/python --resolution lowest-direct \
+		--override .venv-lowest/torch.txt -e ".[dev]"
+	.venv-lowest/bin/python -m pytest -q -m "not slow" -n auto --dist worksteal
 
 # What guards figures and commands of README and docs: every page's Python, the site, the wheel.
 test-docs: .venv/installed
@@ -69,4 +78,4 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.trajectory_scores
 
 clean:
-	rm -rf .venv site .cache .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv .venv-lowest site .cache .mypy_cache .ruff_cache .pytest_cache
