@@ -12,7 +12,7 @@ from nptdms import ChannelObject, TdmsWriter
 from scipy.io import savemat
 
 from ep2sindy.data.mapping import Variable
-from ep2sindy.data.open import open_field, read_field, write_field
+from ep2sindy.data.open import inspect_file, open_field, read_field, write_field
 from ep2sindy.data.quantities import conversion, same_unit
 from ep2sindy.data.readers.source import look_at
 from tests.programs import composed

@@ -241,7 +241,7 @@ def _least_squares(
 
     n = theta.shape[1]
     if not n:  # nothing is free
-        return np.zeros(0), np.zeros((0, 0)), float(np.mean(np.square(target)))
+        return np.zeros(0), np.zeros((0, 0)), float(target @ target / max(len(target), 1))
     norms, size = column_norms(theta), np.linalg.norm(target) or 1.0
     columns = np.column_stack([theta / norms, target / size])
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))
