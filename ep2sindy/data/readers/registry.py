@@ -14,9 +14,14 @@ from ep2sindy.data.readers.netcdf import NETCDF, ZARR
 from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_at
 from ep2sindy.data.readers.tables import CSV, EXCEL, NPY, PARQUET, TDMS
 from ep2sindy.runtime.screen import joined
+from ep2sindy.trust.memory import check_memory
 
 # The first that takes a file reads it: those by their first bytes, then those by form and ending.
 READERS = (MATLAB, NPY, PARQUET, TDMS, EXCEL, NETCDF, HDF5, NPZ, CSV, HALLTHRUSTER, ZARR)
+
+READ_LATER = (MATLAB, NETCDF, HDF5, ZARR)  # large variables are read when they are used
+
+SMALLER = "divide it, or save it as NetCDF, of which parts are read"
 
 
 def open_source(path: Path) -> FileSource:
@@ -27,6 +32,8 @@ def open_source(path: Path) -> FileSource:
             f"{path} is of the kind {reader.name}, which an extra reads: pip install "
             "'ep2sindy[files]', or save it as CSV"
         )
+    if reader not in READ_LATER:  # its values take about as many bytes, or more
+        check_memory(float(path.stat().st_size), f"{path}, which is read at once,", way_out=SMALLER)
     with damage_named(path):
         return replace(reader.open(path), kind=reader.name)
 
