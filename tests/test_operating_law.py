@@ -69,6 +69,27 @@ def test_the_law_of_a_known_family_is_found() -> None:
     np.testing.assert_allclose(weighted.coef, truth(), atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"coef": np.ones((3, 3))},
+            r"a finite number for every .* shape \(3, 3\) came for \(4, 3\)",
+        ),
+        ({"coef": np.full((4, 3), np.nan)}, "a finite number for every coefficient"),
+        ({"coefficients": (("x", "x"), ("x", "y"), ("x", "x^3"), ("z", "x"))}, "x of z came"),
+        ({"coefficients": (("x", "x"), ("x", "y"), ("x", "q"), ("y", "x"))}, "q of x came"),
+        ({"points": np.ones((4, 3))}, r"a column for each of \['a', 'b'\]"),
+        ({"points": np.ones((0, 2))}, "a column for each"),
+        ({"points": np.full((4, 2), np.inf)}, "points must be finite"),
+        ({"covariance": np.eye(4)}, r"that of 12 numbers: shape \(4, 4\)"),
+    ],
+)
+def test_a_law_holds_numbers_that_fit_each_other(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(law(), **change)
+
+
 def test_a_model_between_the_points_is_the_true_one() -> None:
     at = {"a": 0.8, "b": 0.3}
     model = law().model_at(at)
