@@ -26,6 +26,7 @@ from ep2sindy.estimation.likelihood import (
     fit_paths,
     gram,
     innovations,
+    parting,
     squares,
 )
 from ep2sindy.estimation.noise import _shown_by_samples
@@ -229,6 +230,17 @@ def test_a_fit_is_where_the_squares_have_no_slope() -> None:
         tried = [squares(problem, fit.paths, fit.free + s * change, level).sum() for s in (1, -1)]
         curvature = (tried[0] + tried[1] - 2 * fit.total) / 2.0
         assert abs(tried[0] - tried[1]) < 0.05 * np.sqrt(max(curvature, 0.0))
+
+
+def test_paths_of_the_same_record_twice_part_as_fast_as_of_one() -> None:
+    found = []
+    run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 200)
+    for runs in ([run], [run, run]):
+        problem = scale_problem(runs, ep.lorenz().model.library)
+        level = Level(tuple(np.full((200, 3), 0.05) for _ in runs), 0.01)
+        found.append(parting(problem, fit_of_truth(problem, ep.lorenz().model), level))
+    assert found[0] > 0.001
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
 
 
 def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:

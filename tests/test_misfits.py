@@ -15,7 +15,7 @@ from benchmarks.spoilt import spoilt
 from ep2sindy.data.gaps import between_gaps
 from ep2sindy.estimation import explanation
 from ep2sindy.estimation.likelihood import TrajectoryFit
-from ep2sindy.estimation.noise import Noise, noise_beside
+from ep2sindy.estimation.noise import ALIKE_SAMPLES, Noise, noise_beside
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.systems.systems import System
@@ -42,6 +42,22 @@ def test_34_clean_cycles_are_not_the_noise_of_a_state_at_rest(n: int) -> None:
     noise = noise_of([run], [at_rest(run)])
     assert noise.patterned.all()
     assert not noise.memory.any()
+
+
+def test_the_deviance_of_noise_with_a_memory_is_that_of_an_ar1_process() -> None:
+    rng, n = np.random.default_rng(0), 400
+    white, memory = rng.normal(size=(n, 2)), np.array([0.6, 0.0])
+    noise = np.zeros((n, 2))
+    for k in range(n):
+        noise[k] = memory * noise[k - 1] + white[k]
+    run = ep.Trajectory(np.arange(float(n)), noise, ["x", "y"])
+    found = noise_of([run], [np.zeros((n, 2))])
+    assert found.memory == pytest.approx(memory, abs=0.1)
+    variance = np.square(found.std)
+    alike = variance + ALIKE_SAMPLES / n * variance.mean()
+    assert found.deviance == pytest.approx(
+        n * (np.log(alike) + np.log(1.0 - np.square(found.memory))).sum()
+    )
 
 
 def test_a_line_is_found_in_pieces_of_a_record_and_at_unequal_steps() -> None:

@@ -55,7 +55,7 @@ class WienerProcess:
         n, norms = weights.shape[1], np.sqrt(np.square(weights).sum(axis=0))
         weights /= norms
         by_noise = np.zeros_like(by_process)
-        for k in range(4):
+        for k in range(min(4, n)):
             by_process[k, : n - k] /= norms[k:] * norms[: n - k]
             by_noise[k, : n - k] = (weights[k:, : n - k] * weights[: 4 - k, k:]).sum(axis=0)
         return WienerProcess(steps, weights, by_noise, by_process)
@@ -106,7 +106,7 @@ class WienerProcess:
         for k, weight in enumerate(self.differences / root):
             bands[k : k + n, 0, 2 * WIDTH + 1 - 2 * k] = weight
             bands[:n, 1, 2 * WIDTH - 1 + 2 * k] = -weight
-        for k, shared in enumerate(self.by_process[:3]):
+        for k, shared in enumerate(self.by_process[: min(3, n)]):
             bands[: n - k, 1, 2 * WIDTH + 2 * k] = shared[: n - k]
             bands[k:n, 1, 2 * WIDTH - 2 * k] = shared[: n - k]
         sides[:n, 1] = self._differences_of(values) / root
@@ -155,7 +155,7 @@ def _covariance(steps: Float[np.ndarray, " steps"]) -> Float[np.ndarray, "four d
     splines = np.stack([one * x**2 / before, middle, three * y**2 / after]) * 3.0 / whole
     weights = 0.5 * shares * np.stack([one, two, three])
     covariance = np.zeros((4, len(one)), order="F")  # as LAPACK takes it
-    for k in range(3):  # difference i + k begins where step k of difference i does
+    for k in range(min(3, len(one))):  # difference i + k begins where step k of i does
         n = len(one) - k
         products = splines[k:, :n] * splines[: 3 - k, k:] * weights[k:, :n]
         covariance[k, :n] = products.sum(axis=(0, 2))
