@@ -29,7 +29,6 @@ FREE_START = 100.0  # prior variance of the first state: ten times its RMS, squa
 HELD_START = 1e-24  # the same of one that starts at zero
 MAX_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of a step tried
 STEERED = 1.0  # parting of paths, in nats per sample; chaotic systems that are resolved reach 0.3
-MAX_FOLLOWING, WORTH_FOLLOWING = 3, 0.5  # steps of the states alone; what each must leave at most
 SETTLED = 1e-2  # a fall of the squares that ends the fit; a term's price is about ten
 # Give up on a fit with mean square above FAR that falls by less than this share per step.
 FAR, CRAWLS = 10.0, 0.02
@@ -132,18 +131,13 @@ def squares(
     return np.where(np.isfinite(total), total, np.inf)
 
 
-def fit_paths(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, follow: bool = False
-) -> TrajectoryFit:
+def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> TrajectoryFit:
     """Minimise the squares over states and coefficients, which keep their signs.
 
     The result is the nearest local minimum. A coefficient that must be positive and would not be
     leaves the support, and a state that is nonnegative and would start below zero starts there.
-    follow: before a step is halved, let the states follow its coefficients, which takes far fewer
-    steps where the flow is nearly exact. On the way there it would lead into models that follow any
-    samples.
     """
-    fit = _descend(problem, replace(fit, at_zero=None), level, follow)
+    fit = _descend(problem, replace(fit, at_zero=None), level)
     while np.isfinite(fit.total):
         below = problem.nonnegative & [path[0] < 0.0 for path in fit.paths]
         below &= True if fit.at_zero is None else ~fit.at_zero
@@ -153,7 +147,7 @@ def fit_paths(
             fit = _from_zero(fit, below)
         else:
             break
-        fit = _descend(problem, fit, level, follow)
+        fit = _descend(problem, fit, level)
     return fit
 
 
@@ -180,9 +174,7 @@ def _from_zero(fit: TrajectoryFit, below: Bool[np.ndarray, "records d"]) -> Traj
     return replace(fit, paths=paths, at_zero=held)
 
 
-def _descend(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level, follow: bool
-) -> TrajectoryFit:
+def _descend(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> TrajectoryFit:
     """Gauss-Newton with step halving, whatever the signs."""
     fit = replace(fit, squares=squares(problem, fit.paths, fit.free, level))
     if not np.isfinite(fit.total):
@@ -196,8 +188,6 @@ def _descend(
         while share > SHORTEST:
             paths = tuple(p + share * m for p, m in zip(fit.paths, moves, strict=True))
             tried = _at(problem, replace(fit, free=fit.free + share * change), paths, level)
-            if follow:
-                tried = _follow(problem, tried, level, below=fit.total)
             if tried.total < fit.total:
                 break
             share /= 2.0
@@ -214,28 +204,6 @@ def _at(
     problem: EstimationProblem, fit: TrajectoryFit, paths: tuple[np.ndarray, ...], level: Level
 ) -> TrajectoryFit:
     return replace(fit, paths=paths, squares=squares(problem, paths, fit.free, level))
-
-
-def _follow(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, below: float
-) -> TrajectoryFit:
-    """Let the states follow their coefficients, until the squares fall below a value.
-
-    A step of both is straight, and at small rho the states must keep to a flow that is not.
-    """
-    first, none = fit, np.zeros_like(fit.support)
-    for _ in range(MAX_FOLLOWING):
-        if fit.total < below or not np.isfinite(fit.total):
-            break
-        flow = _flow(problem, fit, none, level)
-        moves = _moves(problem, fit, level, flow, np.empty(0))
-        paths = tuple(p + m for p, m in zip(fit.paths, moves, strict=True))
-        tried = _at(problem, fit, paths, level)
-        if not tried.total < WORTH_FOLLOWING * fit.total:
-            break
-        fit = tried
-    followed = fit is not first and fit.total < below
-    return fit if followed and parting(problem, fit, level) < STEERED else first
 
 
 def parting(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> float:

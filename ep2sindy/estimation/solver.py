@@ -216,7 +216,7 @@ def polish(
     """
     if not found.fit.total < FAR * problem.n_squares:
         return found
-    fit, cold = at_level(problem, found.fit, found.level, follow=True)
+    fit, cold = at_level(problem, found.fit, found.level)
     found = AnnealedFit(fit, cold, float(fit.total + prices[fit.support].sum()))
     tried = {found.fit.support.tobytes()}
     for _ in range(MAX_ROUNDS):
@@ -233,7 +233,7 @@ def polish(
             tried.add(each.support.tobytes())
             start = replace(warmer, support=each.support, free=each.free)
             fit, cold = at_level(problem, start, level)
-            fit, cold = at_level(problem, fit, replace(cold, rho=found.level.rho), follow=True)
+            fit, cold = at_level(problem, fit, replace(cold, rho=found.level.rho))
             score = float(fit.total + prices[fit.support].sum())
             if score < found.score and parting(problem, fit, cold) < STEERED:
                 found = AnnealedFit(fit, cold, score)
@@ -279,13 +279,13 @@ def reheat(
 
 
 def at_level(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, follow: bool = False
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> tuple[TrajectoryFit, Level]:
-    """Fit at a level, with as many substeps as it needs; follow: see `fit_paths`."""
+    """Fit at a level, with as many substeps as it needs."""
     level = replace(level, n_substeps=enough_substeps(problem, fit, level))
     if not np.isfinite(squares(problem, fit.paths, fit.free, level)).all():
         fit = replace(fit, free=np.zeros_like(fit.free))  # the zero flow is finite
-    return fit_paths(problem, fit, level, follow=follow), level
+    return fit_paths(problem, fit, level), level
 
 
 def _exchange_terms(
