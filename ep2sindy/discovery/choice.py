@@ -255,10 +255,9 @@ def _count_free(held: Constraint, relations: Sequence[Relation]) -> dict[str, in
     """For each state that relations name, the number of free coefficients of its equation."""
     named = {state for relation in relations for _, state, _ in relation.factors}
     owners = np.array([state for state, _ in held.coefficients])
+    blocks = {state: held.C[owners == state] for state in held.states if state in named}
     return {
-        state: int(np.linalg.matrix_rank(held.C[owners == state]))
-        for state in held.states
-        if state in named
+        s: int(np.linalg.matrix_rank(block)) if block.size else 0 for s, block in blocks.items()
     }
 
 
