@@ -798,9 +798,9 @@ def test_squares_whose_sum_overflows_are_infinite_and_warn_of_nothing() -> None:
 
 def test_a_path_that_misses_the_steps_of_its_model_is_no_trajectory() -> None:
     """What annealing lets pass can hold a model up: y' = a x - b x z with b of 5e3, and z' = 0."""
-    rng = np.random.default_rng([5, 300, 1])
+    rng = np.random.default_rng([5, 300, 3])
     start = rng.uniform([-10.0, -10.0, 15.0], [10.0, 10.0, 30.0])
-    run = LORENZ.trajectory(noise=0.2, rng=500, initial=start).window(0, 300)
+    run = LORENZ.trajectory(noise=0.2, rng=503, initial=start).window(0, 300)
     missing = np.zeros(run.states.shape, dtype=np.bool_)
     missing[:, 2] = np.arange(300) % 10 > 0
     found = ep.estimate(replace(run, missing=missing), LORENZ.model.library)
