@@ -169,8 +169,9 @@ def test_a_run_that_was_broken_off_ends_with_the_same_file(
     config = composed(*on_file(grid, tmp_path), "keep=true")
     whole = programs.computed(config)
     rest = broken_and_resumed(monkeypatch, config, after=3)
-    one, other = (each.folder / "pointwise.nc" for each in (whole, rest))
-    assert one.read_bytes() == other.read_bytes()
+    # Not the bytes: older releases of h5netcdf write the time of day.
+    one, other = (xr.load_dataset(each.folder / "pointwise.nc") for each in (whole, rest))
+    xr.testing.assert_identical(one, other)
     assert "going on with the pieces" in rest.log
 
 
