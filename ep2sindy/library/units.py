@@ -59,7 +59,10 @@ def registry() -> pint.UnitRegistry:
     """Return the package's only pint registry; importing and building it takes 0.25 s."""
     import pint
 
-    return pint.UnitRegistry()
+    def plain(text: str) -> str:  # LaTeX's m^{-3}, which newer releases of pint do not read
+        return text.replace("{", "(").replace("}", ")")
+
+    return pint.UnitRegistry(preprocessors=[plain])
 
 
 @cache
