@@ -16,6 +16,7 @@ import xarray as xr
 from scipy import signal
 from scipy.interpolate import CubicSpline, make_interp_spline
 
+from ep2sindy.data.blocks import read_whole
 from ep2sindy.data.fields import (
     SPACE,
     check_field,
@@ -436,10 +437,12 @@ def _samples(field: xr.Dataset, name: str) -> xr.DataArray:
     """
     if name not in _of_time(field):
         raise ValueError(f"unknown variable of time {name!r}; this field has {_of_time(field)}")
-    array = field[name]
+    array = _time_first(field[name])
     check_samples(array, grid_values(array), mask_cells(array))
-    return _time_first(array)
+    return array
 
 
 def _time_first(array: xr.DataArray) -> xr.DataArray:
-    return array.transpose("time", ...).astype(np.float64)
+    """The variable, read once into memory, in float64 with time first."""
+    ordered = array.transpose("time", ...)
+    return ordered.copy(data=read_whole(ordered).astype(np.float64, copy=False))

@@ -93,9 +93,7 @@ def _windows(
 ) -> Windows:
     """Windows from the first sample and the length of each row, and weights row after row."""
     starts = np.append(0, np.cumsum(lengths))
-    places, shape = (
-        np.arange(starts[-1]) + np.repeat(first - starts[:-1], lengths),
-        (len(first), n_samples),
-    )
+    places = np.arange(starts[-1]) + np.repeat(first - starts[:-1], lengths)
+    shape = len(first), n_samples
     mean, slope = (csr_array((each, places, starts), shape=shape) for each in weights)
     return Windows(mean, slope)
