@@ -37,7 +37,7 @@ class NelderMead:
                 "NelderMead cannot fit initial states: pass free_start=False, or use "
                 "MultipleShooting"
             )
-        return join([self._fit_point(problem.take(p), p) for p in range(len(problem.odes))])
+        return join([self._fit_point(problem.take(p), p) for p in range(len(problem.equations))])
 
     def finer(self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray) -> None:
         """Return None: odeint chooses its own steps."""
@@ -74,12 +74,11 @@ class NelderMead:
 
 def window_paths(problem: RefinementProblem, scaling: np.ndarray) -> np.ndarray:
     """Trajectories by scipy's odeint, window by window, from the data; NaN where it fails."""
-    ode, batch = problem.odes[0], problem.batches[0]
-    basis, offset = (part.detach().cpu().numpy() for part in ode.linear_parts())
-    matrix = basis @ scaling + offset
+    equations, batch = problem.equations[0], problem.batches[0]
+    matrix = equations.matrix(scaling)
     path = np.full(batch.data.shape, np.nan)
-    values, terms = ode.library.at_points(ode.variables)
-    n = ode.n_states
+    values, terms = equations.library.at_points(equations.variables)
+    n = equations.n_states
     for w, data in enumerate(batch.data):
         t = np.append(0.0, np.cumsum(batch.steps[w]))
 

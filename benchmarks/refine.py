@@ -28,7 +28,6 @@ from ep2sindy.library.library import named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.ode import ODE
 from ep2sindy.refinement.problem import Iteration, RefinementProblem, RefinementSettings
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.steps import HermiteSimpson
@@ -125,10 +124,7 @@ def problem(case: Case) -> RefinementProblem:
         window=WINDOW,
         rng=np.random.default_rng(0),
     )
-    ode = ODE(case.start, scale=batch.scale, step_s=batch.step_s)
-    return RefinementProblem(
-        (ode,), (batch,), free_start=False, n_reweights=0, observe=lambda _: None
-    )
+    return RefinementProblem.of([case.start], [batch], [None], free_start=False)
 
 
 def by_hand(batch: WindowBatch, coef: np.ndarray, scaling: np.ndarray) -> np.ndarray:
@@ -251,7 +247,7 @@ def compare(case: Case) -> None:
         "torchdiffeq, L-BFGS": descent_s(work, GradientDescent(), goal=goal),
     }
     data, n_free = work.data[0], work.n_free
-    unit = (work.odes[0].free0 * work.odes[0].unit).numpy()
+    unit = work.equations[0].by_scaling.sum(axis=(0, 1))
     hand = by_hand if case.name == "predator-prey" else forced_by_hand
     for name, paths in {
         "by hand": partial(hand, work.batches[0], unit),

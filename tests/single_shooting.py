@@ -31,7 +31,7 @@ class SingleShooting:
     max_iter: int = 100
 
     def fit(self, problem: RefinementProblem) -> RefinementFit:
-        return join([self._fit_point(problem.take(p), p) for p in range(len(problem.odes))])
+        return join([self._fit_point(problem.take(p), p) for p in range(len(problem.equations))])
 
     def finer(self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray) -> None:
         """Set `n_substeps` instead."""
@@ -106,20 +106,20 @@ class SingleShooting:
 
     def _path(self, problem: RefinementProblem, unknown: np.ndarray) -> np.ndarray:
         """(windows, samples, n_states, columns): trajectories and their derivatives."""
-        system, data = problem.system, problem.data[0]
-        n, n_free, n_steps = system.n_states, system.n_free, data.shape[1] - 1
+        ode, data = problem.ode, problem.data[0]
+        n, n_free, n_steps = ode.n_states, ode.n_free, data.shape[1] - 1
         start = unknown[n_free:].reshape(-1, n) if problem.free_start else data[:, 0]
-        z = torch.zeros((1, n, system.n_columns, len(data)), dtype=torch.float64)
-        z[0, :, 0] = torch.tensor(start.T.copy())
+        z = torch.zeros((1, ode.n_columns, n, len(data)), dtype=torch.float64)
+        z[0, 0] = torch.tensor(start.T.copy())
         for j in range(n):
-            z[0, j, 1 + j] = 1.0
+            z[0, 1 + j, j] = 1.0
         t = torch.arange(n_steps + 1, dtype=torch.float64)
         fine = self.n_substeps * n_steps + 1
         grid = torch.linspace(0.0, float(n_steps), fine, dtype=torch.float64)
-        scaling = torch.tensor(unknown[None, :n_free], device=problem.device)
+        ode.set(unknown[None, :n_free], problem.whole)
         with torch.inference_mode():
             path = odeint(
-                system.rhs(scaling, problem.whole), z.to(problem.device), t, method="rk4",
+                ode, z.to(problem.device), t, method="rk4",
                 options={"grid_constructor": lambda func, y0, t: grid, "perturb": True},
             )  # fmt: skip
-        return path[:, 0].permute(3, 0, 1, 2).cpu().numpy()
+        return path[:, 0].permute(3, 0, 2, 1).cpu().numpy()

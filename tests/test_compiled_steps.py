@@ -8,8 +8,8 @@ import ep2sindy as ep
 from ep2sindy.model.scaled import ScaledModel
 from ep2sindy.model.stability import LimitCycle, share_reaching
 from ep2sindy.refinement.kernels import gap_sizes, squares, triangles
-from ep2sindy.refinement.ode import ODE, Augmented, Drive, augment
-from ep2sindy.refinement.steps import RungeKutta
+from ep2sindy.refinement.ode import ODE, Drive, ScaledEquations
+from ep2sindy.refinement.steps import FusedRungeKutta, RungeKutta, fastest_step
 from tests.models import model_of
 
 CASES = {
@@ -20,31 +20,33 @@ CASES = {
 
 @pytest.mark.parametrize("n_substeps", [1, 2])
 @pytest.mark.parametrize("case", CASES)
-def test_compiled_steps_are_those_of_torchdiffeq(
-    monkeypatch: pytest.MonkeyPatch, case: str, n_substeps: int
-) -> None:
+def test_fused_steps_are_those_of_torchdiffeq(case: str, n_substeps: int) -> None:
     rng, variables = np.random.default_rng(0), sorted({*"xy", *("u" if case == "an input" else "")})
     library = ep.polynomial(variables, degree=3)
     coef = ep.coef_matrix(library, [*CASES[case].values()])
     scale, n_inputs = np.array([2.0, 0.5, 3.0])[: len(variables)], len(variables) - 2
     model = ep.SparseModel(library, ["x", "y"], coef)
-    odes = [ODE(model, scale=scale, step_s=0.2) for _ in range(3)]
-    system, steps = augment(odes), RungeKutta(n_substeps)
+    ode = ODE.of([ScaledEquations.of(model, scale=scale, step_s=0.2)] * 3)
     drive = Drive(
         torch.tensor(rng.uniform(0.5, 1.5, size=(1, 3, 20))),
         torch.tensor(0.3 * rng.normal(size=(1, 4, 3, n_inputs, 20))),
     )
-    scaling, nodes = rng.uniform(0.5, 1.5, (3, system.n_free)), rng.normal(size=(3, 4, 6, 2))
-    assert system.compiled
-    fast = steps.maps(system, drive, scaling, nodes), steps.finer(system, drive, scaling, nodes)
-    monkeypatch.setattr(Augmented, "compiled", False)
-    slow = steps.maps(system, drive, scaling, nodes), steps.finer(system, drive, scaling, nodes)
-    for ours, torchs in zip(fast, slow, strict=True):
+    nodes = rng.normal(size=(3, 4, 6, 2))
+    ode.set(rng.uniform(0.5, 1.5, (3, ode.n_free)), drive)
+    fused, steps = FusedRungeKutta(n_substeps), RungeKutta(n_substeps)
+    for ours, torchs in (
+        (fused.maps(ode, nodes), steps.maps(ode, nodes)),
+        (fused.finer(ode, nodes), steps.finer(ode, nodes)),
+        (fused.maps(ode, nodes, by_scaling=False), steps.maps(ode, nodes)[..., [0, 1, -1]]),
+        (steps.maps(ode, nodes, by_scaling=False), steps.maps(ode, nodes)[..., [0, 1, -1]]),
+    ):
         assert ours.shape == torchs.shape
         np.testing.assert_allclose(ours, torchs, rtol=1e-11, atol=1e-13)
-    held = system.held(torch.tensor(scaling))
-    alone = RungeKutta(n_substeps).maps(held, drive, scaling[:, :0], nodes)
-    np.testing.assert_allclose(alone, slow[0][..., [0, 1, -1]], rtol=1e-11, atol=1e-13)
+
+
+def test_only_products_are_fused() -> None:
+    assert isinstance(fastest_step(ep.polynomial(["x"])), FusedRungeKutta)
+    assert isinstance(fastest_step(ep.polynomial(["x"], functions=["sin"])), RungeKutta)
 
 
 def test_triangles_are_those_of_lapack() -> None:

@@ -95,10 +95,11 @@ def test_every_iteration_is_told_one_scalar_each() -> None:
     watch = watcher(lambda scalars, *, step: told.append((step, scalars)), "ils", relations)
     for loss in (0.5, 0.25):
         watch(Iteration(0, 25, loss, np.array([1.0, 2.0, 3.0]), 0.1, 1e-9))
-    assert [step for step, _ in told] == [0, 1]
+    assert [step for step, _ in told] == [0, 1, 2]
     fit = {"ils/loss": 0.25, "ils/step": 0.1, "ils/defect": 1e-9, "ils/window_stage": 25}
     scalings = {"ils/scaling/x/x": 1.0, "ils/scaling/x/x.y": 2.0, "ils/scaling/y/y": 3.0}
-    assert told[1][1] == fit | scalings
+    assert told[2][1] == fit | scalings
+    assert told[0][1] == dict.fromkeys(scalings, 1.0)
 
 
 def test_iterations_go_to_tensorboard(toy_run: Path) -> None:

@@ -118,7 +118,7 @@ def _refinement() -> None:
         )
         brief(ep.thruster.Thruster(), point, n_cells=20, progress=False)
     system = ep.lotka_volterra()
-    for step in (ep.refinement.RungeKutta(), ep.refinement.HermiteSimpson()):
+    for step in (ep.refinement.RungeKutta(), ep.refinement.FusedRungeKutta()):
         method = ep.refinement.MultipleShooting(step=step)
         ep.refine(system.model, system.trajectory(), window=20, n_windows=2, method=method)
     model = system.model

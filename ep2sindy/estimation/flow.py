@@ -10,16 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.library.library import Library
-from ep2sindy.model.flow_kernels import SumsOfProducts, Tableau, advance, reach_of
-
-LEADS = (0.0, 0.5, 0.5, 1.0)  # of the stages of a step, and their weights
-WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
-CLASSICAL = Tableau(
-    leads=np.diag(LEADS[1:], k=-1),
-    weights=np.array(WEIGHTS),
-    places=np.array([0, 1, 1, 2]),
-    stride=2,
-)
+from ep2sindy.model.flow_kernels import CLASSICAL, advance, sums_of_products
 
 # Equation and term of each coefficient by which a flow is differentiated.
 Coefficients = tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]
@@ -112,31 +103,17 @@ class RightHandSides:
         by: Coefficients,
         slopes: Float[np.ndarray, "steps d columns"],
     ) -> Float[np.ndarray, "steps d"]:
-        """Ends of the steps by the compiled kernel; derivatives go to slopes, unless it is empty.
-
-        Products that neither the coefficients nor the derivatives need stay out.
-        """
-        used = coef.any(axis=1)
-        sums = np.tensordot(coef[used].T, self._shares[used], axes=1)
-        if not slopes.shape[2]:
-            sums = sums[:, :1]
-        target, column, product = np.nonzero(sums)
-        weight, slope_of = sums[target, column, product], column > 0
-        pairs, pair = np.unique(
-            target[slope_of] * self.d + column[slope_of] - 1, return_inverse=True
-        )
-        target[slope_of] = self.d + pair
-        # Each coefficient's own product is a sum by itself.
-        own, p = self._places[by[1]], np.arange(len(by[0]))
-        product = np.append(product, own)
-        target = np.append(target, self.d + len(pairs) + p)
-        needed = np.unique(product)
-        row, factor = np.divmod(pairs, self.d)
-        equations = SumsOfProducts(
-            self._products.table[needed], np.searchsorted(needed, product), target,
-            np.append(weight, np.ones(len(p))), row, factor, by[0], p,
-            reach_of(self.d, row, factor),
-        )  # fmt: skip
+        """Ends of the steps by the compiled kernel; derivatives go to slopes, if it has columns."""
+        used, (equation, term) = coef.any(axis=1), by
+        weights = np.tensordot(coef[used].T, self._shares[used], axes=1)
+        if slopes.shape[2]:
+            # A coefficient changes the rate of its equation by its own product.
+            own = np.zeros((self.d, len(term), weights.shape[2]))
+            own[equation, np.arange(len(term)), self._places[term]] = 1.0
+            weights = np.concatenate([weights, own], axis=1)
+        else:
+            weights = weights[:, :1]
+        equations = sums_of_products(self._products.table, weights)
         ends = np.empty_like(states)
         states = np.ascontiguousarray(states)
         advance(states, steps.inputs, steps.h, CLASSICAL, equations, ends, slopes)
@@ -159,9 +136,10 @@ class RightHandSides:
             by_state = np.einsum("tjp,ti->pij", self._shares[:, 1:], coef)
             rates = np.column_stack([rates, by_state.reshape(-1, d * d)])
             total[:, np.arange(d), np.arange(d)] = 1.0
+        leads = CLASSICAL.leads.sum(axis=1)  # each stage leads on from the one before alone
         for k in range(steps.n_substeps):
             start, slope, begun, change = states, np.zeros_like(states), total.copy(), 0.0
-            for s, (lead, weight) in enumerate(zip(LEADS, WEIGHTS, strict=True)):
+            for s, (lead, weight) in enumerate(zip(leads, CLASSICAL.weights, strict=True)):
                 ahead, share = (lead * steps.h)[:, None], (weight * steps.h)[:, None]
                 values = self._products_of(start + ahead * slope, steps.inputs_at(k, s))
                 both = values @ rates

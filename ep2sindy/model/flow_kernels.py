@@ -9,9 +9,11 @@ end of the step by the matrix `gains[s]`, which follows from the Jacobians of th
 each coefficient costs four products per state, however the states are coupled.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ep2sindy.runtime.compilation import LOOPS, compiled
 
@@ -32,13 +34,29 @@ class Tableau(NamedTuple):
     stride: int
 
 
+CLASSICAL = Tableau(
+    leads=np.diag([0.5, 0.5, 1.0], k=-1),
+    weights=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
+    places=np.array([0, 1, 1, 2]),
+    stride=2,
+)
+
+THREE_EIGHTHS = Tableau(
+    leads=np.array([[0, 0, 0, 0], [1 / 3, 0, 0, 0], [-1 / 3, 1, 0, 0], [1.0, -1, 1, 0]]),
+    weights=np.array([0.125, 0.375, 0.375, 0.125]),
+    places=np.arange(4),
+    stride=3,
+)
+
+
 class SumsOfProducts(NamedTuple):
     """Right-hand sides and their derivatives as weighted sums of products of columns.
 
     table: (products, factors), columns whose product it is: states, inputs, and ones last.
     Entry e adds weight[e] times product[e] to sum target[e]. The sums are the slopes of the d
     states, then the derivative of the slope of state row[q] by state factor[q], then the derivative
-    of the slope of state equation[r] by coefficient column[r]. reach: (d, d), see `reach_of`.
+    of the slope of state equation[r] by coefficient column[r]. reach: (d, d), true where a step
+    carries a change of state k to state j, by four Jacobian entries at most.
     """
 
     table: np.ndarray
@@ -52,11 +70,42 @@ class SumsOfProducts(NamedTuple):
     reach: np.ndarray
 
 
-def reach_of(d, row, factor):
-    """(d, d), true where a step carries a change of state k to state j: four entries at most."""
-    one = np.eye(d)
-    one[row, factor] = 1.0
-    return np.linalg.matrix_power(one, 4) > 0.0
+def sums_of_products(
+    table: np.ndarray, weights: Float[np.ndarray, "d columns products"]
+) -> SumsOfProducts:
+    """Rates and derivatives as the kernel takes them, without the weights that are zero.
+
+    table: (products, factors), as of a library over states and inputs. Columns of the weights: the
+    rate, its derivatives by each state, then by each coefficient.
+    """
+    there = weights != 0.0
+    needed, product, target, *where = _order_of_sums(there.shape, there.tobytes())
+    return SumsOfProducts(table[needed], product, target, weights[there], *where)
+
+
+@lru_cache(maxsize=256)  # a fit takes many steps in which the same weights stay zero
+def _order_of_sums(shape: tuple[int, int, int], there: bytes) -> tuple[np.ndarray, ...]:
+    """The products that are used, and the fields of `SumsOfProducts` that hold no weights.
+
+    There is a sum of products for every rate, then for every derivative that is not zero.
+    """
+    d, width = shape[:2]
+    state, column, product = np.nonzero(np.frombuffer(there, dtype=np.bool_).reshape(shape))
+    by_state, by_coefficient = (column > 0) & (column <= d), column > d
+    code = state * width + column
+    pairs, pair = np.unique(code[by_state], return_inverse=True)
+    sources, source = np.unique(code[by_coefficient], return_inverse=True)
+    target = state.copy()
+    target[by_state] = d + pair
+    target[by_coefficient] = d + len(pairs) + source
+    row, factor = pairs // width, pairs % width - 1
+    carried = np.eye(d)
+    carried[row, factor] = 1.0
+    reach = np.linalg.matrix_power(carried, 4) > 0.0
+    # Columns of `nonzero` are strided, and the kernel would be compiled once more for them; those
+    # of `unique` are not.
+    needed, product = np.unique(product, return_inverse=True)
+    return needed, product, target, row, factor, sources // width, sources % width - 1 - d, reach
 
 
 @compiled(inline="always")

@@ -6,6 +6,7 @@ from ep2sindy.refinement.methods.gradient_descent import (
     GradientDescent as GradientDescent,
 )  # for configs
 from ep2sindy.refinement.steps import RungeKutta as RungeKutta  # for configs
+from ep2sindy.refinement.steps import FusedRungeKutta as FusedRungeKutta  # for configs
 from ep2sindy.refinement.steps import HermiteSimpson as HermiteSimpson  # for configs
 from ep2sindy.refinement.ode import ODE as ODE
 from ep2sindy.refinement.correction import Corrected as Corrected

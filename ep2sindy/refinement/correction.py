@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import RefinementStatus, is_flat, status_of
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.gradient_descent import trajectories as integrate
-from ep2sindy.refinement.ode import ODE, unconstrained
+from ep2sindy.refinement.ode import ScaledEquations
 from ep2sindy.refinement.problem import (
     Iteration,
     RefinementFit,
@@ -150,42 +150,48 @@ def _train(
     if not isinstance(method, GradientDescent):
         raise ValueError(f"a learned correction is trained by GradientDescent alone: {method} came")
     (batch,) = settings.cut([model], [trajectories], np.random.default_rng(seed))
-    known, ode = _known_and_whole(model, correction, batch, settings.constraint, device)
-    problem = RefinementProblem(
-        (ode,), (batch,), settings.free_start, settings.n_reweights, observe
-    )
-    fit = method.fit(problem)
-    relations = unconstrained(model) if settings.constraint is None else settings.constraint
+    known = RefinementProblem.of(
+        [model], [batch], [settings.constraint], free_start=settings.free_start,
+        n_reweights=settings.n_reweights, observe=observe, device=device,
+    )  # fmt: skip
+    rate = _typical_rate(known.equations[0], batch)
+    term = _Scaled(deepcopy(correction), rate).to(device, torch.float64)
+    _check_shape(term, known.equations[0], device)
+    problem = replace(known, correction=term)
     return _result(
-        model, correction, known, problem, fit, relations, history, n_substeps=method.n_substeps
+        model,
+        correction,
+        known,
+        problem,
+        method.fit(problem),
+        history,
+        n_substeps=method.n_substeps,
     )
 
 
 def _result(
     model: SparseModel,
     correction: nn.Module,
-    known: ODE,
+    known: RefinementProblem,
     problem: RefinementProblem,
     fit: RefinementFit,
-    constraint: Constraint,
     history: Sequence[Iteration],
     *,
     n_substeps: int,
 ) -> Corrected:
     """Result in SI; holds the model and term given if the fit did not stay finite."""
-    (ode,), (batch,) = problem.odes, problem.batches
+    (equations,), (batch,), term = problem.equations, problem.batches, problem.correction
     nodes, window_loss, status = _judge(problem, fit, n_substeps)
     trained = status is not RefinementStatus.NON_FINITE
-    coef = (ode if trained else known).coef.detach().cpu().numpy()
-    term = ode.correction
+    scaling = fit.scaling[0] if trained else np.ones_like(fit.scaling[0])
     assert isinstance(term, _Scaled)
     state_scale = batch.scale[: len(model.states)]
     return Corrected(
-        model=with_coef(model, constraint, coef)[0],
+        model=with_coef(model, equations.relations, equations.coef(scaling))[0],
         correction=(term.inner if trained else deepcopy(correction)).to("cpu", torch.float64),
         scale=batch.scale,
         rate=float(term.rate) * state_scale / batch.step_s,
-        loss_before=_loss_from_data(known, problem, n_substeps),
+        loss_before=_loss_from_data(known, n_substeps),
         loss=float(window_loss.mean()) if trained else float("inf"),
         window_loss=window_loss,
         status=status,
@@ -193,26 +199,6 @@ def _result(
         batch=batch,
         trajectories=nodes * state_scale,
     )
-
-
-def _known_and_whole(
-    model: SparseModel,
-    correction: nn.Module,
-    batch: WindowBatch,
-    constraint: Constraint | None,
-    device: str,
-) -> tuple[ODE, ODE]:
-    """Modules of the known part alone, and of it plus a copy of the correction of order one."""
-
-    def ode(term: nn.Module | None) -> ODE:
-        return ODE(
-            model, scale=batch.scale, step_s=batch.step_s, constraint=constraint, correction=term
-        ).to(device)
-
-    known = ode(None)
-    term = _Scaled(deepcopy(correction), _typical_rate(known, batch)).to(device, torch.float64)
-    _check_shape(term, known, device)
-    return known, ode(term)
 
 
 class _Scaled(nn.Module):
@@ -229,17 +215,15 @@ class _Scaled(nn.Module):
         return self.rate * self.inner(values)
 
 
-def _typical_rate(known: ODE, batch: WindowBatch) -> float:
+def _typical_rate(known: ScaledEquations, batch: WindowBatch) -> float:
     """Rms of the known part over the windows, in std per sample; one if it vanishes."""
-    n_inputs = batch.inputs.shape[-1]
     values = np.concatenate([batch.data[:, :-1], batch.inputs[:, :, -1]], axis=-1)
-    flat = torch.tensor(values.reshape(-1, known.n_states + n_inputs), device=known.free0.device)
-    with torch.no_grad():
-        rate = float((known.library.evaluate(flat) @ known.matrix).square().mean().sqrt())
+    rates = known.library.evaluate(values) @ known.matrix(np.ones(known.n_free))
+    rate = float(np.sqrt(np.square(rates).mean()))
     return rate if rate > 0.0 else 1.0
 
 
-def _check_shape(term: nn.Module, known: ODE, device: str) -> None:
+def _check_shape(term: nn.Module, known: ScaledEquations, device: str) -> None:
     rows = torch.zeros((3, len(known.variables)), dtype=torch.float64, device=device)
     with torch.no_grad():
         out = term(rows)
@@ -265,23 +249,25 @@ def _judge(
         flat=is_flat(loss, data, free_start=problem.free_start),
         unidentifiable=False,  # the coefficients have no covariance
         settled=bool(fit.finished[0]),
-        coarse=lambda: not _step_error(problem, nodes, n_substeps) < allowed,
+        coarse=lambda: not _step_error(problem, fit, n_substeps) < allowed,
     )
     return nodes, window_loss, status
 
 
-def _step_error(problem: RefinementProblem, nodes: np.ndarray, n_substeps: int) -> float:
+def _step_error(problem: RefinementProblem, fit: RefinementFit, n_substeps: int) -> float:
     """Rms change of the trajectories, in std, under half the time step."""
+    nodes = fit.nodes[0]
+    problem.ode.set(fit.scaling, problem.whole)
     start = torch.tensor(nodes[:, 0].copy(), device=problem.device)
     with torch.no_grad():
-        finer = integrate(problem.odes[0], problem.whole, start, nodes.shape[1], 2 * n_substeps)
+        finer = integrate(problem.ode, problem.whole, start, nodes.shape[1], 2 * n_substeps)
     return float((finer - torch.tensor(nodes, device=problem.device)).square().mean().sqrt())
 
 
-def _loss_from_data(known: ODE, problem: RefinementProblem, n_substeps: int) -> float:
-    """Loss of a module integrated over each window from the window's first sample."""
-    data = torch.tensor(problem.data[0], device=problem.device)
+def _loss_from_data(known: RefinementProblem, n_substeps: int) -> float:
+    """Loss of equations integrated over each window from the window's first sample."""
+    data = torch.tensor(known.data[0], device=known.device)
     with torch.no_grad():
-        path = integrate(known, problem.whole, data[:, 0], data.shape[1], n_substeps)
+        path = integrate(known.ode, known.whole, data[:, 0], data.shape[1], n_substeps)
     loss = float((path - data).square().mean())
     return loss if np.isfinite(loss) else float("inf")

@@ -104,7 +104,7 @@ def fit_and_judge(
     fit = method.fit(problem)
     closed, verdicts = judge(problem, fit)
     while any(coarse := [v.status is RefinementStatus.COARSE_STEP for v in verdicts]):
-        points = np.flatnonzero(np.broadcast_to(coarse, len(problem.odes)))
+        points = np.flatnonzero(np.broadcast_to(coarse, len(problem.equations)))
         again = method.finer(problem, closed if problem.law is None else fit, points)
         if again is None:
             break
@@ -131,14 +131,14 @@ def judge(
     fit = replace(fit, finite=problem.agree(fit.finite & ~overflown, np.all))
     bias = least_change(step_triangles(problem, fit, sound), problem.law)
     change = least_change(triangles[:, :, None], problem.law)
-    points = np.arange(len(problem.odes))
+    points = np.arange(len(problem.equations))
     if problem.law is not None:
         rows = problem.law.rows(triangles)
         rows = rows.reshape(-1, *rows.shape[2:])
         return fit, [_judge_points(problem, fit, problem.law, points, rows, bias, change)]
     verdicts = []
-    for p, ode in enumerate(problem.odes):
-        n_free = len(ode.free0)
+    for p, equations in enumerate(problem.equations):
+        n_free = equations.n_free
         rows = triangles[p][..., np.append(np.arange(n_free), -1)]
         law, unknowns = LawMap.identity(n_free), (bias[p, :n_free], change[p, :n_free])
         verdicts.append(_judge_points(problem, fit, law, points[[p]], rows, *unknowns))
@@ -258,17 +258,17 @@ def integrate_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndar
 
 def rollout(problem: RefinementProblem, fit: RefinementFit, *, n_substeps: int = 4) -> np.ndarray:
     """Integrate every window step by step with torchdiffeq's rk4, from its fitted start."""
-    system, n_steps = problem.system, fit.nodes.shape[2] - 1
+    ode, n_steps = problem.ode, fit.nodes.shape[2] - 1
+    ode.set(fit.scaling, problem.whole)
     start = torch.tensor(fit.nodes[:, :, 0].transpose(0, 2, 1).copy(), device=problem.device)
-    scaling = torch.tensor(fit.scaling, device=problem.device)
     t = torch.arange(n_steps + 1, dtype=torch.float64)
     grid = torch.linspace(0.0, float(n_steps), n_substeps * n_steps + 1, dtype=torch.float64)
     with torch.inference_mode():
         path = odeint(
-            system.value_rhs(scaling, problem.whole), start, t, method="rk4",
+            ode, start[:, None], t, method="rk4",
             options={"grid_constructor": lambda func, y0, t: grid, "perturb": True},
         )  # fmt: skip
-    return path.permute(1, 3, 0, 2).cpu().numpy()
+    return path[:, :, 0].permute(1, 3, 0, 2).cpu().numpy()
 
 
 def failure(
@@ -302,7 +302,8 @@ def step_triangles(problem: RefinementProblem, fit: RefinementFit, maps: np.ndar
 
     The error of a step is its difference from two steps of half its length.
     """
-    error = fit.step.finer(problem.system, problem.one_step, fit.scaling, fit.nodes) - maps[..., -1]
+    problem.ode.set(fit.scaling, problem.one_step)
+    error = fit.step.finer(problem.ode, fit.nodes) - maps[..., -1]
     shifted = maps.copy()
     shifted[..., -1] = fit.nodes[:, :, 1:] + error
     n_start, window = problem.n_start, fit.nodes.shape[2]

@@ -103,7 +103,7 @@ def refine_law(
             n_reweights=settings.n_reweights,
             observe=observe,
         )
-        free0 = np.stack([ode.free0.numpy() for ode in problem.odes])
+        free0 = np.stack([each.free0 for each in problem.equations])
         begin = weighted_law(free0, None, basis) if start is None else start
         law = LawMap.of(free0, known, begin)
         problem = replace(problem, law=law)

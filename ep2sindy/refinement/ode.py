@@ -1,8 +1,8 @@
-"""Sparse models in torch: right-hand sides, derivatives by states and scalings."""
+"""The equations that a refinement fits, as one torch module over all its points."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -51,92 +51,213 @@ class Drive:
             inputs = ((cubic[0] * u + cubic[1]) * u + cubic[2]) * u + cubic[3]
         return None if self._uniform else self.steps[k][:, None], inputs
 
+    def take(self, points: torch.Tensor) -> Drive:
+        return Drive(self.steps[:, points], self.inputs[:, :, points])
 
-class ODE(nn.Module):
-    """Equations x' = coef library(x, inputs), in scaled states and scaled time.
 
-    States and inputs are in units of `scale` (states, then inputs), time in units of `step_s`.
-    coef = C (scaling * free0) + d in SI, so relations between coefficients always hold; the
-    scalings are the unknowns.
-    correction: an extra term of shape (..., states + inputs) -> (..., states), in scaled
-    variables, whose parameters are trained together with the scalings; only `forward` includes it.
-    Raises ValueError for a model without terms, a relation that leaves out one of its terms or
-    names an unknown one, or a free coefficient of zero, which no scaling can change.
+@dataclass(frozen=True, eq=False)
+class ScaledEquations:
+    """One model in the units of its windows, linear in the scalings of its free coefficients.
+
+    The coefficients in SI are C (scaling * free0) + d, so relations between them always hold. In
+    scaled variables and time the rates are terms(x, u) @ (by_scaling @ scaling + fixed).
+    variables: states, then inputs. by_scaling: (terms, equations, free); fixed: (terms, equations).
     """
 
-    free0: torch.Tensor
-    C: torch.Tensor
-    d: torch.Tensor
-    unit: torch.Tensor
-    places: torch.Tensor
+    variables: tuple[str, ...]
+    n_states: int
+    library: Library
+    relations: Constraint
+    free0: Float[np.ndarray, " free"]
+    by_scaling: Float[np.ndarray, "terms equations free"]
+    fixed: Float[np.ndarray, "terms equations"]
 
-    def __init__(
-        self,
+    @staticmethod
+    def of(
         model: SparseModel,
         *,
         scale: Float[np.ndarray, " variables"],
         step_s: float,
         constraint: Constraint | None = None,
+    ) -> ScaledEquations:
+        """States and inputs are in units of `scale` (states, then inputs), time of `step_s`.
+
+        Raises ValueError for a model without terms, a relation that leaves out one of its terms or
+        names an unknown one, or a free coefficient of zero, which no scaling can change.
+        """
+        relations = unconstrained(model) if constraint is None else constraint
+        coef = _coef(model, relations)
+        rows = [model.library.index(name) for _, name in relations.coefficients]
+        used, terms = np.unique(rows, return_inverse=True)
+        equations = np.array([model.states.index(state) for state, _ in relations.coefficients])
+        variables = (*model.states, *model.inputs)
+        library, values = model.library.take(used).over(variables).scaled(scale)
+        # SI coefficient times this is the coefficient in scaled variables and time.
+        unit = step_s * values[terms] / scale[equations]
+        free0 = coef[np.asarray(relations.free)]
+        by_scaling = np.zeros((len(library), len(model.states), len(free0)))
+        by_scaling[terms, equations] = relations.C * free0 * unit[:, None]
+        fixed = np.zeros(by_scaling.shape[:2])
+        fixed[terms, equations] = relations.d * unit
+        n = len(model.states)
+        return ScaledEquations(variables, n, library, relations, free0, by_scaling, fixed)
+
+    @property
+    def n_free(self) -> int:
+        return len(self.free0)
+
+    def matrix(self, scaling: Float[np.ndarray, " free"]) -> Float[np.ndarray, "terms equations"]:
+        """Coefficients in scaled variables and time."""
+        return self.by_scaling @ scaling + self.fixed
+
+    def coef(self, scaling: Float[np.ndarray, " free"]) -> Float[np.ndarray, " coefs"]:
+        """Coefficients in SI, in the order of the relations."""
+        return self.relations.coef(self.free0 * scaling)
+
+
+class ODE(nn.Module):
+    """Right-hand side of all points of a refinement, in scaled states and time, with tangents.
+
+    The rates of a point are W m(x, u), with the distinct products m of its terms and of their
+    derivatives, and W = basis @ scaling + offset. The scalings, (points, free), are what is fitted,
+    and begin at one; a point with fewer of them ignores the excess.
+    basis: (points, columns * n_states, products, free), with a column for the rates, one for their
+    derivatives by each state, and one for those by each scaling; offset: the same without `free`.
+    correction: a term of a single point, from scaled states and inputs (batch, variables) to rates
+    (batch, n_states), whose parameters are trained together with the scalings.
+    drive: steps and inputs on the way, which must be set before an integration.
+    """
+
+    factors: torch.Tensor
+    basis: torch.Tensor
+    offset: torch.Tensor
+    drive: Drive
+
+    def __init__(
+        self,
+        library: Library,
+        n_states: int,
+        basis: torch.Tensor,
+        offset: torch.Tensor,
         correction: nn.Module | None = None,
     ) -> None:
         super().__init__()
-        relations = unconstrained(model) if constraint is None else constraint
-        coef = _coef(model, relations)
-        self.variables = (*model.states, *model.inputs)
-        self.n_states = len(model.states)
-        rows = [model.library.index(name) for _, name in relations.coefficients]
-        used, terms = np.unique(rows, return_inverse=True)
-        equations = [model.states.index(state) for state, _ in relations.coefficients]
-        self.library, values = model.library.take(used).over(self.variables).scaled(scale)
-        # SI coefficient times this is the coefficient in scaled variables and time.
-        unit = step_s * values[terms] / scale[equations]
-        for name, value in {
-            "free0": coef[np.asarray(relations.free)],
-            "C": relations.C,
-            "d": relations.d,
-            "unit": unit,
-        }.items():
-            self.register_buffer(name, torch.tensor(np.asarray(value), dtype=torch.float64))
-        self.register_buffer("places", torch.tensor(terms * self.n_states + equations))
-        self.scaling = nn.Parameter(torch.ones(len(self.free0), dtype=torch.float64))
+        self.library, self.n_states = library, n_states
+        factors = torch.tensor(library.table.T, device=basis.device)
+        self.register_buffer("factors", factors.contiguous())
+        self.register_buffer("basis", basis)
+        self.register_buffer("offset", offset)
+        self.scaling = nn.Parameter(basis.new_ones((len(basis), basis.shape[-1])))
         self.correction = correction
-        self.drive: Drive | None = None
 
-    @property
-    def coef(self) -> torch.Tensor:
-        """Coefficients (coefs,) in SI, in the order of the constraint."""
-        return self.C @ (self.scaling * self.free0) + self.d
+    @staticmethod
+    def of(points: Sequence[ScaledEquations], correction: nn.Module | None = None) -> ODE:
+        """Module of some points, whose terms may differ.
 
-    @property
-    def matrix(self) -> torch.Tensor:
-        """Coefficient matrix (terms, equations) in scaled variables and time."""
-        flat = torch.zeros(
-            len(self.library) * self.n_states, dtype=self.free0.dtype, device=self.free0.device
-        )
-        return flat.index_add(0, self.places, self.coef * self.unit).view(-1, self.n_states)
-
-    def forward(self, t: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        """Right-hand side at x (batch, n_states); t: in samples since each window's start."""
-        values, steps = x, None
-        if self.drive is not None:
-            steps, inputs = self.drive.at(t)
-            values = torch.cat([x, inputs[0].T], dim=-1)
-        rate = self.library.evaluate(values) @ self.matrix
-        if self.correction is not None:
-            rate = rate + self.correction(values)
-        return rate if steps is None else rate * steps[0].T
-
-    def linear_parts(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Linear parts of `matrix` = first @ scaling + second.
-
-        Returns first, (terms, equations, free), and second, (terms, equations).
+        Raises ValueError for points that differ in their variables.
         """
-        shape = (len(self.library), self.n_states)
-        by_scaling = self.C * self.free0 * self.unit[:, None]
-        basis = self.C.new_zeros((shape[0] * shape[1], len(self.free0)))
-        offset = self.C.new_zeros(shape[0] * shape[1])
-        basis = basis.index_add(0, self.places, by_scaling).view(*shape, -1)
-        return basis, offset.index_add(0, self.places, self.d * self.unit).view(shape)
+        if len({(point.variables, point.n_states) for point in points}) > 1:
+            raise ValueError(
+                "models refined in one batch must share their states and inputs: "
+                f"{sorted({point.variables for point in points})} came"
+            )
+        products, basis, offset = _weights(points)
+        return ODE(
+            products, points[0].n_states, torch.tensor(basis), torch.tensor(offset), correction
+        )
+
+    @property
+    def n_free(self) -> int:
+        return self.basis.shape[-1]
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns: the rate, its derivatives by each state, then by each scaling."""
+        return 1 + self.n_states + self.n_free
+
+    def take(self, points: torch.Tensor) -> ODE:
+        """Module of some of the points, with scalings of one, without drive or correction."""
+        return ODE(self.library, self.n_states, self.basis[points], self.offset[points])
+
+    def set(self, scaling: Float[np.ndarray, "points free"], drive: Drive) -> None:
+        """Set the scalings, and what the next integration goes through."""
+        with torch.no_grad():
+            self.scaling.copy_(torch.tensor(scaling))
+        self.drive = drive
+
+    def weights(self, n_columns: int) -> torch.Tensor:
+        """Weights of the products in the first columns, (points, rows, products)."""
+        rows = n_columns * self.n_states
+        by_scaling = self.basis[:, :rows] @ self.scaling[:, None, :, None]
+        return by_scaling[..., 0] + self.offset[:, :rows]
+
+    def fields(self, x: torch.Tensor, inputs: torch.Tensor, n_columns: int) -> torch.Tensor:
+        """Rates, then their derivatives, (points, n_columns, n_states, batch).
+
+        x: (points, n_states, batch). One gather and product evaluates every distinct product, one
+        matmul all columns.
+        """
+        columns = torch.cat([x, inputs, torch.ones_like(x[:, :1])], dim=1)
+        columns = self.library.with_functions(columns, axis=1)
+        products = columns.index_select(1, self.factors[0])
+        for rows in self.factors[1:]:
+            products = products * columns.index_select(1, rows)
+        found = torch.bmm(self.weights(n_columns), products)
+        return found.view(len(x), n_columns, self.n_states, x.shape[-1])
+
+    def forward(self, t: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+        """d/dt of states and tangents z, (points, columns, n_states, batch).
+
+        The first column is the state x, with x' = f(x, s). The others are, as far as they are
+        given, its derivatives S by each of its initial values, with S' = (df/dx) S, then those by
+        each scaling s, with S' = (df/dx) S + df/ds.
+        """
+        steps, inputs = self.drive.at(t)
+        n, x = self.n_states, z[:, 0]
+        found = self.fields(x, inputs, z.shape[1])
+        if z.shape[1] > 1:
+            whole = torch.empty_like(z)
+            whole[:, 0] = found[:, 0]
+            tangents = torch.mul(found[:, 1:2], z[:, 1:, :1], out=whole[:, 1:])
+            for v in range(1, n):
+                tangents.addcmul_(found[:, 1 + v : 2 + v], z[:, 1:, v : v + 1])
+            tangents[:, n:] += found[:, 1 + n :]
+            found = whole
+        if self.correction is not None:
+            found = found + self._correct(x, inputs)
+        return found if steps is None else found * steps[:, None]
+
+    def _correct(self, x: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
+        """Rates of the correction; it has no tangents, which only autograd could give."""
+        assert self.correction is not None
+        rates: torch.Tensor = self.correction(torch.cat([x, inputs], dim=1)[0].T)
+        return rates.T[None, None]
+
+
+@lru_cache(maxsize=256)  # every fold of a selection refines the same terms
+def _products(
+    variables: tuple[str, ...], terms: tuple[Term, ...], n: int
+) -> tuple[Library, Library, np.ndarray]:
+    """A library of the terms, and their derivatives as by `Library.with_derivatives`."""
+    library = library_of(variables, terms)
+    return library, *library.with_derivatives(n)
+
+
+def _weights(points: Sequence[ScaledEquations]) -> tuple[Library, np.ndarray, np.ndarray]:
+    """The products that any point needs, and the basis and the offset of their weights."""
+    first = points[0]
+    n, n_free = first.n_states, max(point.n_free for point in points)
+    distinct = tuple(dict.fromkeys(term for point in points for term in point.library.terms))
+    terms, products, transfer = _products(first.variables, distinct, n)
+    size = (len(points), 1 + n + n_free, n, len(products))
+    basis, offset = np.zeros((*size, n_free)), np.zeros(size)
+    for point, by_point, fixed_point in zip(points, basis, offset, strict=True):
+        spread, own = transfer[terms.places(point.library)], point.n_free
+        by_point[: 1 + n, :, :, :own] = np.einsum("tcm,tji->cjmi", spread, point.by_scaling)
+        fixed_point[: 1 + n] = np.einsum("tcm,tj->cjm", spread, point.fixed)
+        fixed_point[1 + n : 1 + n + own] = np.einsum("tm,tji->ijm", spread[:, 0], point.by_scaling)
+    rows = (size[0], size[1] * n, len(products))
+    return products, basis.reshape(*rows, n_free), offset.reshape(rows)
 
 
 def unconstrained(model: SparseModel) -> Constraint:
@@ -180,142 +301,3 @@ def _coef(model: SparseModel, relations: Constraint) -> np.ndarray:
             "cannot move them; start from a small value"
         )
     return coef
-
-
-@dataclass(frozen=True, eq=False)
-class Augmented:
-    """Right-hand sides of many points with their derivatives by state and scaling, in one batch.
-
-    One gather and product evaluates every distinct product of `library`. One matmul of these gives
-    the rate, its derivatives by the states and its derivatives by the scalings, column by column.
-    factors: (degree, products). basis: (points, rows, products, free), with rows = n_states *
-    columns. offset: the same without `free`.
-    """
-
-    library: Library
-    factors: torch.Tensor
-    basis: torch.Tensor
-    offset: torch.Tensor
-    n_states: int
-
-    @property
-    def n_free(self) -> int:
-        return self.basis.shape[-1]
-
-    @property
-    def compiled(self) -> bool:
-        """True if the kernel of `model.flow_kernels` takes the same steps."""
-        return not self.library.functions and self.offset.device.type == "cpu"
-
-    @property
-    def n_columns(self) -> int:
-        """Number of columns: the rate, its derivatives by each state, then by each scaling."""
-        return 1 + self.n_states + self.n_free
-
-    def take(self, points: torch.Tensor) -> Augmented:
-        return replace(self, basis=self.basis[points], offset=self.offset[points])
-
-    def held(self, scaling: torch.Tensor) -> Augmented:
-        """The same with scalings (points, free) as they are, without derivatives by them."""
-        shape = (len(scaling), self.n_states, self.n_columns, -1)
-        weights = self.weights(scaling).view(shape)[:, :, : 1 + self.n_states].flatten(1, 2)
-        return replace(self, basis=weights.new_zeros((*weights.shape, 0)), offset=weights)
-
-    def weights(self, scaling: torch.Tensor) -> torch.Tensor:
-        """Weights of the products, (points, rows, products), for scalings (points, free)."""
-        return (self.basis @ scaling[:, None, :, None])[..., 0] + self.offset
-
-    def fields(self, weights: torch.Tensor, x: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
-        """Rates and their derivatives, (points, n_states, columns, batch).
-
-        x: (points, n_states, batch).
-        """
-        columns = torch.cat([x, inputs, torch.ones_like(x[:, :1])], dim=1)
-        columns = self.library.with_functions(columns, axis=1)
-        products = columns.index_select(1, self.factors[0])
-        for rows in self.factors[1:]:
-            products = products * columns.index_select(1, rows)
-        return torch.bmm(weights, products).view(len(x), self.n_states, -1, x.shape[-1])
-
-    def rhs(
-        self, scaling: torch.Tensor, drive: Drive
-    ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
-        """Function for d/dt of the state and of its derivatives by its start and the scalings.
-
-        The function takes and returns (points, n_states, columns, batch).
-        """
-        weights, n = self.weights(scaling), self.n_states
-
-        def rate(t: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
-            steps, inputs = drive.at(t)
-            out = self.fields(weights, z[:, :, 0], inputs)
-            tangents = out[:, :, 1:2] * z[:, 0:1, 1:]
-            for v in range(1, n):
-                tangents.addcmul_(out[:, :, 1 + v : 2 + v], z[:, v : v + 1, 1:])
-            tangents[:, :, n:] += out[:, :, 1 + n :]
-            whole = torch.cat([out[:, :, :1], tangents], dim=2)
-            return whole if steps is None else whole.mul_(steps[:, None])
-
-        return rate
-
-    def value_rhs(
-        self, scaling: torch.Tensor, drive: Drive
-    ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
-        """Function for d/dt of the state only, (points, n_states, batch)."""
-        weights = self.weights(scaling)[:, :: self.n_columns]
-
-        def rate(t: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-            steps, inputs = drive.at(t)
-            out = self.fields(weights, x, inputs)[:, :, 0]
-            return out if steps is None else out * steps
-
-        return rate
-
-
-@lru_cache(maxsize=256)  # every fold of a selection refines the same terms
-def _products(
-    variables: tuple[str, ...], terms: tuple[Term, ...], n: int
-) -> tuple[Library, Library, np.ndarray]:
-    """A library of the terms, and their derivatives as by `Library.with_derivatives`."""
-    library = library_of(variables, terms)
-    return library, *library.with_derivatives(n)
-
-
-def augment(odes: Sequence[ODE]) -> Augmented:
-    """Combine modules of the same variables into one batch of points, on the first's device.
-
-    Terms may differ: the products are those that any module needs, and modules with fewer
-    scalings are padded with columns of zeros.
-    Raises ValueError for modules that differ in variables, or hold a correction, whose
-    derivatives are available only from autograd.
-    """
-    first = odes[0]
-    if any(ode.correction is not None for ode in odes):
-        raise ValueError("a learned correction has no tangents here; refine by GradientDescent")
-    if any((ode.variables, ode.n_states) != (first.variables, first.n_states) for ode in odes):
-        raise ValueError(
-            "models refined in one batch must share their states and inputs: "
-            f"{sorted({ode.variables for ode in odes})} came"
-        )
-    n, n_free = first.n_states, max(len(ode.free0) for ode in odes)
-    distinct = tuple(dict.fromkeys(term for ode in odes for term in ode.library.terms))
-    terms, products, transfer = _products(first.variables, distinct, n)
-    size = (len(odes), n, 1 + n + n_free, len(products))
-    basis, offset = np.zeros((*size, n_free)), np.zeros(size)
-    for ode, by_point, fixed_point in zip(odes, basis, offset, strict=True):
-        with torch.no_grad():
-            by_scaling, fixed = (part.cpu().numpy() for part in ode.linear_parts())
-        spread = transfer[terms.places(ode.library)]
-        own = by_scaling.shape[-1]
-        by_point[:, : 1 + n, :, :own] = np.einsum("tcm,tji->jcmi", spread, by_scaling)
-        fixed_point[:, : 1 + n] = np.einsum("tcm,tj->jcm", spread, fixed)
-        fixed_point[:, 1 + n : 1 + n + own] = np.einsum("tm,tji->jim", spread[:, 0], by_scaling)
-    device = first.C.device
-    factors = torch.tensor(products.table.T, device=device)
-    return Augmented(
-        library=products,
-        factors=factors.contiguous(),
-        basis=torch.tensor(basis, device=device).flatten(1, 2),
-        offset=torch.tensor(offset, device=device).flatten(1, 2),
-        n_states=n,
-    )

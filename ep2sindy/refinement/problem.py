@@ -10,12 +10,13 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from torch import nn
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.ode import ODE, Augmented, Drive, augment
+from ep2sindy.refinement.ode import ODE, Drive, ScaledEquations
 from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
 from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.refinement.windows import (
@@ -229,18 +230,21 @@ class LawMap:
 class RefinementProblem:
     """Models of the same states, with a batch of windows for each, on one device.
 
-    free_start: true if the initial state of each window is fitted; otherwise it is the data's.
-    n_reweights: number of passes with weights 1/std of the residuals, after weights 1/std of the
-    data. law: ties the scalings of all points to the few unknowns of a law; None gives each point
-    its own scalings.
+    equations: of each model in the units of its windows; `ode` is their module. free_start: true if
+    the initial state of each window is fitted; otherwise it is the data's. n_reweights: number of
+    passes with weights 1/std of the residuals, after weights 1/std of the data. law: ties the
+    scalings of all points to the few unknowns of a law; None gives each point its own scalings.
+    correction: a term that is trained along, of the only point.
     """
 
-    odes: tuple[ODE, ...]
+    equations: tuple[ScaledEquations, ...]
     batches: tuple[WindowBatch, ...]
     free_start: bool
     n_reweights: int
     observe: Callable[[Iteration], None]
     law: LawMap | None = None
+    device: str = "cpu"
+    correction: nn.Module | None = None
 
     @staticmethod
     def of(
@@ -254,15 +258,18 @@ class RefinementProblem:
         device: str = "cpu",
     ) -> RefinementProblem:
         """Problem with models scaled like their windows; a constraint of None frees all terms."""
-        odes = [
-            ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=relations).to(device)
+        equations = tuple(
+            ScaledEquations.of(model, scale=batch.scale, step_s=batch.step_s, constraint=relations)
             for model, batch, relations in zip(models, batches, constraints, strict=True)
-        ]
-        return RefinementProblem(tuple(odes), tuple(batches), free_start, n_reweights, observe)
+        )
+        return RefinementProblem(
+            equations, tuple(batches), free_start, n_reweights, observe, device=device
+        )
 
     @cached_property
-    def system(self) -> Augmented:
-        return augment(self.odes)
+    def ode(self) -> ODE:
+        """The module that is fitted, of all points, with scalings of one."""
+        return ODE.of(self.equations, self.correction).to(self.device)
 
     @cached_property
     def data(self) -> Float[np.ndarray, "points windows samples n_states"]:
@@ -275,16 +282,12 @@ class RefinementProblem:
     @property
     def n_free(self) -> int:
         """Largest number of scalings of a model; other models ignore the excess ones."""
-        return max(len(ode.free0) for ode in self.odes)
+        return max(each.n_free for each in self.equations)
 
     @property
     def n_start(self) -> int:
         """Number of unknowns in the initial state of a window."""
         return self.data.shape[-1] if self.free_start else 0
-
-    @property
-    def device(self) -> torch.device:
-        return self.odes[0].free0.device
 
     @cached_property
     def one_step(self) -> Drive:
@@ -298,7 +301,7 @@ class RefinementProblem:
 
     def take(self, point: int) -> RefinementProblem:
         """Problem of a single point."""
-        return replace(self, odes=(self.odes[point],), batches=(self.batches[point],))
+        return replace(self, equations=(self.equations[point],), batches=(self.batches[point],))
 
     def agree(self, values: Values, reduce: Callable[[Values], Any]) -> Values:
         """Values by point; if a law ties the points, all get the value given by `reduce`."""

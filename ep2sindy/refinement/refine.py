@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any, cast, overload
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.runs import Runs, is_run, trajectories_of
@@ -259,16 +258,14 @@ def _result(
     history: Sequence[Iteration],
 ) -> Refinement:
     """Result of one point, in SI and in the model's own order of coefficients."""
-    batch, ode = problem.batches[point], problem.odes[point]
+    batch, equations = problem.batches[point], problem.equations[point]
     relations = unconstrained(model) if constraint is None else constraint
     finite = verdict.status is not RefinementStatus.NON_FINITE
     refined, naive = replace(model, covariance=None), None
     if finite:
-        with torch.no_grad():
-            ode.scaling.copy_(torch.tensor(fit.scaling[point, : len(ode.free0)]))
-            values = ode.coef.cpu().numpy()
+        values = equations.coef(fit.scaling[point, : equations.n_free])
         refined, order = with_coef(model, relations, values)
-        by_scaling = (relations.C * ode.free0.cpu().numpy())[order]
+        by_scaling = (relations.C * equations.free0)[order]
         robust, naive = (
             by_scaling @ covariance @ by_scaling.T
             for covariance in (verdict.covariance, verdict.covariance_naive)
@@ -353,9 +350,9 @@ def refine_batch(
             chunk, [batch] * len(chunk), relations_of, n_reweights=n_reweights
         )
         fit = method.fit(problem)
-        for p, (model, ode) in enumerate(zip(chunk, problem.odes, strict=True)):
-            free = ode.free0.cpu().numpy() * fit.scaling[p, : len(ode.free0)]
-            moved, _ = with_coef(model, relations_of[p], relations_of[p].coef(free))
+        for p, (model, equations) in enumerate(zip(chunk, problem.equations, strict=True)):
+            values = equations.coef(fit.scaling[p, : equations.n_free])
+            moved, _ = with_coef(model, relations_of[p], values)
             refined.append(moved if fit.finite[p] else model)
         finished.append(fit.finished & fit.finite)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -390,7 +387,7 @@ def smooth_batch(
         # Every window is a separate point, so one that blows up does not stop the others.
         problem = replace(
             by_model,
-            odes=tuple(ode for ode in by_model.odes for _ in windows),
+            equations=tuple(each for each in by_model.equations for _ in windows),
             batches=tuple(windows * len(chunk)),
         )
         paths.append(integrate_windows(problem, method.fit(problem)))

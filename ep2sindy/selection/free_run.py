@@ -288,7 +288,7 @@ class FreeRunScore:
             n_windows=self.n_windows,
             rng=np.random.default_rng(self.seed),
         )
-        method, together = budget(batch)
+        method, together = budget(batch, first.library)
         with progress.stage(len(systems), "system", "refined without a fold") as advance:
             refined = refine_batch(
                 [system.model for system in systems],

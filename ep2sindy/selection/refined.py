@@ -239,7 +239,7 @@ def _refined(
     order = _by_size(ensemble)
     if not order.size:
         return ensemble
-    method, together = budget(batch)
+    method, together = budget(batch, ensemble.library)
     found = refine_batch(
         _models(ensemble, order),
         batch,
@@ -270,7 +270,7 @@ def _residuals(
     found = np.repeat(still[None], ensemble.coef.shape[2], axis=0)
     order = _by_size(ensemble)
     if order.size:
-        method, together = budget(batch)
+        method, together = budget(batch, ensemble.library)
         paths = smooth_batch(
             _models(ensemble, order),
             batch,

@@ -15,6 +15,7 @@ from ep2sindy.library.roles import process_amounts
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
+from ep2sindy.refinement.steps import fastest_step
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.selection.criteria import FLOOR
@@ -202,13 +203,15 @@ def _system(
     return TrialSystem(with_coef(model, held, held.coef(free))[0], held)
 
 
-def budget(batch: WindowBatch) -> tuple[MultipleShooting, int]:
+def budget(batch: WindowBatch, library: Library) -> tuple[MultipleShooting, int]:
     """Refinement method for systems to be judged, and how many to refine together.
 
     The regression's coefficients are close, so whole windows are fitted at once in few iterations.
     Systems that need more are the wrong ones.
     """
-    method = MultipleShooting(first_memory=batch.data.shape[1], tolerance=1e-3, max_iter=10)
+    method = MultipleShooting(
+        step=fastest_step(library), first_memory=batch.data.shape[1], tolerance=1e-3, max_iter=10
+    )
     return method, max(1, BATCH_STEPS // batch.steps.size)
 
 

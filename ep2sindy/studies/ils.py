@@ -236,9 +236,14 @@ def window_table(
 def watcher(
     tell: Callable[..., None], method: str, constraint: Constraint
 ) -> Callable[[Iteration], None]:
-    """A callback that logs every iteration of a refinement as scalars; the step is its number."""
-    names = [constraint.coefficients[k] for k in constraint.free]
-    steps = count()
+    """A callback that logs every iteration of a refinement as scalars; the step is its number.
+
+    At step zero are the scalings before the first iteration, which are one.
+    """
+    free = [constraint.coefficients[k] for k in constraint.free]
+    names = [f"{method}/scaling/{state}/{term.replace('*', '.')}" for state, term in free]
+    tell(dict.fromkeys(names, 1.0), step=0)
+    steps = count(1)
 
     def watch(iteration: Iteration) -> None:
         scalars = {
@@ -247,8 +252,7 @@ def watcher(
             f"{method}/defect": iteration.defect,
             f"{method}/window_stage": iteration.memory,
         }
-        for (state, term), value in zip(names, iteration.scaling, strict=True):
-            scalars[f"{method}/scaling/{state}/{term.replace('*', '.')}"] = float(value)
+        scalars |= dict(zip(names, iteration.scaling.tolist(), strict=True))
         tell(scalars, step=next(steps))
 
     return watch

@@ -44,14 +44,14 @@ class GradientDescent:
     n_substeps: int = 1
 
     def fit(self, problem: RefinementProblem) -> RefinementFit:
-        return join([self._fit_point(problem.take(p), p) for p in range(len(problem.odes))])
+        return join([self._fit_point(problem.take(p), p) for p in range(len(problem.equations))])
 
     def finer(self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray) -> None:
         """Return None: the step is not halved automatically; set `n_substeps` instead."""
         return
 
     def _fit_point(self, problem: RefinementProblem, point: int) -> RefinementFit:
-        ode, data = problem.odes[0], torch.tensor(problem.data[0], device=problem.device)
+        ode, data = problem.ode, torch.tensor(problem.data[0], device=problem.device)
         start = nn.Parameter(data[:, 0].clone(), requires_grad=problem.free_start)
         weights, used = np.ones((1, data.shape[-1])), np.ones((1, data.shape[-1]))
         finished, path = False, data
@@ -70,7 +70,7 @@ class GradientDescent:
             if not torch.isfinite(path).all():
                 break
             weights = residual_weights(path[None].cpu().numpy(), problem.data)
-        scaling = ode.scaling.detach().cpu().numpy()[None].copy()
+        scaling = ode.scaling.detach().cpu().numpy().copy()
         return RefinementFit(
             scaling=scaling,
             nodes=path[None].cpu().numpy(),
@@ -132,9 +132,10 @@ def trajectories(
     t = torch.arange(n_samples, dtype=torch.float64, device=start.device)
     grid = torch.linspace(0.0, float(last), n_substeps * last + 1, dtype=torch.float64)
     options = {"grid_constructor": lambda func, y0, t: grid, "perturb": True}
-    return odeint(ode, start, t, method="rk4", options=options).transpose(0, 1)
+    path = odeint(ode, start.T[None, None], t, method="rk4", options=options)
+    return path[:, 0, 0].permute(2, 0, 1)
 
 
 def _iteration(point: int, data: torch.Tensor, ode: ODE, loss: float) -> Iteration:
-    scaling = ode.scaling.detach().cpu().numpy().copy()
+    scaling = ode.scaling.detach().cpu().numpy()[0].copy()
     return Iteration(point, data.shape[1], loss, scaling, 0.0, 0.0)

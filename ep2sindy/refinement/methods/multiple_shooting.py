@@ -15,7 +15,6 @@ from ep2sindy.refinement.kernels import (
     starts,
     triangles,
 )
-from ep2sindy.refinement.ode import Augmented, Drive
 from ep2sindy.refinement.problem import (
     Iteration,
     LawMap,
@@ -122,24 +121,24 @@ class MultipleShooting:
         window = walk.problem.data.shape[2]
         walk = walk.stage(window, points, tolerance=self.tolerance, max_iter=self.max_iter)
         walk = walk.join(points).marked(window, points)
-        is_whole = walk.system is walk.problem.system
-        return replace(walk.state, maps=walk.maps if is_whole else None)
+        return replace(walk.state, maps=walk.maps if walk.by_scaling else None)
 
 
 @dataclass(frozen=True, eq=False)
 class _Walk:
     """State of a fit between two iterations, with the one-step maps at its nodes.
 
-    system: the equations whose maps these are. damping: (points,), zero for whole Gauss-Newton
-    steps. price: (points,), of the gaps between steps, in the sum that an iteration must lower.
+    damping: (points,), zero for whole Gauss-Newton steps. price: (points,), of the gaps between
+    steps, in the sum that an iteration must lower. by_scaling: whether the maps hold derivatives by
+    the scalings.
     """
 
     problem: RefinementProblem
-    system: Augmented
     state: RefinementFit
     maps: np.ndarray
     damping: np.ndarray
     price: np.ndarray
+    by_scaling: bool = True
 
     @staticmethod
     def of(problem: RefinementProblem, state: RefinementFit) -> _Walk:
@@ -147,7 +146,7 @@ class _Walk:
         maps = step_maps(problem, state.step, state.scaling, state.nodes, points)
         sound = problem.agree(np.isfinite(maps).all(axis=(1, 2, 3, 4)), np.all)
         zeros, state = np.zeros(len(points)), replace(state, finite=state.finite & sound)
-        return _Walk(problem, problem.system, state, maps, zeros, zeros)
+        return _Walk(problem, state, maps, zeros, zeros)
 
     @property
     def window(self) -> int:
@@ -218,17 +217,16 @@ class _Walk:
             is_open = self.problem.agree(is_open, np.any)
             if not is_open.any():
                 break
-            if walk.system is self.system:
+            if walk.by_scaling:
                 walk = walk.held()
             walk = walk.iterate(points[is_open], self.window, 0.0, hold=True)
         return walk
 
     def held(self) -> _Walk:
         """The same with the scalings held, and without derivatives by them."""
-        scaling = torch.tensor(self.state.scaling, device=self.problem.device)
-        system, n = self.system.held(scaling), self.system.n_states
+        n = self.maps.shape[-2]
         maps = np.concatenate([self.maps[..., :n], self.maps[..., -1:]], axis=-1)
-        return replace(self, system=system, maps=maps)
+        return replace(self, maps=maps, by_scaling=False)
 
     def iterate(
         self, active: np.ndarray, memory: int, tolerance: float, *, hold: bool = False
@@ -248,7 +246,7 @@ class _Walk:
         scaling, nodes = state.scaling.copy(), state.nodes.copy()
         scaling[active] += change
         nodes[active] += share[:, None, None, None] * moved
-        raw = step_maps(problem, state.step, scaling, nodes, active, self.system)
+        raw = step_maps(problem, state.step, scaling, nodes, active, by_scaling=self.by_scaling)
         ahead = self.pulled(raw, active, memory)
         size, defect = gap_sizes(maps, state.nodes[active])
         size_ahead, defect_ahead = gap_sizes(ahead, nodes[active])
@@ -354,7 +352,7 @@ def tell(
                 point=int(point),
                 memory=memory,
                 loss=float(np.square(nodes[point] - problem.data[point]).mean()),
-                scaling=scaling[point, : len(problem.odes[point].free0)].copy(),
+                scaling=scaling[point, : problem.equations[point].n_free].copy(),
                 step=float(relative[i]),
                 defect=float(defect[i]),
             )
@@ -367,15 +365,16 @@ def step_maps(
     scaling: np.ndarray,
     nodes: np.ndarray,
     points: np.ndarray,
-    system: Augmented | None = None,
+    *,
+    by_scaling: bool = True,
 ) -> np.ndarray:
-    """One-step maps of the given points, by the problem's equations unless others are given."""
-    system, drive = problem.system if system is None else system, problem.one_step
+    """One-step maps of the given points, with their derivatives by the scalings unless held."""
+    ode, drive = problem.ode, problem.one_step
     if len(points) < len(nodes):
         index = torch.tensor(points, device=problem.device)
-        system = system.take(index)
-        drive = Drive(drive.steps[:, index], drive.inputs[:, :, index])
-    return step.maps(system, drive, scaling[points, : system.n_free], nodes[points])
+        ode, drive = ode.take(index), drive.take(index)
+    ode.set(scaling[points], drive)
+    return step.maps(ode, nodes[points], by_scaling=by_scaling)
 
 
 def newton_step(
