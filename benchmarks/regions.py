@@ -18,8 +18,8 @@ from jaxtyping import Float
 from scipy.special import expit
 
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.model.many import rk4_step
 from ep2sindy.model.model import coef_matrix
+from ep2sindy.model.runge_kutta import step
 from ep2sindy.thruster.parameters import Thruster
 
 Equations = Mapping[str, Mapping[str, float]]
@@ -180,5 +180,5 @@ def _integrate(
     states[0] = [4e17, 2.6e18]
     for k in range(n_samples - 1):
         start, middle, end = inputs[2 * k : 2 * k + 3]
-        states[k + 1] = rk4_step(slope, states[k], (start, middle, end), dt_s)
+        states[k + 1] = step(slope, states[k], (start, middle, end), dt_s)
     return states

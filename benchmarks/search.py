@@ -31,7 +31,7 @@ from threadpoolctl import threadpool_limits
 
 import ep2sindy as ep
 from benchmarks.timing import cpu_s
-from ep2sindy.model.many import rk4_step
+from ep2sindy.model.runge_kutta import step
 from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.front import ParetoFront, pareto_front
@@ -219,7 +219,7 @@ def continued(system: System, n_samples: int) -> ep.Trajectory:
     t, states = step_s * np.arange(n_samples), np.empty((n_samples, 3))
     states[0] = start.states[0]
     for k in range(1, n_samples):
-        states[k] = rk4_step(
+        states[k] = step(
             lambda x, _: system.model.derivative(x, np.empty(0)), states[k - 1], (t, t, t), step_s
         )
     noise = np.random.default_rng(0).normal(size=states.shape) * states.std(axis=0)

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 import ep2sindy as ep
-from ep2sindy.model.scaled import ScaledModel
+from ep2sindy.model import stability
 from ep2sindy.model.stability import LimitCycle, share_reaching
+from ep2sindy.model.vector_field import VectorField
 from ep2sindy.refinement.kernels import gap_sizes, squares, triangles
 from ep2sindy.refinement.ode import ODE, Drive, ScaledEquations
 from ep2sindy.refinement.steps import FusedRungeKutta, RungeKutta, fastest_step
@@ -84,21 +85,20 @@ def test_starts_that_a_kernel_brings_near_the_end_reach_what_a_loop_reaches(
     cycle = LimitCycle(6.6, states, np.array([1.0, 0.001]), model)
     found = share_reaching(model, cycle, n_starts=32, n_periods=8.0)
 
-    def as_they_are(self: ScaledModel, y: np.ndarray, *_: object, **__: object) -> tuple:
-        return y, np.zeros(y.shape[1]), np.full(y.shape[1], 100_000)
+    def as_they_are(field: VectorField, y: np.ndarray, *_: object) -> tuple:
+        return y, np.zeros(len(y)), np.full(len(y), 100_000)
 
-    monkeypatch.setattr(ScaledModel, "approach", as_they_are)
+    monkeypatch.setattr(stability, "_approach", as_they_are)
     assert share_reaching(model, cycle, n_starts=32, n_periods=8.0) == found
     assert 0.0 <= found < 1.0
 
 
 def test_each_start_takes_no_more_steps_than_allowed() -> None:
-    model = model_of({"x": {"y": 1.0}, "y": {"x": -1.0}})
-    scaled = ScaledModel.of(model, np.ones(2), 1.0)
-    settings = {"times_rate": 1.0, "floor": 10.0}
-    y, t, left = scaled.approach(np.ones((2, 3)), np.zeros(2), 5.0, 1.0, 4, **settings)
+    """A circle, whose steps are a 64th of the time unit, since its Jacobian is small."""
+    field = model_of({"x": {"y": 1.0}, "y": {"x": -1.0}}).field
+    y, t, left = stability._approach(field, np.ones((3, 2)), np.zeros(2), 5.0, 1.0, 4)
     np.testing.assert_array_equal(left, 0)
-    np.testing.assert_allclose(t, 0.4)
-    np.testing.assert_allclose(y[0], np.cos(0.4) + np.sin(0.4), rtol=1e-6)
-    y, t, left = scaled.approach(np.ones((2, 3)), np.zeros(2), 1.2, 1.0, 40, **settings)
-    assert y.shape == (2, 0)
+    np.testing.assert_allclose(t, 4.0 / 64.0)
+    np.testing.assert_allclose(y[:, 0], np.cos(1.0 / 16.0) + np.sin(1.0 / 16.0), rtol=1e-9)
+    y, *_ = stability._approach(field, np.ones((3, 2)), np.zeros(2), 1.2, 1.0, 40)
+    assert y.shape == (0, 2)

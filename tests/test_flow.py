@@ -7,11 +7,12 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.estimation.explanation import _misfit
-from ep2sindy.estimation.flow import RightHandSides, Steps
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, parting
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
+from ep2sindy.model.flow import Steps, _in_arrays, ends, flow
 from ep2sindy.model.flow_kernels import _advance
+from ep2sindy.model.vector_field import VectorField
 from ep2sindy.systems.draws import realization
 
 N = 37  # no multiple of the lanes
@@ -26,44 +27,42 @@ def steps(n_substeps: int, n_inputs: int, rng: np.random.Generator) -> Steps:
 def test_the_compiled_flow_is_that_of_array_expressions(names: str, n_substeps: int) -> None:
     rng, inputs = np.random.default_rng(0), names.count("u")
     d = len(names) - inputs
-    sides = RightHandSides(ep.polynomial(list(names), degree=3), d)
-    coef = (
-        0.2 * rng.normal(size=(len(sides.library), d)) * (rng.random((len(sides.library), d)) < 0.3)
-    )
-    by = rng.integers(0, d, 9), rng.integers(0, len(sides.library), 9)
+    library = ep.polynomial(list(names), degree=3)
+    there = rng.random((len(library), d)) < 0.3
+    field = VectorField(library, 0.2 * there * rng.normal(size=(len(library), d)))
+    by = rng.integers(0, d, 9), rng.integers(0, len(library), 9)
     states, divided = rng.normal(size=(N, d)), steps(n_substeps, inputs, rng)
     plain = np.zeros((N, d, d + 9))
-    ends = sides._in_arrays(coef, states, divided, by, plain)
-    flow = sides.flow(coef, states, divided, by, n_more=2)
-    np.testing.assert_allclose(flow.ends, ends, rtol=1e-12)
-    np.testing.assert_allclose(sides.ends(coef, states, divided), ends, rtol=1e-12)
-    off = np.abs(flow.slopes[:, :, :-2] - plain).max()
+    expected = _in_arrays(field, states, divided, by, plain)
+    found = flow(field, states, divided, by, n_more=2)
+    np.testing.assert_allclose(found.ends, expected, rtol=1e-12)
+    np.testing.assert_allclose(ends(field, states, divided), expected, rtol=1e-12)
+    off = np.abs(found.slopes[:, :, :-2] - plain).max()
     assert off < 1e-12 * np.abs(plain).max()
-    assert not flow.slopes[:, :, -2:].any()
+    assert not found.slopes[:, :, -2:].any()
 
 
 def test_a_chain_carries_a_change_as_far_as_its_stages_reach() -> None:
     """In x_k' = x_(k-1)^2 a step carries a change four states on, and no further."""
     names = [f"x{k}" for k in range(8)]
     library = ep.named_terms(names, [f"{name}^2" for name in names])
-    sides, rng = RightHandSides(library, 8), np.random.default_rng(0)
-    coef, none = np.eye(8, k=1), np.empty(0, dtype=np.int64)
-    slopes = sides.flow(coef, rng.uniform(1, 2, (N, 8)), steps(1, 0, rng), (none, none)).slopes
+    field, rng = VectorField(library, np.eye(8, k=1)), np.random.default_rng(0)
+    slopes = flow(field, rng.uniform(1, 2, (N, 8)), steps(1, 0, rng)).slopes
     far = np.subtract.outer(np.arange(8), np.arange(8))
     assert np.array_equal((slopes != 0.0).all(axis=0), (far >= 0) & (far <= 4))
 
 
 def test_a_sample_that_runs_away_leaves_the_others_alone() -> None:
-    sides, rng = RightHandSides(ep.polynomial(["x"], degree=3), 1), np.random.default_rng(0)
-    coef, none = np.array([[0.0], [0.0], [0.0], [1.0]]), np.empty(0, dtype=np.int64)
+    library, rng = ep.polynomial(["x"], degree=3), np.random.default_rng(0)
+    field = VectorField(library, np.array([[0.0], [0.0], [0.0], [1.0]]))
     states, divided = rng.normal(size=(N, 1)), steps(2, 0, rng)
     with np.errstate(over="ignore", invalid="ignore"):
         away = np.where(np.arange(N)[:, None] == 5, 1e200, states)
-        flow = sides.flow(coef, away, divided, (none, none))
-    assert not np.isfinite(flow.ends[5])
+        found = flow(field, away, divided)
+    assert not np.isfinite(found.ends[5])
     others = np.arange(N) != 5
-    np.testing.assert_array_equal(flow.ends[others], sides.ends(coef, states, divided)[others])
-    assert np.isfinite(flow.slopes[others]).all()
+    np.testing.assert_array_equal(found.ends[others], ends(field, states, divided)[others])
+    assert np.isfinite(found.slopes[others]).all()
 
 
 @pytest.mark.parametrize(("rate", "expected"), [(0.2, 0.2 * 2), (-0.2, 0.0), (0.0, 0.0)])

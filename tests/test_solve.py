@@ -12,10 +12,11 @@ from scipy.interpolate import make_interp_spline
 import ep2sindy as ep
 from ep2sindy.model import kernels
 from ep2sindy.model.inputs import curve_through, driven
-from ep2sindy.model.many import DrivenWindows, Ensemble, rk4_step
+from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.rollout import _scaled_rhs
-from ep2sindy.model.solve import Border, Products, Solved, _first_step, scheme, solve_stages
+from ep2sindy.model.runge_kutta import dormand_prince, step
+from ep2sindy.model.solve import Border, Driven, Solved, _first_step, solve_stages
+from ep2sindy.model.vector_field import VectorField
 from tests.models import model_of
 
 NO_BORDER = Border((), lambda _, y: y)
@@ -26,14 +27,13 @@ def run(rates: Callable, t: np.ndarray, y: np.ndarray, **settings: object) -> So
     return solve_stages(rates, NO_BORDER, t, y, **given | settings)
 
 
-def products(model: SparseModel) -> Products:
-    nothing, _ = driven([], None, np.array([0.0, 1.0]), {})
-    rates = _scaled_rhs(model, nothing, np.ones(len(model.states)))
-    assert isinstance(rates, Products)
+def products(model: SparseModel) -> Driven:
+    rates = Driven(model.field)
+    assert rates.is_compiled
     return rates
 
 
-def through_scipy(rates: Products) -> Callable[[float, np.ndarray], np.ndarray]:
+def through_scipy(rates: Driven) -> Callable[[float, np.ndarray], np.ndarray]:
     """The same equations as a function of which nothing is known."""
     return lambda t, y: rates(t, y)
 
@@ -54,7 +54,7 @@ def test_compiled_steps_are_those_of_scipy(system: ep.systems.System) -> None:
         slopes[0], h = solver.f, solver.h_abs  # each step by itself: rounding adds up in many
         solver.step()
         found = kernels._step(
-            rates.parts, scheme(), t, h, 10.0, y, at, slopes, np.ones(len(y) + 1), 1e-8
+            rates.parts, dormand_prince(), t, h, 10.0, y, at, slopes, np.ones(len(y) + 1), 1e-8
         )
         assert found[3] == solver.nfev - before
         if found[3] == 12:
@@ -81,9 +81,10 @@ def test_the_dense_output_is_of_seventh_order() -> None:
         y, at, room, slopes = np.array([1.0, 0.0]), np.empty(2), np.empty(2), np.zeros((16, 2))
         columns, shape = np.ones(3), np.empty((7, 2))
         slopes[0] = rates(0.0, y)
-        t, *_ = kernels._step(rates.parts, scheme(), 0.0, step_s, 9.0, y, at, slopes, columns, 1.0)
+        parts, scheme = rates.parts, dormand_prince()
+        t, *_ = kernels._step(parts, scheme, 0.0, step_s, 9.0, y, at, slopes, columns, 1.0)
         assert t == step_s
-        kernels._polynomial(rates.parts, scheme(), 0.0, step_s, y, at, slopes, room, columns, shape)
+        kernels._polynomial(parts, scheme, 0.0, step_s, y, at, slopes, room, columns, shape)
         shares = np.linspace(0.1, 0.9, 9)
         paths = []
         for share in shares:
@@ -100,7 +101,8 @@ def test_inputs_are_the_spline_through_their_samples() -> None:
     samples = np.column_stack([np.sin(9.0 * t), t**3])
     spline, drive = make_interp_spline(t, samples, k=3), curve_through(t, samples, [None, "smooth"])
     # x' = u, y' = v: the slope is the input.
-    rates = Products(np.array([[2], [3]]), np.eye(2), np.ones(2), drive)
+    library = ep.named_terms(["x", "y", "u", "v"], ["u", "v"])
+    rates = Driven(VectorField(library, np.eye(2)), drive)
     for at in np.linspace(t[0], t[-1], 301).tolist():
         np.testing.assert_allclose(drive(at), spline(at), rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(rates(at, np.zeros(2)), drive(at), rtol=1e-12, atol=1e-12)
@@ -109,7 +111,7 @@ def test_inputs_are_the_spline_through_their_samples() -> None:
 def test_functions_of_ones_own_stay_with_scipy() -> None:
     t, model = np.array([0.0, 1.0]), model_of({"x": {"u": 1.0}}, inputs=["u"])
     drive, _ = driven(["u"], {"u": np.sin}, t, {})
-    assert not isinstance(_scaled_rhs(model, drive, np.ones(1)), Products)
+    assert not Driven(model.field, drive).is_compiled
 
 
 @pytest.mark.parametrize("compiled", [True, False])
@@ -189,5 +191,5 @@ def test_many_compiled_runs_are_runge_kutta_steps_to_the_last_digit() -> None:
             np.testing.assert_array_equal(np.isnan(paths[m, :, k]).any(axis=1), far & (k > 0))
             np.testing.assert_array_equal(paths[m, ~far, k], x[:, ~far].T)
             for _ in range(2):
-                x = rk4_step(slope, x, (np.empty(0),) * 3, 0.05)
+                x = step(slope, x, (np.empty(0),) * 3, 0.05)
                 x[:, far] = 100.0  # beyond the bounds, and finite

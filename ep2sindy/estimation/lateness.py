@@ -13,10 +13,10 @@ from math import log
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.estimation.flow import Flow
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, hessian
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 from ep2sindy.estimation.supports import PenalisedFit, best_support, inverse_of, penalise
+from ep2sindy.model.flow import Flow
 
 PAYS = 1.0  # least fall of squares plus prices, beyond the delays' own price
 SURE = 6.0  # standard errors of every delay: true ones of a sample show ten and more

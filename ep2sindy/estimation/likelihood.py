@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.estimation.flow import Flow
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
+from ep2sindy.model.flow import Flow
 
 FREE_START = 100.0  # prior variance of the first state: ten times its RMS, squared
 HELD_START = 1e-24  # the same of one that starts at zero

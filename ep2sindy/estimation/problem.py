@@ -16,11 +16,12 @@ from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.coefficients import coefficients_of
 from ep2sindy.estimation.cost import Watch
-from ep2sindy.estimation.flow import Flow, RightHandSides, Steps
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Process, Relation
 from ep2sindy.library.roles import Roles
+from ep2sindy.model.flow import Flow, Steps, ends, flow
 from ep2sindy.model.inputs import Curve, check_courses, curve_through, plausible_courses
+from ep2sindy.model.vector_field import VectorField
 
 MIN_SAMPLES = 5  # of a record: a smoother accepts no fewer
 
@@ -338,7 +339,7 @@ class EstimationProblem:
         self, record: ScaledRecord, states: Float[np.ndarray, "samples d"], free: np.ndarray
     ) -> Float[np.ndarray, "samples d"]:
         """Derivatives of the states at the samples, per mean step."""
-        return self._right_hand_sides.rates(self.coef(free), states, record.inputs)
+        return self.field(free).rates(np.concatenate([states, record.inputs], axis=1))
 
     def ends(
         self,
@@ -348,7 +349,7 @@ class EstimationProblem:
         n_substeps: int,
     ) -> Float[np.ndarray, "steps d"]:
         """States at the end of each step, by `n_substeps` classical Runge-Kutta steps."""
-        return self._right_hand_sides.ends(self.coef(free), states, record.divided(n_substeps))
+        return ends(self.field(free), states, record.divided(n_substeps))
 
     @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
     def flow(
@@ -368,7 +369,7 @@ class EstimationProblem:
         involved = np.flatnonzero(support if self.C is None else self.C[:, support].any(axis=1))
         by = self.equation[involved], self.column[involved]
         steps = record.divided(n_substeps)
-        found = self._right_hand_sides.flow(self.coef(free), states, steps, by, n_more=n_more)
+        found = flow(self.field(free), states, steps, by, n_more=n_more)
         if self.C is None:
             return found
         d, p = len(self.states), len(self.states) + len(involved)
@@ -376,9 +377,9 @@ class EstimationProblem:
         slopes = [found.slopes[:, :, :d], by_free, found.slopes[:, :, p:]]
         return replace(found, slopes=np.concatenate(slopes, axis=2))
 
-    @cached_property
-    def _right_hand_sides(self) -> RightHandSides:
-        return RightHandSides(self.library, len(self.states))
+    def field(self, free: Float[np.ndarray, " free"]) -> VectorField:
+        """The scaled right-hand side with these coefficients."""
+        return VectorField(self.library, self.coef(free))
 
 
 def scale_problem(

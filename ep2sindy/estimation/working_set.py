@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.cost import SMALL
-from ep2sindy.estimation.flow import Flow
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import (
     FREE_START,
@@ -38,6 +37,7 @@ from ep2sindy.estimation.solver import (
     smoothed,
 )
 from ep2sindy.estimation.supports import N_BEST, inverse_of, term_prices
+from ep2sindy.model.flow import Flow
 from ep2sindy.regression.exchanges import exchanged_supports
 
 # rho of the first set: the state nearly free, or quite. One alone leaves out more true terms.

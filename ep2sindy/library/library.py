@@ -235,6 +235,11 @@ class Library:
         Returns a library of these products, sorted by ascending exponents, and weights of shape
         (terms, 1 + n, products), which combine the products to each term and its n derivatives.
         """
+        if n not in self._derived:
+            self._derived[n] = self._derive(n)
+        return self._derived[n]
+
+    def _derive(self, n: int) -> tuple[Library, np.ndarray]:
         slopes = [[{term: 1.0}, *map(term.derivative, self.variables[:n])] for term in self.terms]
         distinct = list(dict.fromkeys(t for sums in slopes for parts in sums for t in parts))
         unsorted = library_of(self.variables, distinct)
@@ -259,6 +264,10 @@ class Library:
     def _arguments(self) -> list[int]:
         """Index of the variable that each function takes."""
         return [self.variables.index(f.variable) for f in self.functions]
+
+    @cached_property
+    def _derived(self) -> dict[int, tuple[Library, np.ndarray]]:
+        return {}
 
     @cached_property
     def derivatives(self) -> tuple[Library, Float[np.ndarray, "terms columns products"]]:

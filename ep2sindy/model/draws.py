@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from itertools import count
 
 import numpy as np
@@ -11,8 +9,8 @@ from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.model.inputs import Curve
-from ep2sindy.model.many import rk4_step
-from ep2sindy.model.rollout import Equations, terms_in_use
+from ep2sindy.model.many import Steps, run_many
+from ep2sindy.model.vector_field import Equations, VectorField
 
 # Substeps between two samples: the fewest whose central run differs from that of twice as many by
 # no more than this share of its largest states.
@@ -76,93 +74,48 @@ def draw_runs(
     """
     if len(t) < 2:  # of a run that ended at its start
         return starts[:, None][:, : len(t)]
-    library, _ = terms_in_use(model.library, model.coef)
-    rows = [model.library.index(name) for name in library.names]
-    coef = np.ascontiguousarray(coef[:, rows])
-    gather = [[*model.states, *model.inputs].index(name) for name in library.variables]
-
-    def rates(x: np.ndarray, time: float, c: np.ndarray) -> np.ndarray:
-        values = x if drive is None else np.column_stack([x, np.tile(drive(time), (len(x), 1))])
-        return np.einsum("nt,nts->ns", library.evaluate(values[:, gather]), c)
-
     bound = BLOW_UP * zero_to_one(reach)
-    with np.errstate(over="ignore", invalid="ignore"):
-        centre = starts.mean(axis=0)[None], coef.mean(axis=0)[None]
-        n = _enough_substeps(rates, t, *centre, bound)
-        if rng is None or push_std is None or not push_std.any():
-            return _integrate(rates, t, starts, coef, n, bound)
-        pushes = push_std * np.sqrt(np.diff(t) / push_step_s)[:, None]
-        return _integrate(rates, t, starts, coef, n, bound, pushes, rng)
+    if drive is not None and not model.inputs:
+        drive = None
+    centre = VectorField.of(model, coef.mean(axis=0)[None])
+    steps = _fine_enough(centre, starts.mean(axis=0), t, drive, bound)
+    pushes = None
+    if rng is not None and push_std is not None and push_std.any():
+        size = push_std * np.sqrt(np.diff(t) / push_step_s)[:, None]
+        drawn = size[:, None] * rng.standard_normal((len(size), *starts.shape))
+        pushes = np.ascontiguousarray(drawn.transpose(1, 0, 2)[:, None])
+    fields, still = VectorField.of(model, coef), np.zeros(len(bound))
+    return run_many(fields, starts[:, None], steps, centre=still, reach=bound, pushes=pushes)[:, 0]
 
 
-def _enough_substeps(
-    rates: Callable[..., np.ndarray],
-    t: np.ndarray,
-    start: np.ndarray,
-    coef: np.ndarray,
-    bound: np.ndarray,
-) -> int:
-    """Number of Runge-Kutta steps between samples that follow the central run."""
-    n = 1
-    run = _integrate(rates, t, start, coef, n, bound)
+def _fine_enough(
+    field: VectorField,
+    start: Float[np.ndarray, " n_states"],
+    t: Float[np.ndarray, " samples"],
+    drive: Curve | None,
+    bound: Float[np.ndarray, " n_states"],
+) -> Steps:
+    """Steps between the samples that follow the central run."""
+
+    def runs(starts: np.ndarray, first: np.ndarray, n_samples: int, n_substeps: int) -> np.ndarray:
+        steps = Steps.along(t, drive, first, n_samples, n_substeps)
+        found = run_many(field, starts[None], steps, centre=np.zeros(len(bound)), reach=bound)
+        return found[0]
+
+    n, begin = 1, np.zeros(1, dtype=np.int64)
+    run = runs(start[None], begin, len(t), n)[0]
+    some = np.linspace(0, len(t) - 2, min(len(t) - 1, 40)).astype(np.int64)
     while n < MAX_SUBSTEPS:
-        finer = _integrate(rates, t, start, coef, 2 * n, bound)
+        finer = runs(start[None], begin, len(t), 2 * n)[0]
         # A chaotic run leaves its neighbours: steps, not whole runs, are compared.
-        steps = [
-            np.concatenate(
-                [
-                    _step(rates, t[k], t[k + 1], finer[:, k], coef, m) - finer[:, k]
-                    for k in np.linspace(0, len(t) - 2, min(len(t) - 1, 40)).astype(int)
-                ]
-            )
-            for m in (n, 2 * n)
-        ]
-        off = np.abs(steps[0] - steps[1]) / zero_to_one(np.abs(run).max(axis=(0, 1)))
+        coarse, fine = (runs(finer[some], some, 2, m)[:, 1] for m in (n, 2 * n))
+        off = np.abs(coarse - fine) / zero_to_one(np.abs(run).max(axis=0))
         if not np.isfinite(run).all():
             off = np.full(1, np.inf if np.isfinite(finer).all() or n < 8 else 0.0)
         if off.max() <= ACCURATE:
             break
         n, run = 2 * n, finer
-    return n
-
-
-def _integrate(
-    rates: Callable[..., np.ndarray],
-    t: np.ndarray,
-    starts: np.ndarray,
-    coef: np.ndarray,
-    n_substeps: int,
-    bound: np.ndarray,
-    pushes: np.ndarray | None = None,
-    rng: np.random.Generator | None = None,
-) -> np.ndarray:
-    x = starts.copy()
-    runs = np.full((len(x), len(t), x.shape[1]), np.nan)
-    runs[:, 0] = x
-    for k in range(len(t) - 1):
-        x = _step(rates, t[k], t[k + 1], x, coef, n_substeps)
-        if pushes is not None and rng is not None:
-            x = x + pushes[k] * rng.standard_normal(x.shape)
-        x = np.where((np.abs(x) <= bound).all(axis=1)[:, None], x, np.nan)
-        runs[:, k + 1] = x
-    return runs
-
-
-def _step(
-    rates: Callable[..., np.ndarray],
-    t: float,
-    end_t: float,
-    x: np.ndarray,
-    coef: np.ndarray,
-    n_substeps: int,
-) -> np.ndarray:
-    """Classical Runge-Kutta steps up to a time."""
-    h, before_end = (end_t - t) / n_substeps, np.nextafter(end_t, -np.inf)
-    for k in range(n_substeps):
-        now = t + k * h
-        nodes = now, now + 0.5 * h, min(now + h, before_end)  # inputs may jump at the end
-        x = rk4_step(partial(rates, c=coef), x, nodes, h)
-    return x
+    return Steps.along(t, drive, begin, len(t), n)
 
 
 def halton(n: int, n_dimensions: int) -> np.ndarray:

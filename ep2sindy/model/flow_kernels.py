@@ -20,35 +20,6 @@ from ep2sindy.runtime.compilation import LOOPS, compiled
 LANES = 64
 
 
-class Tableau(NamedTuple):
-    """An explicit scheme of four stages, in shares of a step.
-
-    leads: (4, 4), weight of each earlier slope in the state of a stage; weights: (4,), of the
-    slopes in the end of the step. places: (4,), of the stages among the positions at which inputs
-    are given; every step begins `stride` positions after the one before.
-    """
-
-    leads: np.ndarray
-    weights: np.ndarray
-    places: np.ndarray
-    stride: int
-
-
-CLASSICAL = Tableau(
-    leads=np.diag([0.5, 0.5, 1.0], k=-1),
-    weights=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
-    places=np.array([0, 1, 1, 2]),
-    stride=2,
-)
-
-THREE_EIGHTHS = Tableau(
-    leads=np.array([[0, 0, 0, 0], [1 / 3, 0, 0, 0], [-1 / 3, 1, 0, 0], [1.0, -1, 1, 0]]),
-    weights=np.array([0.125, 0.375, 0.375, 0.125]),
-    places=np.arange(4),
-    stride=3,
-)
-
-
 class SumsOfProducts(NamedTuple):
     """Right-hand sides and their derivatives as weighted sums of products of columns.
 
@@ -80,7 +51,8 @@ def sums_of_products(
     """
     there = weights != 0.0
     needed, product, target, *where = _order_of_sums(there.shape, there.tobytes())
-    return SumsOfProducts(table[needed], product, target, weights[there], *where)
+    table = table if len(needed) == len(table) else table[needed]
+    return SumsOfProducts(table, product, target, weights[there], *where)
 
 
 @lru_cache(maxsize=256)  # a fit takes many steps in which the same weights stay zero

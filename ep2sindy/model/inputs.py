@@ -67,7 +67,11 @@ class Curve:
 
     def at(self, share: float) -> Float[np.ndarray, "steps n_inputs"]:
         """The inputs at a given share of every step; at its end they have not jumped yet."""
-        return np.polyval(self.pieces, share)
+        values: np.ndarray = np.polyval(self.pieces, share)
+        times = self.t[:-1] + share * np.diff(self.t)
+        for column, function in self.functions.items():
+            values[:, column] = [function(now) for now in times.tolist()]
+        return values
 
 
 def curve_through(

@@ -1,14 +1,13 @@
-"""Compiled integration of one free run: the Dormand-Prince scheme of eighth order.
+"""Compiled integration of single runs, and of many: sums of products of states and inputs.
 
-The equations are sums of products, given as a tuple (table, coef, scale, breaks, pieces). The
-columns are the states, the inputs and a one; row k of `table` lists the columns whose product is
-term k. coef: (terms, n), already divided by the scale of the state. scale: (n,), factors from the
-solver's states to SI. breaks: (m + 1,), pieces: (powers, m, inputs): see `inputs.Curve`.
+Rates are given as entries (table, product, target, weight), in ascending order of the products: row
+k of `table` lists the columns, of states, inputs and a one, whose product is product k, and entry e
+adds weight[e] times product[e] to the slope of state target[e]. Inputs are (breaks, pieces), breaks
+(m + 1,) and pieces (powers, m, inputs): see `inputs.Curve`.
 
-The scheme is a tuple of its coefficients (a, b, c, e3, e5, a_dense, c_dense, dense), as published:
-Hairer, Norsett & Wanner 1993, Solving Ordinary Differential Equations I, II.5, II.6 and II.10;
-`solve.scheme` returns them. Steps, errors and dense output are those of SciPy's `DOP853`, so that
-a run differs from SciPy's by rounding only.
+`advance` takes steps of the Dormand-Prince scheme of order eight, a tuple of its coefficients (a,
+b, c, e3, e5, a_dense, c_dense, dense), see `runge_kutta`. Steps, errors and dense output are those
+of SciPy's `DOP853`, so that a run differs from SciPy's by rounding only.
 """
 
 import numpy as np
@@ -22,25 +21,27 @@ EXPONENT = -1.0 / 8.0  # power of the error in the step size; the error estimate
 
 
 @compiled(error_model="numpy")
-def _add_terms(table, coef, columns, slope):
-    """Write the slopes of all states: the sum over terms of coef times the product of columns."""
+def _sum(table, product, target, weight, columns, slope):
+    """Write the slopes of all states: the sums of the entries. Each product is taken once."""
     for i in range(len(slope)):
         slope[i] = 0.0
-    for k in range(len(table)):
-        value = columns[table[k, 0]]
-        for factor in range(1, table.shape[1]):
-            value *= columns[table[k, factor]]
-        for i in range(len(slope)):
-            slope[i] += value * coef[k, i]
+    value, before = 0.0, -1
+    for e in range(len(product)):
+        k = product[e]
+        if k != before:
+            value, before = columns[table[k, 0]], k
+            for factor in range(1, table.shape[1]):
+                value *= columns[table[k, factor]]
+        slope[target[e]] += weight[e] * value
 
 
 @compiled(error_model="numpy")
-def rates(equations, t, y, columns, slope):
-    """Write the right-hand side at one state into `slope`; `columns` is workspace, in SI."""
-    table, coef, scale, breaks, pieces = equations
+def _rates(equations, t, y, columns, slope):
+    """Write the right-hand side at one state into `slope`; `columns` is workspace."""
+    table, product, target, weight, breaks, pieces = equations
     n, n_inputs = len(y), pieces.shape[2]
     for i in range(n):
-        columns[i] = y[i] * scale[i]
+        columns[i] = y[i]
     if n_inputs:
         place, above = 0, pieces.shape[1]
         while above - place > 1:  # bisection for the span that contains t
@@ -55,7 +56,7 @@ def rates(equations, t, y, columns, slope):
             for power in range(len(pieces)):
                 value = value * share + pieces[power, place, j]
             columns[n + j] = value
-    _add_terms(table, coef, columns, slope)
+    _sum(table, product, target, weight, columns, slope)
 
 
 @compiled(error_model="numpy")
@@ -66,7 +67,7 @@ def _stage(equations, t, y, h, weights, n_before, slopes, at, columns):
         for s in range(n_before):
             value += slopes[s, i] * weights[s]
         at[i] = y[i] + value * h
-    rates(equations, t, at, columns, slopes[n_before])
+    _rates(equations, t, at, columns, slopes[n_before])
 
 
 @compiled(error_model="numpy")
@@ -115,10 +116,10 @@ def _between(shape, start, share, out):
 
 
 @compiled(error_model="numpy")
-def _room(y, blow_up):
-    """`blow_up` minus the largest absolute state; negative beyond it."""
+def _room(y, n_bounded, blow_up):
+    """`blow_up` minus the largest absolute of the first states; negative beyond it."""
     largest = 0.0
-    for i in range(len(y)):
+    for i in range(n_bounded):
         largest = max(largest, abs(y[i]))
     return blow_up - largest
 
@@ -146,7 +147,7 @@ def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
             for s in range(12):
                 value += slopes[s, i] * b[s]
             at[i] = y[i] + h * value
-        rates(equations, before_end, at, columns, slopes[12])
+        _rates(equations, before_end, at, columns, slopes[12])
         calls += 12
         error = _error(e3, e5, slopes, h, y, at, rtol)
         if error < 1.0:
@@ -165,22 +166,24 @@ def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
 
 @compiled(error_model="numpy")
 def advance(
-    equations, scheme, times, stops, out, y, slope, t, h, place, calls, limit, blow_up, rtol
-):
+    equations, scheme, times, stops, out, y, slope, t, h, place, calls, limit, n_bounded, blow_up,
+    rtol,
+):  # fmt: skip
     """Integrate to the last of `times`, filling rows of `out` from `place` on.
 
     stops: times at which inputs jump or bend, then the last time: no step goes beyond. y and slope
     are updated in place. h: the step to try. Returns the reason for stopping, the time, the step to
     try next, the next place and the number of evaluations. Reasons: FINISHED; LOOK: `limit`
-    evaluations have been exceeded; CROSSED: the largest state crossed `blow_up` in the last step,
-    and samples are filled up to the crossing; FAILED: the step became too small.
+    evaluations have been exceeded; CROSSED: the largest of the first n_bounded states crossed
+    `blow_up` in the last step, and samples are filled up to the crossing; FAILED: the step became
+    too small.
     """
     n = len(y)
     slopes, shape = np.empty((16, n)), np.empty((7, n))
-    at, room, columns = np.empty(n), np.empty(n), np.ones(n + equations[4].shape[2] + 1)
+    at, room, columns = np.empty(n), np.empty(n), np.ones(n + equations[5].shape[2] + 1)
     for i in range(n):  # array expressions take seconds longer to compile
         slopes[0, i] = slope[i]
-    inside = _room(y, blow_up) >= 0.0
+    inside = _room(y, n_bounded, blow_up) >= 0.0
     stop = np.searchsorted(stops, t, "right")
     while t < times[-1]:
         ahead, length, h, n_calls = _step(
@@ -190,19 +193,19 @@ def advance(
         if ahead == t:
             return FAILED, t, h, place, calls
         over = calls > limit  # checked before the evaluations for dense output, as in SciPy
-        crossed = (_room(at, blow_up) >= 0.0) != inside
+        crossed = (_room(at, n_bounded, blow_up) >= 0.0) != inside
         if times[place] <= ahead:
             _polynomial(equations, scheme, t, length, y, at, slopes, room, columns, shape)
             calls += 3
             while place < len(times) and times[place] <= ahead:
                 _between(shape, y, (times[place] - t) / length, out[place])
-                if crossed and (_room(out[place], blow_up) >= 0.0) != inside:
+                if crossed and (_room(out[place], n_bounded, blow_up) >= 0.0) != inside:
                     break
                 place += 1
         t = ahead
         if t == stops[stop]:
             stop += 1
-            rates(equations, t, at, columns, slopes[12])
+            _rates(equations, t, at, columns, slopes[12])
             calls += 1
         for i in range(n):
             y[i] = at[i]
@@ -216,87 +219,87 @@ def advance(
 
 
 @compiled(error_model="numpy")
-def _runge_kutta(table, coef, drive, h, x, total, slope, columns):
-    """One classical Runge-Kutta step of length h; updates x in place.
+def _runge_kutta(table, product, target, weight, leads, weights, drive, h, x, slopes, columns):
+    """One step of order four of length h; updates x in place.
 
-    drive: (inputs, 3), at the start, middle and end of the step.
-    Source: Hairer, Norsett & Wanner 1993, II.1.
+    drive: (inputs, 3), at the start, middle and end of the step. leads, weights: of the tableau of
+    the classical scheme, in which every stage leads on from the one before alone.
     """
     n = len(x)
     for stage in range(4):
-        ahead = 0.5 * h if stage < 3 else h
         for i in range(n):
-            columns[i] = x[i] + ahead * slope[i] if stage else x[i]
+            ahead = h * leads[stage, stage - 1] * slopes[stage - 1, i] if stage else 0.0
+            columns[i] = x[i] + ahead
         for j in range(len(drive)):
             columns[n + j] = drive[j, (stage + 1) // 2]
-        _add_terms(table, coef, columns, slope)
-        for i in range(n):
-            if stage == 0:
-                total[i] = slope[i]
-            else:
-                total[i] += (2.0 if stage < 3 else 1.0) * slope[i]
+        _sum(table, product, target, weight, columns, slopes[stage])
     for i in range(n):
-        x[i] = x[i] + h / 6.0 * total[i]
+        for stage in range(4):
+            x[i] += h * weights[stage] * slopes[stage, i]
 
 
 @compiled(error_model="numpy")
-def run_many(table, coefs, start, steps_s, drive, n_substeps, centre, reach):
+def run_many(
+    table, product, target, weight, first, leads, weights, starts, steps_s, drive, pushes,
+    n_substeps, centre, reach,
+):  # fmt: skip
     """Integrate many models from many starts by classical Runge-Kutta steps.
 
-    coefs: (models, terms, states); start: (windows, states); steps_s: (windows, steps); drive:
-    (windows, steps, inputs, 3). Returns the states (samples, states, models, windows) after every
-    n_substeps steps, and flags (samples, models, windows), true while all states have stayed
-    within reach (states,) of the centre. A run that left this range stays at its last state inside.
+    first: (models + 1,), the entries of model m are those from first[m] to first[m + 1]. starts:
+    (models, windows, n); steps_s: (windows, steps); drive: (windows, steps, inputs, 3); pushes:
+    (models, windows, samples, n), added at every sample, or without samples. Returns the states
+    (models, windows, samples, n) after every n_substeps steps; NaN from where a state is farther
+    than reach (n,) from the centre (n,).
     """
-    n_windows, n = start.shape
-    n_models, n_samples = len(coefs), steps_s.shape[1] // n_substeps
-    paths = np.empty((n_samples, n, n_models, n_windows))
-    inside = np.empty((n_samples, n_models, n_windows), dtype=np.bool_)
-    x, last = np.empty(n), np.empty(n)
-    total, slope, columns = np.empty(n), np.empty(n), np.ones(n + drive.shape[2] + 1)
+    n_models, n_windows, n = starts.shape
+    n_samples = steps_s.shape[1] // n_substeps
+    paths = np.full((n_models, n_windows, n_samples, n), np.nan)
+    x, slopes, columns = np.empty(n), np.empty((4, n)), np.ones(n + drive.shape[2] + 1)
     for m in range(n_models):
+        own = slice(first[m], first[m + 1])
+        entries = table, product[own], target[own], weight[own]
         for w in range(n_windows):
             bounded = True
             for i in range(n):
-                x[i] = last[i] = start[w, i]
+                x[i] = starts[m, w, i]
             for k in range(n_samples):
                 for step in range(k * n_substeps, (k + 1) * n_substeps * bounded):
                     at, h = drive[w, step], steps_s[w, step]
-                    _runge_kutta(table, coefs[m], at, h, x, total, slope, columns)
+                    _runge_kutta(*entries, leads, weights, at, h, x, slopes, columns)
                 for i in range(n):
+                    if pushes.shape[2]:
+                        x[i] += pushes[m, w, k, i]
                     bounded = bounded and abs(x[i] - centre[i]) <= reach[i]
+                if not bounded:
+                    break
                 for i in range(n):
-                    last[i] = x[i] if bounded else last[i]
-                    paths[k, i, m, w] = last[i]
-                inside[k, m, w] = bounded
-    return paths, inside
+                    paths[m, w, k, i] = x[i]
+    return paths
 
 
 @compiled(error_model="numpy")
-def approach(
-    terms, coef, products, derivatives, centre, bound, until, times_rate, floor, y, t, left
-):
+def approach(rates, jacobian, leads, weights, centre, bound, until, times_rate, floor, y, t, left):
     """Runge-Kutta steps of many starts until a time, each of length times_rate / max(rate, floor).
 
-    terms, coef, products, derivatives: of a `ScaledModel`, whose Jacobian's norm is the rate. y:
-    (starts, n), t and left: (starts,), the steps that each start may still take, are updated in
+    rates, jacobian: entries of the right-hand side and of its derivatives, whose norm is the rate.
+    y: (starts, n), t and left: (starts,), the steps that each start may still take, are updated in
     place. Returns flags, false for starts that left the bound about the centre.
     """
     n_starts, n = y.shape
-    kept, jacobian = np.ones(n_starts, dtype=np.bool_), np.empty(n * n)
-    total, slope, columns = np.empty(n), np.empty(n), np.ones(n + 1)
+    kept, derivatives = np.ones(n_starts, dtype=np.bool_), np.empty(n * n)
+    slopes, columns = np.empty((4, n)), np.ones(n + 1)
     none = np.empty((0, 3))
     for p in range(n_starts):
         x = y[p]
         while kept[p] and left[p] > 0 and t[p] < until:
             for i in range(n):
                 columns[i] = x[i]
-            _add_terms(products, derivatives, columns, jacobian)
+            _sum(*jacobian, columns, derivatives)
             square = 0.0
             for i in range(n * n):
-                square += jacobian[i] * jacobian[i]
+                square += derivatives[i] * derivatives[i]
             h = times_rate / max(np.sqrt(square), floor)
-            _runge_kutta(terms, coef, none, h, x, total, slope, columns)
+            _runge_kutta(*rates, leads, weights, none, h, x, slopes, columns)
             t[p] += h
             left[p] -= 1
             for i in range(n):

@@ -21,9 +21,10 @@ from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.draws import draw_coef, draw_runs
 from ep2sindy.model.inputs import check_courses, driven, inputs_at_samples
-from ep2sindy.model.rollout import Rollout, check_start, rates, rollout, simulate
+from ep2sindy.model.rollout import Rollout, check_start, rollout, simulate
 from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
+from ep2sindy.model.vector_field import VectorField
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.screen import N_LINES
 from ep2sindy.runtime.values import check_count, read_only
@@ -146,8 +147,7 @@ class SparseModel:
 
         NaN outside the domain of a function of the model.
         """
-        values = np.concatenate([states, inputs], axis=-1)
-        return rates(self.library, self.coef, values[..., self._gather])
+        return self.field.rates(np.concatenate([states, inputs], axis=-1))
 
     def rollout(
         self,
@@ -327,10 +327,9 @@ class SparseModel:
         return list(self.states).index(state)
 
     @cached_property
-    def _gather(self) -> np.ndarray:
-        """Position of each variable of the library in the list of states, then inputs."""
-        known = (*self.states, *self.inputs)
-        return np.array(list(map(known.index, self.library.variables)), dtype=np.int64)
+    def field(self) -> VectorField:
+        """The right-hand side over the states, then the inputs, and its derivatives, in SI."""
+        return VectorField.of(self)
 
 
 def coef_matrix(

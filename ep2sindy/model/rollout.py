@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 
 from ep2sindy.data.numbers import band_of, zero_to_one
 from ep2sindy.data.trajectory import Trajectory, as_dataframe, as_dataset, check_time
-from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.inputs import Curve, curve_through, driven
-from ep2sindy.model.solve import Border, Products, Rates, edges_of, solve_stages
+from ep2sindy.model.solve import Border, Driven, edges_of, solve_stages
+from ep2sindy.model.vector_field import Equations, VectorField
 from ep2sindy.runtime.screen import one_screen, text_table
 
 if TYPE_CHECKING:
@@ -24,29 +24,6 @@ if TYPE_CHECKING:
 
 # A start that is less than this share of what the first rates add tells no size of the state.
 NEGLIGIBLE = 1e-12
-
-
-@runtime_checkable
-class Equations(Protocol):
-    """Interface of equations x' = library(states, inputs) coef, such as a SparseModel."""
-
-    @property
-    def library(self) -> Library: ...
-
-    @property
-    def states(self) -> Sequence[str]: ...
-
-    @property
-    def inputs(self) -> Sequence[str]: ...
-
-    @property
-    def coef(self) -> np.ndarray: ...
-
-    @property
-    def units(self) -> Mapping[str, str]: ...
-
-    @property
-    def courses(self) -> Mapping[str, str]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,18 +192,15 @@ def start_scale(
     is shorter, the fastest time scale of the start. If its rate is zero as well, the rate follows
     from what the other states have become by then. The size is one for a state that stays at zero.
     """
-    library, coef = terms_in_use(model.library, model.coef)
-    n, known = len(start), [*model.states, *model.inputs]
-    places = [known.index(name) for name in library.variables]
-    values, terms = library.at_points(known)
-    values[:] = np.append(start, inputs)
-    size, jacobian = np.abs(start), np.zeros((len(known), n))
+    n = len(start)
+    values = np.append(start, inputs)
+    size = np.abs(start)
     with np.errstate(all="ignore"):  # of functions outside their domain, and of rates that overflow
-        jacobian[places] = library.jacobian(values[places]) @ coef
+        jacobian = model.field.jacobian(values)
         finite = bool(np.isfinite(jacobian).all())
-        fastest = np.abs(np.linalg.eigvals(jacobian[:n])).max() if finite else 0.0
+        fastest = np.abs(np.linalg.eigvals(jacobian)).max() if finite else 0.0
         for _ in range(n):  # the longest chain of states of which each sets off the next
-            moved = (terms() @ coef) / max(fastest, 1.0 / duration_s)
+            moved = model.field.rates(values) / max(fastest, 1.0 / duration_s)
             small = (np.abs(start) <= NEGLIGIBLE * np.abs(moved)) & np.isfinite(moved)
             size = np.where(small, np.maximum(size, np.abs(moved)), size)
             values[:n] = np.where(small, moved, start)
@@ -267,12 +241,12 @@ def _integrate(
     limit_s: float,
 ) -> Rollout:
     """Integrate from x0 over t in units of `scale`, until a scaled state exceeds `blow_up`."""
-    border = _border(model, np.append(x0, samples[0]), drive, scale)
+    border = _border(model.field, np.append(x0, samples[0]), drive, scale)
     if edge := border.beyond(t[0], x0 / scale):
         message = f"the start, at t = {t[0]:.6g} s, is outside {edge.text}"
         return _rollout_of(model, t[:1], x0[None], samples, message, edge.function.name)
     found = solve_stages(
-        _scaled_rhs(model, drive, scale),
+        Driven(model.field.scaled(scale), drive),
         border,
         t,
         x0 / scale,
@@ -316,59 +290,10 @@ def _rollout_of(
     )
 
 
-def _border(model: Equations, start: np.ndarray, drive: Curve, scale: np.ndarray) -> Border:
-    """Border of the domain of the functions that the model uses."""
+def _border(field: VectorField, start: np.ndarray, drive: Curve, scale: np.ndarray) -> Border:
+    """Border of the domain of the functions that the equations use."""
 
     def values(t: float, y: np.ndarray) -> np.ndarray:
-        return np.append(y * scale, drive(t)) if model.inputs else y * scale
+        return np.append(y * scale, drive(t))
 
-    library, _ = terms_in_use(model.library, model.coef)
-    return Border(edges_of(library.functions, [*model.states, *model.inputs], start), values)
-
-
-def _scaled_rhs(model: Equations, drive: Curve, scale: np.ndarray) -> Rates:
-    """Right-hand side for scaled states, without the terms whose coefficients are all zero."""
-    present = np.flatnonzero(model.coef.any(axis=1))
-    coef, known = model.coef[present] / scale, [*model.states, *model.inputs]
-    uses_functions = model.library.exponents[present, len(model.library.variables) :].any()
-    if not (drive.functions or uses_functions):
-        table = model.library.columns_of(known, present)
-        return Products(table, coef, scale, drive)
-    values, terms = model.library.at_points(known, present)
-    n = len(model.states)
-
-    def rhs(t: float, y: np.ndarray) -> np.ndarray:
-        values[:n] = y * scale
-        if model.inputs:
-            values[n:] = drive(t)
-        return terms() @ coef
-
-    return rhs
-
-
-# Right-hand sides evaluated only for the terms that a model uses; its library may have more.
-
-
-def rates(
-    library: Library,
-    coef: Float[np.ndarray, "terms n_states"],
-    values: Float[np.ndarray, "... variables"],
-) -> Float[np.ndarray, "... n_states"]:
-    """Rates library(values) coef; NaN outside the domain of a function with a coefficient."""
-    used, coef = terms_in_use(library, coef)
-    return used.evaluate(values) @ coef
-
-
-def terms_in_use(
-    library: Library, coef: Float[np.ndarray, "terms n_states"]
-) -> tuple[Library, Float[np.ndarray, "_ n_states"]]:
-    """Terms with a nonzero coefficient, and the coefficients; all terms if there are no functions.
-
-    Functions of unused terms are dropped because they may be undefined at the states of the model.
-    """
-    used = np.flatnonzero(coef.any(axis=1))
-    if not library.functions or len(used) == len(coef):
-        return library, coef
-    if len(used):
-        return library.take(used), coef[used]
-    return polynomial(library.variables, degree=0), coef[:1]
+    return Border(edges_of(field.library.functions, field.library.variables, start), values)

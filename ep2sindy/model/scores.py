@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.coerce import check_domain, keep_inside, noise_inside
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.model.rollout import Equations, rates, terms_in_use
+from ep2sindy.model.vector_field import Equations
 from ep2sindy.signals.smoothers import Smoother
 
 
@@ -40,13 +40,13 @@ def derivative_r2(
     smoother: Smoother,
 ) -> float:
     """Mean over the states of the R2 of their derivatives; see `SparseModel.score`."""
-    library, _ = terms_in_use(model.library, model.coef)
+    library = model.field.library
     check_domain([run], library, smooth=x_dot is None)
-    values, data = run.columns(model.library.variables), run.columns(model.states)
+    values, data = run.columns(library.variables), run.columns(model.states)
     if x_dot is None:
         smooth, sides = [], []
         for each in run.stretches():
-            samples = each.columns(model.library.variables)
+            samples = each.columns(library.variables)
             inside = noise_inside(library, samples)
             smooth.append(keep_inside(library, smoother.smooth(each.t, samples), inside))
             sides.append(smoother.derivative(each.t, each.columns(model.states)))
@@ -58,6 +58,6 @@ def derivative_r2(
                 f"x_dot must have shape {data.shape}, a row per sample and a column for each of "
                 f"{list(model.states)}: {truth.shape} came"
             )
-    found = rates(model.library, model.coef, values)
+    found = model.field.rates(values)
     pairs = zip(truth.T, found.T, strict=True)
     return float(np.mean([r2(truth=y, prediction=p[None])[0] for y, p in pairs]))

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import pairwise
 from time import monotonic
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ep2sindy.library.functions import Function, Interval
 from ep2sindy.model.inputs import Curve
+from ep2sindy.model.runge_kutta import dormand_prince
+from ep2sindy.model.vector_field import VectorField
 
 # Largest number of evaluations of the right-hand side in a run: a hundred times what an oscillation
 # needs that its samples resolve. A model that blows up in ever smaller steps stops there.
@@ -36,43 +38,36 @@ Clock = Callable[[], float]  # seconds since an arbitrary origin
 
 
 @dataclass(frozen=True, eq=False)
-class Products:
-    """Right-hand side made of products of states and inputs, which compiled code can evaluate.
+class Driven:
+    """Right-hand side of a vector field, in its own units, with its inputs along time."""
 
-    table: indices of the columns that each term multiplies; columns are the states, the inputs
-    and a one. coef: in units of the scale. drive: the inputs in time.
-    """
-
-    table: Int[np.ndarray, "terms degree"]
-    coef: Float[np.ndarray, "terms n_states"]
-    scale: Float[np.ndarray, " n_states"]
-    drive: Curve
+    field: VectorField
+    drive: Curve | None = None
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
-        from ep2sindy.model import kernels
+        values, rates = self._at_point
+        values[: len(y)] = y
+        if self.drive is not None and len(values) > len(y):
+            values[len(y) :] = self.drive(t)
+        return rates()
 
-        slope, columns = np.empty(len(y)), np.ones(len(y) + self.drive.pieces.shape[2] + 1)
-        # Copied: kernels would be compiled again for a strided or read-only array.
-        kernels.rates(self.parts, float(t), np.array(y), columns, slope)
-        return slope
+    @property
+    def is_compiled(self) -> bool:
+        """Whether compiled code can integrate it, which calls no functions."""
+        return not (self.field.library.functions or (self.drive and self.drive.functions))
 
     @cached_property
     def parts(self) -> tuple[np.ndarray, ...]:
         """Arguments of the compiled functions; see `model.kernels`."""
-        parts = self.table, self.coef, self.scale, self.drive.t, self.drive.pieces
-        return tuple(np.array(part, order="C") for part in parts)
+        t, pieces = np.arange(2.0), np.empty((1, 1, 0))
+        if self.drive is not None:
+            t, pieces = self.drive.t, self.drive.pieces
+        # Copied: kernels would be compiled again for a strided or read-only array.
+        return tuple(np.array(part, order="C") for part in (*self.field.entries, t, pieces))
 
-
-@cache
-def scheme() -> tuple[np.ndarray, ...]:
-    """Coefficients of the explicit method, from SciPy's tables; see `model.kernels`."""
-    from scipy.integrate import DOP853
-
-    tables = (
-        DOP853.A, DOP853.B, DOP853.C, DOP853.E3, DOP853.E5,
-        DOP853.A_EXTRA, DOP853.C_EXTRA, DOP853.D,
-    )  # fmt: skip
-    return tuple(np.ascontiguousarray(table) for table in tables)
+    @cached_property
+    def _at_point(self) -> tuple[np.ndarray, Callable[[], np.ndarray]]:
+        return self.field.at_point()
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +94,7 @@ class Counted:
     clock: Clock
     deadline: float
     stops: Float[np.ndarray, " _"]
+    n_bounded: int
     began_s: float = np.inf
     calls: int = 0
     look_at: int = FIRST_LOOK
@@ -161,24 +157,30 @@ def solve_stages(
     bound: str,
     rtol: float,
     limit_s: float,
+    n_bounded: int | None = None,
     clock: Clock = monotonic,
 ) -> Solved:
     """Integrate from y over t, first explicitly, then implicitly if the equations are stiff.
 
     The run ends early if a state exceeds `blow_up`, leaves the domain or exhausts the budget.
-    `Products` are integrated by compiled functions. If stability limits the steps, an implicit
-    method continues the run, with the same number of evaluations again.
+    A `Driven` field of products is integrated by compiled functions. If stability limits the steps,
+    an implicit method continues the run, with the same number of evaluations again.
     stops: times among t at which the inputs jump or bend; every method starts anew there.
-    bound: the quantity that `blow_up` is a multiple of, in words. clock: measures `limit_s`.
+    bound: the quantity that `blow_up` is a multiple of, in words. n_bounded: number of the first
+    states, which `blow_up` bounds; None for all. clock: measures `limit_s`.
     """
     began = clock()
     budget = CALLS + CALLS_PER_SAMPLE * len(t)
-    rhs = Counted(rates, border, budget, clock, began + limit_s, np.asarray(stops), float(t[0]))
+    rhs = Counted(
+        rates, border, budget, clock, began + limit_s, np.asarray(stops),
+        len(y) if n_bounded is None else n_bounded, float(t[0]),
+    )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore"):  # on the way to a blow-up
         if not np.isfinite(rhs(t[0], y)).all():
             text = f"the first step overflows: a rate at t = {t[0]:.6g} s is not finite"
             return Solved(t[:1], y[None], True, text)
-        explicit = _compiled_stage if isinstance(rates, Products) else _scipy_stage
+        compiled = isinstance(rates, Driven) and rates.is_compiled
+        explicit = _compiled_stage if compiled else _scipy_stage
         found = explicit(rhs, t, y, blow_up, rtol)
         if rhs.stiff:
             return _implicit(found, rhs, t, blow_up, bound, rtol)
@@ -192,7 +194,9 @@ def _implicit(
     began, at, state = rhs.clock(), before.last_s, before.last
     assert state is not None, "a run that is found to be stiff has been stopped there"
     # began_s is left at infinity, so that this part is never taken for stiff.
-    rest = Counted(rhs.rates, rhs.border, rhs.budget, rhs.clock, rhs.deadline, rhs.stops)
+    rest = Counted(
+        rhs.rates, rhs.border, rhs.budget, rhs.clock, rhs.deadline, rhs.stops, rhs.n_bounded
+    )
     try:
         found = _scipy_stage(rest, np.append(at, t[t > at]), state, blow_up, rtol, IMPLICIT)
     except (ValueError, np.linalg.LinAlgError):  # raised for slopes that are not finite
@@ -232,7 +236,7 @@ def _smooth_stage(
         return rhs(min(now, before_end), y)
 
     def ends(t: float, y: np.ndarray) -> float:
-        return min(blow_up - float(np.abs(y).max()), rhs.left_s(t, y))
+        return min(blow_up - float(np.abs(y[: rhs.n_bounded]).max()), rhs.left_s(t, y))
 
     ends.terminal = True  # type: ignore[attr-defined]
     events = [ends, rhs.border] if rhs.border.edges else [ends]
@@ -256,7 +260,7 @@ def _compiled_stage(
     """Integrate by the compiled explicit method, which takes the same steps as SciPy's."""
     from ep2sindy.model import kernels
 
-    assert isinstance(rhs.rates, Products)
+    assert isinstance(rhs.rates, Driven)
     equations, times, stops = rhs.rates.parts, np.array(t), np.append(rhs.stops, t[-1])
     now, state, out = float(t[0]), np.array(y), np.empty((len(t), len(y)))
     slope = rhs.rates(now, state)
@@ -266,8 +270,8 @@ def _compiled_stage(
     while status == kernels.LOOK and rhs.left_s(now, state) > 0.0:
         limit = min(rhs.look_at, rhs.budget, rhs.calls + CALLS_PER_LOOK)
         status, now, h, place, rhs.calls = kernels.advance(
-            equations, scheme(), times, stops, out, state, slope, now, h, place, rhs.calls, limit,
-            blow_up, rtol,
+            equations, dormand_prince(), times, stops, out, state, slope, now, h, place, rhs.calls,
+            limit, rhs.n_bounded, blow_up, rtol,
         )  # fmt: skip
     if status == kernels.FINISHED:
         return Stage(times, out, 0)

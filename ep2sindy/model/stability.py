@@ -7,13 +7,14 @@ from enum import StrEnum
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.integrate import DOP853, OdeSolution
 
 from ep2sindy.model.draws import starts_around
-from ep2sindy.model.many import rk4_step
+from ep2sindy.model.kernels import approach
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.rollout import start_scale
-from ep2sindy.model.scaled import ScaledModel
+from ep2sindy.model.rollout import simulate, start_scale
+from ep2sindy.model.runge_kutta import CLASSICAL, step
+from ep2sindy.model.solve import Border, Driven, solve_stages
+from ep2sindy.model.vector_field import VectorField, entries_of
 from ep2sindy.runtime.values import check_positive, read_only
 
 # A multiplier whose modulus is this close to one counts as neutral: a departure then takes at least
@@ -111,10 +112,10 @@ def limit_cycle(
     """
     start = np.asarray(start, dtype=np.float64)
     _check_search(model, start, period_s=period_s, n_samples=n_samples)
-    run = free_run(model, start, period_s=period_s, n_periods=RETURNS[1])
+    run = _run(model, start, period_s=period_s, n_periods=RETURNS[1])
     cycle = _cycle(model, run, period_s=period_s, n_samples=n_samples)
     if run is not None and cycle is None:
-        run = free_run(model, start, period_s=period_s, n_periods=N_SETTLING + RETURNS[1])
+        run = _run(model, start, period_s=period_s, n_periods=N_SETTLING + RETURNS[1])
         late = None if run is None else run[N_SETTLING * N_SAMPLES :]
         cycle = _cycle(model, late, period_s=period_s, n_samples=n_samples)
     if cycle is None:
@@ -143,7 +144,7 @@ def _backwards(
 ) -> LimitCycle | None:
     """Cycle found in reversed time, converted to forward time."""
     reverse = replace(model, coef=-model.coef, covariance=None)
-    run = free_run(reverse, start, period_s=period_s, n_periods=RETURNS[1])
+    run = _run(reverse, start, period_s=period_s, n_periods=RETURNS[1])
     cycle = _cycle(reverse, run, period_s=period_s, n_samples=n_samples)
     if cycle is None or not cycle.multipliers.all():
         return None
@@ -177,11 +178,11 @@ def share_reaching(
     n_periods = periods_to_reach(cycle) if n_periods is None else n_periods
     _check_reach(model, cycle, n_starts=n_starts, n_periods=n_periods, spread=spread)
     scale = deviations(cycle.states)
-    scaled = ScaledModel.of(model, scale, cycle.period_s)
+    field = model.field.scaled(scale, cycle.period_s)
     curve = cycle.states / scale
-    y = (starts_around(cycle.states, n_starts, spread) / scale).T
-    per_period = float(np.mean(1.0 / _steps(scaled, curve.T)))
-    on_cycle = _on_cycle(scaled, y, curve, n_periods, round(PATIENCE * n_periods * per_period))
+    y = starts_around(cycle.states, n_starts, spread) / scale
+    per_period = float(np.mean(1.0 / _steps(field, curve)))
+    on_cycle = _on_cycle(field, y, curve, n_periods, round(PATIENCE * n_periods * per_period))
     return float(on_cycle) / n_starts
 
 
@@ -197,41 +198,63 @@ def periods_to_reach(cycle: LimitCycle) -> float:
 
 
 def _on_cycle(
-    scaled: ScaledModel, y: np.ndarray, curve: np.ndarray, n_periods: float, n_steps: int
+    field: VectorField, y: np.ndarray, curve: np.ndarray, n_periods: float, n_steps: int
 ) -> int:
-    """Number of starts (n_states, starts) that follow the curve over the last periods."""
+    """Number of starts (starts, n_states) that follow the curve over the last periods."""
     from scipy.interpolate import CubicSpline  # imports take 0.25 s, and are seldom needed
     from scipy.spatial import KDTree
 
     closed = np.append(curve, curve[:1], axis=0)
     spline = CubicSpline(np.arange(len(closed)), closed, bc_type="periodic")
     nearest = KDTree(spline(np.arange(16 * len(curve)) / 16.0))
-    centre = curve.mean(axis=0)[:, None]
-    bound = BLOW_UP * np.abs(y - centre).max()
-    y, t, left = scaled.approach(
-        y, centre[:, 0], float(bound), n_periods - N_LATE, n_steps,
-        times_rate=STEP_TIMES_RATE, floor=STEP_TIMES_RATE * MIN_STEPS,
-    )  # fmt: skip
+    centre = curve.mean(axis=0)
+    bound = float(BLOW_UP * np.abs(y - centre).max())
+    y, t, left = _approach(field, y, centre, bound, n_periods - N_LATE, n_steps)
     quarters = np.zeros((len(t), 4), dtype=np.bool_)
     while (running := (t < n_periods) & (left > 0)).any():
         with np.errstate(over="ignore", invalid="ignore"):  # runs that overflow are dropped
-            step = np.where(running, _steps(scaled, y), 0.0)
-            y = rk4_step(lambda x, _: scaled.slope(x), y, (t, t, t), step)
-            t, left = t + step, left - running
-            kept = (np.abs(y - centre) <= bound).all(axis=0)
+            h = np.where(running, _steps(field, y), 0.0)
+            y = step(lambda x, _: field.rates(x), y, (t, t, t), h[:, None])
+            t, left = t + h, left - running
+            kept = (np.abs(y - centre) <= bound).all(axis=1)
         late = np.flatnonzero(kept & (t >= n_periods - N_LATE))
         if len(late):
-            distance, place = nearest.query(y[:, late].T)
+            distance, place = nearest.query(y[late])
             kept[late] = distance <= REACHED_WITHIN
             quarters[late, 4 * place // nearest.n] = True
         if not kept.all():
-            y, t, left, quarters = y[:, kept], t[kept], left[kept], quarters[kept]
+            y, t, left, quarters = y[kept], t[kept], left[kept], quarters[kept]
     return int(np.count_nonzero(quarters.all(axis=1) & (t >= n_periods)))
 
 
-def _steps(scaled: ScaledModel, y: np.ndarray) -> np.ndarray:
-    """Time step at every state (n_states, points), in periods."""
-    return STEP_TIMES_RATE / np.maximum(scaled.rate(y), STEP_TIMES_RATE * MIN_STEPS)
+def _steps(field: VectorField, y: np.ndarray) -> np.ndarray:
+    """Time step at every state (points, n_states), in periods.
+
+    The Frobenius norm of the Jacobian is no smaller than its largest eigenvalue.
+    """
+    rate = np.linalg.norm(field.jacobian(y), axis=(1, 2))
+    return STEP_TIMES_RATE / np.maximum(rate, STEP_TIMES_RATE * MIN_STEPS)
+
+
+def _approach(
+    field: VectorField, y: np.ndarray, centre: np.ndarray, bound: float, until: float, n_steps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Starts that stay within the bound about the centre, run until a time by compiled code.
+
+    Each takes Runge-Kutta steps of its own, at most n_steps. Returns the states, their times and
+    the steps left. With functions in the library, which no kernel evaluates, nothing has been run.
+    """
+    t, left = np.zeros(len(y)), np.full(len(y), n_steps)
+    if field.library.functions:
+        return y, t, left
+    derivatives = field.weights[:, 1:].reshape(-1, field.weights.shape[2]).T
+    points = np.array(y, order="C")
+    kept = approach(
+        field.entries, entries_of(field.products.table, derivatives),
+        CLASSICAL.leads, CLASSICAL.weights,
+        centre, bound, until, STEP_TIMES_RATE, STEP_TIMES_RATE * MIN_STEPS, points, t, left,
+    )  # fmt: skip
+    return points[kept], t[kept], left[kept]
 
 
 def _check_search(
@@ -287,12 +310,11 @@ def _check_reach(
 # closed orbit.
 START_RTOL, RTOL, FINAL_RTOL = 1e-6, 1e-9, 1e-11
 
-# A period takes 30 to 300 steps. A run that takes this many is stiff while it diverges, and is
-# given up.
-MAX_STEPS = 1000
+# Longest work on a run; a period takes milliseconds, unless it is stiff.
+LIMIT_S = 60.0
 
-# A run is also given up when a state has moved this far: in standard deviations, or for the first
-# run in units of its initial size.
+# A run is also given up when a state has become this large: in standard deviations, or for the
+# first run in units of its initial size.
 ORBIT_BLOW_UP, START_BLOW_UP = 1e3, 1e4
 
 # An orbit counts as closed if its gap is below this value times the amplification over one period,
@@ -342,32 +364,16 @@ class ClosedOrbit:
         return np.append(1.0 + 0.0j, others[np.argsort(-np.abs(others), kind="stable")])
 
 
-@dataclass(frozen=True, eq=False)
-class _Path:
-    """Integrated state followed by its departures; `at` needs the dense output to be kept."""
-
-    end: np.ndarray
-    times: list[float]
-    pieces: list[object]
-
-    def at(self, t: float | np.ndarray) -> np.ndarray:
-        return OdeSolution(self.times, self.pieces)(t)
-
-
-def free_run(
+def _run(
     model: SparseModel, start: Float[np.ndarray, " n_states"], *, period_s: float, n_periods: float
 ) -> Float[np.ndarray, "samples n_states"] | None:
     """States of a free run from a start, N_SAMPLES per period; None if they diverge."""
     # A state that starts near zero has at least the size that its rate gives it in a period.
     moved = np.abs(model.derivative(start, np.empty(0))) * period_s
     size = np.maximum(start_scale(model, start, np.empty(0), period_s), moved)
-    scaled = ScaledModel.of(model, size, period_s)
-    y = np.append(start / size, np.zeros(start.size**2))
-    path = _path(scaled, y, n_periods, rtol=START_RTOL, blow_up=START_BLOW_UP, keep=True)
-    if path is None:
-        return None
-    times = np.linspace(0.0, n_periods, round(N_SAMPLES * n_periods) + 1)
-    return path.at(times)[: start.size].T * size
+    t = period_s * np.linspace(0.0, n_periods, round(N_SAMPLES * n_periods) + 1)
+    run = simulate(model, t, start, None, blow_up=START_BLOW_UP, rtol=START_RTOL, reach=size)
+    return None if run.diverged else run.states
 
 
 def find_closed_orbit(
@@ -377,32 +383,33 @@ def find_closed_orbit(
     period_s: float,
     n_samples: int,
 ) -> ClosedOrbit | None:
-    """Closed orbit near the first state of a `free_run`; its closest return starts the search.
+    """Closed orbit near the first state of a free run; its closest return starts the search.
 
     None if Newton's method does not close the orbit, or ends on a fixed point.
     """
     scale = deviations(run)
-    scaled = ScaledModel.of(model, scale, period_s)
+    field = model.field.scaled(scale, period_s)
+    departing = Driven(field.with_departures())
     first, last = (round(N_SAMPLES * r) for r in RETURNS)
     distance = np.linalg.norm((run[first : last + 1] - run[0]) / scale, axis=1)
-    closed = _close_orbit(scaled, run[0] / scale, float(first + distance.argmin()) / N_SAMPLES)
+    closed = _close_orbit(
+        field, departing, run[0] / scale, float(first + distance.argmin()) / N_SAMPLES
+    )
     if closed is None:
         return None
     y, period = closed
-    n = len(y)
-    path = _path(scaled, np.append(y, np.eye(n)), period, rtol=FINAL_RTOL, keep=True)
+    # If the guess was several periods, the orbit found is traversed several times.
+    turns = np.arange(6, 0, -1)
+    path = _path(departing, y, np.append(0.0, period / turns), rtol=FINAL_RTOL)
     if path is None:
         return None
-    # If the guess was several periods, the orbit found is traversed several times.
-    turns = (k for k in range(6, 1, -1) if np.abs(path.at(period / k)[:n] - y).max() < 1e-4)
-    period /= next(turns, 1)
-    states = path.at(np.arange(n_samples) * (period / n_samples))[:n].T
-    if not (states.std(axis=0) > STILL).any():
+    n, returned = len(y), np.abs(path[1:-1, : len(y)] - y).max(axis=1) < 1e-4
+    period /= turns[np.argmax(np.append(returned, True))]
+    path = _path(departing, y, np.linspace(0.0, period, n_samples + 1), rtol=FINAL_RTOL)
+    if path is None or not (path[:-1, :n].std(axis=0) > STILL).any():
         return None
-    monodromy = path.at(period)[n:].reshape(n, n).T
-    return ClosedOrbit(
-        period, _without_rounding(states), monodromy, scaled.slope(y[:, None])[:, 0], scale
-    )
+    monodromy = path[-1, n:].reshape(n, n).T
+    return ClosedOrbit(period, _without_rounding(path[:-1, :n]), monodromy, field.rates(y), scale)
 
 
 def deviations(states: Float[np.ndarray, "samples n_states"]) -> Float[np.ndarray, " n_states"]:
@@ -413,70 +420,63 @@ def deviations(states: Float[np.ndarray, "samples n_states"]) -> Float[np.ndarra
 
 
 def _close_orbit(
-    scaled: ScaledModel, y: np.ndarray, period: float
+    field: VectorField, departing: Driven, y: np.ndarray, period: float
 ) -> tuple[np.ndarray, float] | None:
     """State and period of a closed orbit, by Newton steps of least norm, halved if they fail."""
     n = len(y)
-    base, step, best = np.append(y, period), np.zeros(n + 1), np.inf
+    base, change, best = np.append(y, period), np.zeros(n + 1), np.inf
     for _ in range(N_NEWTON):
-        trial = base + step
+        trial = base + change
         path = None
         if PERIODS[0] <= trial[n] <= PERIODS[1]:
-            path = _path(scaled, np.append(trial[:n], np.eye(n)), float(trial[n]), rtol=RTOL)
-        missed = np.inf if path is None else float(np.linalg.norm(path.end[:n] - trial[:n]))
+            path = _path(departing, trial[:n], np.array([0.0, trial[n]]), rtol=RTOL)
+        missed = np.inf if path is None else float(np.linalg.norm(path[-1, :n] - trial[:n]))
         if path is None or missed > best:
-            step = 0.5 * step
-            if np.abs(step).max() < CLOSED_WITHIN:
+            change = 0.5 * change
+            if np.abs(change).max() < CLOSED_WITHIN:
                 return None
             continue
         base, best = trial, missed
-        monodromy = path.end[n:].reshape(n, n).T
-        step = _newton_step(scaled, base[:n], path.end[:n], monodromy)
+        monodromy = path[-1, n:].reshape(n, n).T
+        change = _newton_step(field, base[:n], path[-1, :n], monodromy)
         if missed <= CLOSED_WITHIN * max(1.0, float(np.linalg.norm(monodromy, 2))):
-            base += step  # this step costs no further integration, and squares the remaining error
+            base += change  # costs no further integration, and squares the remaining error
             return base[:n], float(base[n])
     return None
 
 
 def _newton_step(
-    scaled: ScaledModel, y: np.ndarray, reached: np.ndarray, monodromy: np.ndarray
+    field: VectorField, y: np.ndarray, reached: np.ndarray, monodromy: np.ndarray
 ) -> np.ndarray:
     """Newton step of the state, across the flow, and of the period."""
     n = len(y)
-    here, there = scaled.slope(np.stack([y, reached], axis=1)).T
+    here, there = field.rates(np.stack([y, reached]))
     equations = np.zeros((n + 1, n + 1))
     equations[:n, :n] = monodromy - np.eye(n)
     equations[:n, n] = there
     equations[n, :n] = here / max(float(np.linalg.norm(here)), np.finfo(float).tiny)
-    step = np.linalg.lstsq(equations, np.append(y - reached, 0.0), rcond=RCOND)[0]
-    length = max(float(np.linalg.norm(step[:n])), 5.0 * abs(float(step[n])))
-    return step * (LONGEST / max(length, LONGEST))
+    change = np.linalg.lstsq(equations, np.append(y - reached, 0.0), rcond=RCOND)[0]
+    length = max(float(np.linalg.norm(change[:n])), 5.0 * abs(float(change[n])))
+    return change * (LONGEST / max(length, LONGEST))
 
 
 def _path(
-    scaled: ScaledModel,
-    y: np.ndarray,
-    span: float,
-    *,
-    rtol: float,
-    blow_up: float = ORBIT_BLOW_UP,
-    keep: bool = False,
-) -> _Path | None:
-    """Integrate a state and departures over scaled time; None if the run is given up."""
-    n = scaled.n_states
-    times, pieces = [0.0], []
-    with np.errstate(over="ignore", invalid="ignore"):  # a run that overflows is given up
-        solver = DOP853(scaled.with_departures(), 0.0, y, span, rtol=rtol, atol=rtol)
-        for _ in range(MAX_STEPS):
-            solver.step()
-            if solver.status == "failed" or not np.abs(solver.y[:n] - y[:n]).max() < blow_up:
-                return None
-            if keep:
-                times.append(solver.t)
-                pieces.append(solver.dense_output())
-            if solver.status == "finished":
-                return _Path(solver.y, times, pieces) if np.isfinite(solver.y).all() else None
-    return None
+    departing: Driven, y: np.ndarray, times: np.ndarray, *, rtol: float
+) -> Float[np.ndarray, "times n_states_and_departures"] | None:
+    """States from y, then the departures that n unit ones become; None if the run is given up."""
+    n = len(y)
+    found = solve_stages(
+        departing,
+        Border((), lambda t, y: y),
+        times,
+        np.append(y, np.eye(n)),
+        blow_up=ORBIT_BLOW_UP + float(np.abs(y).max()),
+        bound="a standard deviation",
+        rtol=rtol,
+        limit_s=LIMIT_S,
+        n_bounded=n,
+    )
+    return None if found.ended_early or not np.isfinite(found.y).all() else found.y
 
 
 def _without_rounding(states: np.ndarray) -> np.ndarray:

@@ -10,7 +10,8 @@ import torch
 from torchdiffeq import odeint
 
 from ep2sindy.library.library import Library
-from ep2sindy.model.flow_kernels import THREE_EIGHTHS, advance, sums_of_products
+from ep2sindy.model.flow_kernels import advance, sums_of_products
+from ep2sindy.model.runge_kutta import THREE_EIGHTHS
 from ep2sindy.refinement.kernels import propagate
 from ep2sindy.refinement.ode import ODE, Drive
 from ep2sindy.runtime.values import set_counts

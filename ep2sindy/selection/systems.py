@@ -95,6 +95,7 @@ class TrialSystem:
             runs,
             n_windows=n_windows,
             window=window,
+            method=MultipleShooting(step=fastest_step(self.model.library)),
             constraint=self.constraint,
             n_reweights=n_reweights,
             seed=seed,
