@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.special import ndtri, stdtrit
-from torchdiffeq import odeint
 
 from ep2sindy.estimation.noise import are_noise
 from ep2sindy.refinement.kernels import condense, propagate
 from ep2sindy.refinement.methods.multiple_shooting import least_change, step_maps
 from ep2sindy.refinement.problem import LawMap, Method, RefinementFit, RefinementProblem
+from ep2sindy.refinement.steps import integrate
 from ep2sindy.refinement.windows import WindowBatch
 
 FLAT = 0.95  # a model with more than this share of a constant's loss does not follow the data
@@ -121,7 +121,7 @@ def judge(
     There is one verdict for each point, or a single one if a law ties the points. If one point
     blows up, all points that a law ties to it count as not finite.
     """
-    fit, maps = integrate(problem, fit)
+    fit, maps = follow(problem, fit)
     n_start, window = problem.n_start, fit.nodes.shape[2]
     sound = maps if fit.finite.all() else np.where(np.isfinite(maps), maps, 0.0)
     condensed = condense(sound, fit.nodes, problem.data, fit.weights, window, n_start)
@@ -202,49 +202,49 @@ def _join_windows(batches: Sequence[WindowBatch]) -> WindowBatch:
     )
 
 
-def integrate(problem: RefinementProblem, fit: RefinementFit) -> tuple[RefinementFit, np.ndarray]:
+def follow(problem: RefinementProblem, fit: RefinementFit) -> tuple[RefinementFit, np.ndarray]:
     """Integrate every window from its fitted start; also returns the one-step maps.
 
-    All steps are integrated at once. Newton's method closes the gaps between them, with starts and
-    scalings held, and so converges to the trajectory itself. Points where it does not converge
-    are integrated step by step. Points that blow up are marked as not finite.
+    Points whose gaps do not close are integrated step by step. Points that blow up are marked as
+    not finite.
     """
-    nodes, finite = fit.nodes.copy(), fit.finite.copy()
-    points = np.arange(len(nodes))
-    window = nodes.shape[2]
-    start = np.zeros((*nodes.shape[:2], 1, nodes.shape[-1]))
-    still = np.zeros_like(fit.scaling)
-    open_points = points
-    known = fit.maps
-    for _ in range(CLOSING_STEPS):
-        maps = step_maps(problem, fit.step, fit.scaling, nodes, points) if known is None else known
-        known = None
-        with np.errstate(invalid="ignore", over="ignore"):
-            gaps = np.abs(maps[..., -1] - nodes[:, :, 1:]).max(axis=(1, 2, 3))
-        open_points = np.flatnonzero(finite & ~(gaps < CLOSED))
-        if not open_points.size or not np.isfinite(gaps[open_points]).all():
-            break
-        change = propagate(maps, nodes, start, still, window)
-        nodes[open_points] += change[open_points]
+    nodes, gaps, maps = close_gaps(problem, fit)
+    finite = fit.finite.copy()
+    open_points = np.flatnonzero(finite & ~(gaps < CLOSED).all(axis=1))
     if open_points.size:
-        states = rollout(problem, fit)
-        sound = np.isfinite(states[open_points]).all(axis=(1, 2, 3))
+        states = rollout(problem, fit)[open_points]
+        sound = np.isfinite(states).all(axis=(1, 2, 3))
         finite[open_points] = sound
-        nodes[open_points[sound]] = states[open_points[sound]]
-        maps = step_maps(problem, fit.step, fit.scaling, nodes, points)
+        nodes[open_points[sound]] = states[sound]
+        maps = step_maps(problem, fit.step, fit.scaling, nodes, np.arange(len(nodes)))
     finite &= np.isfinite(maps).all(axis=(1, 2, 3, 4))
     return replace(fit, nodes=nodes, finite=finite, maps=None), maps
 
 
-def integrate_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndarray:
-    """Trajectories from the fitted starts, with gaps closed as in `integrate`, per window.
+def follow_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndarray:
+    """Trajectories from the fitted starts, (points, windows, samples, n_states).
 
-    Returns (points, windows, samples, n_states); NaN in windows whose gaps do not close.
+    NaN in windows whose gaps do not close.
+    """
+    nodes, gaps, _ = close_gaps(problem, fit)
+    nodes[~(gaps < CLOSED)] = np.nan
+    return nodes
+
+
+def close_gaps(
+    problem: RefinementProblem, fit: RefinementFit
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes of the trajectories from the fitted starts, with starts and scalings held.
+
+    All steps are integrated at once, and Newton's method closes the gaps between them. Returns the
+    nodes, the largest gap of every window (points, windows), in std, and the one-step maps.
     """
     nodes, points = fit.nodes.copy(), np.arange(len(fit.nodes))
     start = np.zeros((*nodes.shape[:2], 1, nodes.shape[-1]))
+    maps = fit.maps
     for _ in range(CLOSING_STEPS):
-        maps = step_maps(problem, fit.step, fit.scaling, nodes, points)
+        if maps is None:
+            maps = step_maps(problem, fit.step, fit.scaling, nodes, points)
         with np.errstate(invalid="ignore", over="ignore"):
             gaps = np.abs(maps[..., -1] - nodes[:, :, 1:]).max(axis=(2, 3))
         is_open = np.isfinite(gaps) & ~(gaps < CLOSED)
@@ -252,22 +252,23 @@ def integrate_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndar
             break
         change = propagate(maps, nodes, start, np.zeros_like(fit.scaling), nodes.shape[2])
         nodes[is_open] += change[is_open]
-    nodes[~(gaps < CLOSED)] = np.nan
-    return nodes
+        maps = None
+    if maps is None:
+        maps = step_maps(problem, fit.step, fit.scaling, nodes, points)
+    return nodes, gaps, maps
 
 
 def rollout(problem: RefinementProblem, fit: RefinementFit, *, n_substeps: int = 4) -> np.ndarray:
     """Integrate every window step by step with torchdiffeq's rk4, from its fitted start."""
-    ode, n_steps = problem.ode, fit.nodes.shape[2] - 1
-    ode.set(fit.scaling, problem.whole)
+    problem.ode.set(fit.scaling, problem.whole)
     start = torch.tensor(fit.nodes[:, :, 0].transpose(0, 2, 1).copy(), device=problem.device)
-    t = torch.arange(n_steps + 1, dtype=torch.float64)
-    grid = torch.linspace(0.0, float(n_steps), n_substeps * n_steps + 1, dtype=torch.float64)
     with torch.inference_mode():
-        path = odeint(
-            ode, start[:, None], t, method="rk4",
-            options={"grid_constructor": lambda func, y0, t: grid, "perturb": True},
-        )  # fmt: skip
+        path = integrate(
+            problem.ode,
+            start[:, None],
+            n_segments=fit.nodes.shape[2] - 1,
+            n_substeps=n_substeps,
+        )
     return path[:, :, 0].permute(1, 3, 0, 2).cpu().numpy()
 
 

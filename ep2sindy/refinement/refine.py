@@ -20,7 +20,7 @@ from ep2sindy.refinement.judge import (
     RefinementVerdict,
     failure,
     fit_and_judge,
-    integrate_windows,
+    follow_windows,
 )
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import all_fixed, unconstrained
@@ -390,6 +390,6 @@ def smooth_batch(
             equations=tuple(each for each in by_model.equations for _ in windows),
             batches=tuple(windows * len(chunk)),
         )
-        paths.append(integrate_windows(problem, method.fit(problem)))
+        paths.append(follow_windows(problem, method.fit(problem)))
         advance(len(chunk))
     return np.concatenate(paths).reshape(len(models), *batch.data.shape)

@@ -61,11 +61,14 @@ class RungeKutta:
         z[:, 0] = x
         for j in range(ode.n_states):
             z[:, 1 + j, j] = 1.0
-        return _as_maps(_integrate(ode, z, self.n_substeps), nodes)
+        with torch.inference_mode():
+            end = integrate(ode, z, n_substeps=self.n_substeps)[-1]
+        return _as_maps(end, nodes)
 
     def finer(self, ode: ODE, nodes: np.ndarray) -> np.ndarray:
         x = _batch(nodes[:, :, :-1], ode)
-        end = _integrate(ode, x[:, None], 2 * self.n_substeps)[:, 0]
+        with torch.inference_mode():
+            end = integrate(ode, x[:, None], n_substeps=2 * self.n_substeps)[-1, :, 0]
         return end.permute(0, 2, 1).cpu().numpy().reshape(nodes[:, :, 1:].shape)
 
     def halved(self) -> RungeKutta | None:
@@ -75,13 +78,19 @@ class RungeKutta:
 ONE_RUNGE_KUTTA = RungeKutta()
 
 
-def _integrate(ode: ODE, start: torch.Tensor, n_steps: int) -> torch.Tensor:
-    """States and tangents (points, columns, n_states, batch) at the end of one unit of time."""
-    grid = torch.linspace(0.0, 1.0, n_steps + 1, dtype=torch.float64)  # stays on the CPU
-    options = {"grid_constructor": lambda func, y0, t: grid}
-    with torch.inference_mode():
-        end: torch.Tensor = odeint(ode, start, grid[[0, -1]], method="rk4", options=options)[-1]
-    return end
+def integrate(
+    ode: ODE, start: torch.Tensor, *, n_segments: int = 1, n_substeps: int
+) -> torch.Tensor:
+    """States and tangents from their start through the segments of the drive, by torchdiffeq.
+
+    start: (points, columns, n_states, batch). Returns (1 + n_segments, *start.shape).
+    """
+    # Times stay on the CPU. Inputs at a node are those of the segment that a step belongs to.
+    t = torch.arange(n_segments + 1, dtype=torch.float64)
+    grid = torch.linspace(0.0, n_segments, n_substeps * n_segments + 1, dtype=torch.float64)
+    options = {"grid_constructor": lambda func, y0, t: grid, "perturb": n_segments > 1}
+    path: torch.Tensor = odeint(ode, start, t, method="rk4", options=options)
+    return path
 
 
 @dataclass(frozen=True)

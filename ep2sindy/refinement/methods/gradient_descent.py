@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
-from torchdiffeq import odeint
 
 from ep2sindy.refinement.ode import ODE, Drive
 from ep2sindy.refinement.problem import (
@@ -20,7 +19,7 @@ from ep2sindy.refinement.problem import (
     join,
     residual_weights,
 )
-from ep2sindy.refinement.steps import RungeKutta
+from ep2sindy.refinement.steps import RungeKutta, integrate
 
 Optimizer = Callable[[list[nn.Parameter]], torch.optim.Optimizer]
 
@@ -128,11 +127,8 @@ def trajectories(
 ) -> torch.Tensor:
     """Trajectories (windows, samples, n_states) from starts (windows, n_states), differentiable."""
     ode.drive = drive
-    last = n_samples - 1
-    t = torch.arange(n_samples, dtype=torch.float64, device=start.device)
-    grid = torch.linspace(0.0, float(last), n_substeps * last + 1, dtype=torch.float64)
-    options = {"grid_constructor": lambda func, y0, t: grid, "perturb": True}
-    path = odeint(ode, start.T[None, None], t, method="rk4", options=options)
+    column = start.T[None, None]
+    path = integrate(ode, column, n_segments=n_samples - 1, n_substeps=n_substeps)
     return path[:, 0, 0].permute(2, 0, 1)
 
 
