@@ -15,7 +15,7 @@ from ep2sindy.regression.gram_kernels import (
     append_term,
     substitute,
 )
-from ep2sindy.runtime.compilation import GIVEN_ARRAYS, LOOPS, compiled
+from ep2sindy.runtime.compilation import LOOPS, compiled
 
 PATH_PER_TERM = 8  # supports on a lasso path, per term, at which it ends; they may come and go
 
@@ -153,7 +153,7 @@ def _leave(xx, active, n_active, term, lower):
 
 
 # For kernels that are given their arrays; sweeps are made in place, so these are not separate ones.
-PLAIN: dict[str, Any] = {"error_model": "numpy", **GIVEN_ARRAYS}
+PLAIN: dict[str, Any] = {"error_model": "numpy"}
 PLAIN_INNER = {**PLAIN, "no_cpython_wrapper": True}
 
 

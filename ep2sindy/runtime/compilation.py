@@ -45,16 +45,11 @@ def _separate_arrays() -> dict[str, Any]:
 
 SEPARATE_ARRAYS = _separate_arrays()
 
-# For kernels that make no arrays but are given all: no references are counted, which halves the
-# time to compile loops and often the time to run them. Numba's decorators keep it to themselves.
-GIVEN_ARRAYS = {"_nrt": False} if hasattr(cpu.CPUTargetOptions, "_nrt") else {}
-
 # How kernels are compiled that are nothing but loops over separate arrays that they are given.
 LOOPS: dict[str, Any] = {
     "fastmath": {"contract"},
     "error_model": "numpy",
     **SEPARATE_ARRAYS,
-    **GIVEN_ARRAYS,
 }
 
 # The same for kernels that only kernels call, from several places: they are compiled once and then
