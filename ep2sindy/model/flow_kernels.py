@@ -121,12 +121,15 @@ def _sum_products(s, columns, table, product, target, weight, values, sums):
 def _gains(sums, row, factor, leads, weights, h, gains, by_state):
     """Change of the end of a step per change of the slope at each stage, and of its start."""
     d = len(by_state)
+    # The end is x + sum_s w_s h k_s: by_state starts as the identity, gains[s] as w_s h times it.
     for j in range(d):
         for k in range(d):
             for i in range(LANES):
                 by_state[j, k, i] = 1.0 if j == k else 0.0
                 for s in range(4):
                     gains[s, j, k, i] = weights[s] * h[i] if j == k else 0.0
+    # Backwards over the stages, k_later = f(x + h sum_s a_(later, s) k_s), so that
+    # gains[s] += h a_(later, s) gains[later] J_later, and then by_state += gains[s] J_s.
     for s in range(3, -1, -1):
         for later in range(s + 1, 4):
             lead = leads[later, s]

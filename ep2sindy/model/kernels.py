@@ -139,6 +139,7 @@ def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
         ahead = min(t + h, end_t)
         h = ahead - t
         before_end = np.nextafter(ahead, -np.inf)
+        # The stages k_s = f(t + c_s h, x + h sum_r a_sr k_r), then the end x + h sum_s b_s k_s.
         for s in range(1, 12):
             now = min(t + c[s] * h, before_end)
             _stage(equations, now, y, h, a[s], s, slopes, at, columns)
@@ -149,6 +150,7 @@ def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
             at[i] = y[i] + h * value
         _rates(equations, before_end, at, columns, slopes[12])
         calls += 12
+        # An error above one repeats the step, shorter; below one it sets the length of the next.
         error = _error(e3, e5, slopes, h, y, at, rtol)
         if error < 1.0:
             factor = MAX_FACTOR
@@ -226,6 +228,7 @@ def _runge_kutta(table, product, target, weight, leads, weights, drive, h, x, sl
     the classical scheme, in which every stage leads on from the one before alone.
     """
     n = len(x)
+    # k_s = f(x + h a_(s, s - 1) k_(s - 1), u), then x += h sum_s w_s k_s.
     for stage in range(4):
         for i in range(n):
             ahead = h * leads[stage, stage - 1] * slopes[stage - 1, i] if stage else 0.0

@@ -57,11 +57,13 @@ def _advance(by: np.ndarray, nodes: np.ndarray, x: np.ndarray, new: np.ndarray) 
     n, n_columns = x.shape
     n_start = n_columns - (by.shape[1] - n)
     for j in range(n):
+        # What the step adds itself: F_s of the scalings, and the defect F(x_k) - x_(k+1).
         for c in range(n_start):
             new[j, c] = 0.0
         for c in range(n_start, n_columns):
             new[j, c] = by[j, n + c - n_start]
         new[j, n_columns - 1] -= nodes[j]
+        # F_x times the columns so far: dx_(k+1) = F_x dx_k + F_s ds + defect.
         for v in range(n):
             _add(x[v], by[j, v], new[j])
     for j in range(n):
@@ -98,6 +100,7 @@ def _condense(maps, nodes, data, weights, block, n_start, out, columns, x, new):
             for b in range(out.shape[2]):
                 first = b * block
                 last = min(first + block, n_samples)
+                # dx of the first node, by the start (the identity), the scalings (zero) and one.
                 for j in range(n):
                     for c in range(n_columns):
                         x[j, c] = 0.0
@@ -106,6 +109,7 @@ def _condense(maps, nodes, data, weights, block, n_start, out, columns, x, new):
                     else:
                         x[j, n_columns - 1] = data[p, w, first, j] - nodes[p, w, first, j]
                 for k in range(first, last):
+                    # Rows of the least squares: W (dx_k + x_k - data_k).
                     for j in range(n):
                         row = (k - first) * n + j
                         for c in range(n_columns):
@@ -181,6 +185,7 @@ def starts(condensed: np.ndarray, change: np.ndarray, n: int) -> np.ndarray:
     for p in range(n_points):
         for w in range(n_windows):
             for b in range(n_blocks):
+                # Back substitution in R_start d_start = -(R_scaling d_scaling + r).
                 r = condensed[p, w, b]
                 for i in range(n - 1, -1, -1):
                     total = -r[i, n_columns - 1]
@@ -209,6 +214,7 @@ def propagate(
                 if k % block == 0:
                     out[p, w, k] = start[p, w, k // block]
                     continue
+                # dx_k = F_x dx_(k-1) + F_s ds + the defect F(x_(k-1)) - x_k.
                 for j in range(n):
                     total = maps[p, w, k - 1, j, width - 1] - nodes[p, w, k, j]
                     for v in range(n):

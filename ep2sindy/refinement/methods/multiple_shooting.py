@@ -53,6 +53,11 @@ FINE = 1e-3
 class MultipleShooting:
     """Damped Gauss-Newton on nodes and scalings together, in stages of growing memory.
 
+    Over the scalings s and a node x_k at every sample of every window it minimises
+        sum_k |W (x_k - data_k)|^2   subject to   x_(k+1) = F_k(x_k, s),
+    where F_k integrates the equations over one step, states in units of their standard deviation
+    and W weighs them. It assumes residuals of constant variance in each state.
+
     Each iteration integrates every step of every window in one call, with tangents, and solves
     for the scalings, with each window's start eliminated by QR. In a stage, every step ends at
     (1 - 1/memory) times its own end plus 1/memory times the data, so that what happened more than
@@ -70,6 +75,10 @@ class MultipleShooting:
     below it.
     Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_7; Abarbanel et al. 2009,
     doi:10.1137/090749761 for the pull.
+
+    >>> system = ep.lotka_volterra()
+    >>> method = ep.refinement.MultipleShooting(tolerance=1e-9)
+    >>> refined = ep.refine(system.model, system.trajectory(noise=0.02, rng=0), method=method)
     """
 
     step: Step = ONE_RUNGE_KUTTA
