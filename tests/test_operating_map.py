@@ -88,7 +88,7 @@ def test_fixed_points_and_their_eigenvalues_are_exact() -> None:
     state = fixed_point(model, np.array([2.5, 2.5]), scale=ONES, positive=ONES > 0.0)
     assert state is not None
     np.testing.assert_allclose(state, [3.0, 2.0], rtol=1e-8)
-    turning = np.sort_complex(eigenvalues(model, state, scale=ONES))
+    turning = np.sort_complex(eigenvalues(model, state))
     np.testing.assert_allclose(turning, [-1j * 6**0.5, 1j * 6**0.5], atol=1e-8)
     drift = model_of({"x": {"1": 1.0}, "y": {"1": 1.0}})
     assert fixed_point(drift, ONES, scale=ONES, positive=ONES > 0.0) is None

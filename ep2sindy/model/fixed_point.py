@@ -12,7 +12,6 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.model.model import SparseModel
 
 RESTING = 1e-8  # rates at a fixed point, relative to those half a standard deviation away
-STEP = 1e-6  # of central differences, in units of the states
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +37,7 @@ def rest_point(
     state = fixed_point(model, near, scale=zero_to_one(scale), positive=positive)
     if state is None:
         return None
-    values = eigenvalues(model, state, scale=zero_to_one(scale))
+    values = eigenvalues(model, state)
     leading = values[int(values.real.argmax())]
     return RestPoint(state, float(leading.real), abs(float(leading.imag)) / (2.0 * np.pi))
 
@@ -63,16 +62,8 @@ def fixed_point(
 
 
 def eigenvalues(
-    model: SparseModel,
-    state: Float[np.ndarray, " n_states"],
-    *,
-    scale: Float[np.ndarray, " n_states"],
+    model: SparseModel, state: Float[np.ndarray, " n_states"]
 ) -> Complex[np.ndarray, " n_states"]:
-    """Eigenvalues of the Jacobian of an autonomous model, in 1/s. scale: of the states."""
-    steps = STEP * np.diag(scale)
-    ahead, behind = (
-        model.derivative(state + sign * steps, np.empty((len(state), 0))) for sign in (1.0, -1.0)
-    )
-    jacobian = ((ahead - behind) / (2.0 * STEP)).T / scale[:, None]  # in units of the states
-    found: np.ndarray = np.linalg.eigvals(jacobian).astype(np.complex128)
+    """Eigenvalues of the Jacobian of an autonomous model, in 1/s."""
+    found: np.ndarray = np.linalg.eigvals(model.field.jacobian(state)).astype(np.complex128)
     return found

@@ -123,7 +123,7 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, f
     fixed = fixed_point(model, mean, scale=scale, positive=positive)
     growth = np.nan
     if fixed is not None:
-        growth = float(eigenvalues(model, fixed, scale=scale).real.max())
+        growth = float(eigenvalues(model, fixed).real.max())
     if fate is Fate.DIVERGES and growth * period_s < -NEUTRAL:
         # The fixed point is stable, but the record's cycle lies outside its basin: the model rests.
         fate = Fate.RESTS
