@@ -16,7 +16,8 @@ import numpy as np
 import ep2sindy as ep
 from benchmarks.timing import cpu_s
 from ep2sindy.model.inputs import Curve, curve_through
-from ep2sindy.model.solve import Border, Products, Solved, solve_stages
+from ep2sindy.model.solve import Border, Driven, Solved, solve_stages
+from ep2sindy.model.vector_field import VectorField
 
 PERIODS, PER_PERIOD = 10, 60
 # Each system with its period in its own unit of time.
@@ -33,19 +34,17 @@ def run(rates: Callable, t: np.ndarray, y: np.ndarray, rtol: float) -> Solved:
     return solve_stages(rates, free, t, y, blow_up=np.inf, bound="", rtol=rtol, limit_s=300.0)
 
 
-def equations(system: ep.systems.System, drive: Curve) -> Products:
+def equations(system: ep.systems.System, drive: Curve) -> Driven:
     """Of a system; a driven one is pushed by its first input in its first state."""
-    model, n = system.model, len(system.model.states)
-    n_inputs = drive.pieces.shape[2]
-    table, coef = model.library.columns_of([*model.states, "u"][: n + n_inputs]), model.coef
-    if n_inputs:
-        degree = table.shape[1]
-        table = np.concatenate([table, [[n, *[n + 1] * (degree - 1)]]])
-        coef = np.concatenate([coef, 0.1 * np.eye(1, n)])
-    return Products(table, coef, np.ones(n), drive)
+    field, n = system.model.field, len(system.model.states)
+    if drive.pieces.shape[2]:
+        library = field.library.over([*system.model.states, "u"])
+        library = library + ep.named_terms(library.variables, ["u"])
+        field = VectorField(library, np.concatenate([field.coef, 0.1 * np.eye(1, n)]))
+    return Driven(field, drive)
 
 
-def row(name: str, rates: Products, t: np.ndarray, y: np.ndarray) -> str:
+def row(name: str, rates: Driven, t: np.ndarray, y: np.ndarray) -> str:
     """Of one system: both times, their ratio, and distances in standard deviations."""
 
     def by_scipy(at: float, state: np.ndarray) -> np.ndarray:
