@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.draws import halton, starts_around
+from ep2sindy.model.draws import starts_around
 from ep2sindy.model.fixed_point import rest_point
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import (
@@ -287,14 +287,6 @@ def test_starts_that_cannot_be_and_a_cycle_of_another_model_are_refused() -> Non
         share_reaching(model, cycle, spread=(3.0, 0.3))
     with pytest.raises(ValueError, match="it has 2 states"):
         share_reaching(model_of({**HOPF, "z": {"z": -1.0}}), cycle)
-
-
-@pytest.mark.parametrize("n_dimensions", [1, 2, 3, 8])
-def test_starts_are_spread_as_by_haltons_sequence(n_dimensions: int) -> None:
-    from scipy.stats import qmc
-
-    scipys = qmc.Halton(n_dimensions, scramble=False).fast_forward(1).random(64)
-    np.testing.assert_array_equal(halton(64, n_dimensions), scipys)
 
 
 def test_a_slow_cycle_is_waited_for() -> None:

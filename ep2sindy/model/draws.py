@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import count
 
 import numpy as np
 from jaxtyping import Float
@@ -118,26 +117,11 @@ def _fine_enough(
     return Steps.along(t, drive, begin, len(t), n)
 
 
-def halton(n: int, n_dimensions: int) -> np.ndarray:
-    """First points of Halton's sequence, without the one at zero, (n, n_dimensions).
-
-    They equal those of `scipy.stats.qmc` to the last digit; its import takes half a second.
-    Source: Halton 1960, doi:10.1007/BF01386213.
-    """
-    points = np.zeros((n, n_dimensions))
-    bases = (k for k in count(2) if all(k % j for j in range(2, k)))
-    for column, base in zip(points.T, bases, strict=False):
-        digits, place = np.arange(1, n + 1), 1.0
-        while digits.any():
-            place /= base
-            digits, digit = np.divmod(digits, base)
-            column += place * digit
-    return points
-
-
 def starts_around(states: np.ndarray, n_starts: int, spread: tuple[float, float]) -> np.ndarray:
     """Starts (starts, n_states) that fill a box; see `share_reaching`."""
-    share = halton(n_starts, states.shape[1])
+    from scipy.stats.qmc import Halton  # its import takes a quarter of a second
+
+    share = Halton(states.shape[1], scramble=False).random(n_starts + 1)[1:]  # the first is zero
     mean = states.mean(axis=0)
     reach = spread[1] * 0.5 * np.ptp(states, axis=0)
     low, high = np.log(spread)
