@@ -593,17 +593,16 @@ def test_runs_are_joined_without_a_way_from_one_to_the_next(
 ) -> None:
     problem, fit, level = three_runs(rng)
     level, change = replace(level, push=push), 0.1 * rng.normal(size=problem.n_free)
-    moves = likelihood._moves(
-        problem, fit, level, likelihood._flow(problem, fit, fit.support, level), change
-    )
+    about = likelihood.hessian_on(problem, fit, fit.support, level)[3]
+    moves = np.split(likelihood._moves(about, change), problem.all_records.breaks + 1)
     totals = [0.0] * 5
     for record, path, noise, move in zip(
         problem.records, fit.paths, level.noise, moves, strict=True
     ):
         alone, own = replace(problem, records=(record,)), replace(fit, paths=(path,))
         its = replace(level, noise=(noise,))
-        flow = likelihood._flow(alone, own, fit.support, its)
-        (expected,) = likelihood._moves(alone, own, its, flow, change)
+        about = likelihood.hessian_on(alone, own, fit.support, its)[3]
+        expected = likelihood._moves(about, change)
         np.testing.assert_allclose(move, expected, rtol=1e-9, atol=1e-12)
         pair, (_, least, logs) = gram(alone, own, its), innovations(alone, own, its)
         parts = pair.quadratic, pair.linear, least, logs, squares(alone, (path,), fit.free, its)

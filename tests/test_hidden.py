@@ -9,7 +9,7 @@ import ep2sindy as ep
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_guess_by, with_guesses
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit, hessian, observe
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit, hessian_on, observe
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import AnnealedFit, astray
@@ -201,14 +201,10 @@ def test_what_was_not_measured_counts_nothing() -> None:
     free = np.zeros(problem.n_free)
     fit = TrajectoryFit((path,), free, np.ones(len(free), dtype=bool), np.zeros(2))
     level = Level((0.1 * ones,), 1.0)
-
-    def flow(record, path):
-        return problem.flow(record, path[:-1], free, fit.support, 1)
-
-    least = hessian(problem, fit, level, flow)[2]
+    least = hessian_on(problem, fit, fit.support, level)[2]
     far = replace(record, samples=record.samples + np.array([0.0, 5.0]))  # a guess is no sample
     moved = replace(problem, records=(far,))
-    assert hessian(moved, fit, level, flow)[2] == pytest.approx(least)
+    assert hessian_on(moved, fit, fit.support, level)[2] == pytest.approx(least)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.pushed import likely_errors, solve_pushed
 from ep2sindy.systems.systems import System
@@ -106,9 +107,11 @@ def test_the_likeliest_errors_of_a_random_walk_are_exact() -> None:
     rng, n = np.random.default_rng(1), 20_000
     walk = np.cumsum(0.3 * rng.standard_normal(n))
     samples = walk + 0.5 * rng.standard_normal(n)
-    slopes, misses = np.ones((n - 1, 1, 1)), -np.diff(samples)[:, None]
-    found = likely_errors(
-        [(slopes, misses, np.zeros((n, 1)))], np.array([True]), np.array([0.1]), np.array([0.1])
-    )
-    assert found.samples[0] == pytest.approx(0.5, rel=0.05)
-    assert found.process[0] == pytest.approx(0.3, rel=0.05)
+    run = Trajectory(np.arange(float(n)), samples[:, None], ["x"])
+    problem = scale_problem([run], ep.polynomial(["x"], degree=1))
+    none, guess = np.zeros(2), np.array([0.1])
+    fit = TrajectoryFit((problem.records[0].samples,), none, none > 0.0, guess)
+    level = Level((np.ones((n, 1)),), 1.0).with_errors(guess, guess)
+    found = likely_errors(problem, fit, level)
+    assert found.samples * problem.scale == pytest.approx([0.5], rel=0.05)
+    assert found.process * problem.scale == pytest.approx([0.3], rel=0.05)

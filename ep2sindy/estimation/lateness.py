@@ -13,9 +13,9 @@ from math import log
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.estimation.flow import Flow
-from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, hessian
-from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
+from ep2sindy.estimation.kernels import eliminate
+from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, flow_by, joined, linearise
+from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.supports import PenalisedFit, best_support, inverse_of, penalise
 
 PAYS = 1.0  # least fall of squares plus prices, beyond the delays' own price
@@ -70,18 +70,12 @@ def delayed_gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -
     state that is read tau early lies tau times its rate further on. At the start of a step this
     displacement goes through the flow; at the end of the step it is what the samples show.
     """
-    d, n = len(problem.states), len(fit.support)
-
-    def flow(record: ScaledRecord, path: np.ndarray) -> Flow:
-        everything = np.ones_like(fit.support)
-        found = problem.flow(record, path[:-1], fit.free, everything, level.n_substeps, n_more=d)
-        rates = problem.rates(record, path, fit.free)
-        columns = found.slopes[:, :, :d] * rates[:-1, None, :]
-        columns[:, np.arange(d), np.arange(d)] -= rates[1:]
-        found.slopes[:, :, -d:] = columns
-        return found
-
-    quadratic, gradient, least, _ = hessian(problem, fit, level, flow)
+    d, n, record = len(problem.states), len(fit.support), problem.all_records
+    flow = flow_by(problem, fit, np.ones_like(fit.support), level, n_more=d)
+    rates = problem.rates(record, joined(fit.paths), fit.free)
+    flow.slopes[:, :, -d:] = flow.slopes[:, :, :d] * rates[:-1, None, :]
+    flow.slopes[:, np.arange(d), np.arange(-d, 0)] -= rates[1:]
+    quadratic, gradient, least, _ = eliminate(*linearise(problem, fit, level, flow))
     linear = quadratic[:, :n] @ fit.free + gradient
     own = quadratic[:n, :n]
     offset = least + fit.free @ own @ fit.free + 2.0 * fit.free @ gradient[:n]

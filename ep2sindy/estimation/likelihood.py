@@ -12,7 +12,7 @@ an apparent noise, so that the same filter serves both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import log, pi
 from typing import NamedTuple
@@ -53,6 +53,11 @@ class Level:
     rho: float
     n_substeps: int = 1
     push: Float[np.ndarray, " d"] | None = None
+
+    def with_errors(self, noise: Float[np.ndarray, " d"], push: Float[np.ndarray, " d"]) -> Level:
+        """The same records with other errors, alike at all samples."""
+        own = tuple(np.tile(noise, (len(each), 1)) for each in self.noise)
+        return Level(own, 1.0, push=push)
 
     @property
     def variance(self) -> Float[np.ndarray, "samples d"]:
@@ -213,8 +218,8 @@ def parting(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> flo
     is large, the least error of the flow steers the path to any sample, and the squares are no
     likelihood.
     """
-    seen, _, logs = innovations(problem, fit, level)
-    precision = np.where(np.isfinite(seen.residuals), 1.0 / seen.variance, 0.0)
+    about, _, logs = innovations(problem, fit, level)
+    precision = np.where(np.isfinite(about.residuals), 1.0 / about.variance, 0.0)
     by_record = np.add.reduceat(precision, np.append(0, problem.all_records.breaks + 1))
     told = logs + np.log(precision[precision > 0.0]).sum() - np.log1p(FREE_START * by_record).sum()
     return max(float(told), 0.0) / problem.n_samples
@@ -222,19 +227,15 @@ def parting(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> flo
 
 def innovations(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[Seen, float, float]:
-    """What a fit leaves of all samples, and what these add to what came before.
+) -> tuple[Linearised, float, float]:
+    """The linearisation about a fit, and what all samples add to what came before.
 
     The latter are the sum of the squares of the innovations, in their standard deviations, and the
     sum of the logarithms of their variances.
     """
-    problem.watch.look()
-    seen = observe(problem.all_records, joined(fit.paths), level.variance)
-    flow = _flow(problem, fit, np.zeros_like(fit.support), level)
-    misses = _misses(problem, fit, flow)
-    case = misses, seen.residuals, seen.variance, *_errors(problem, fit, level)
-    _, _, least, logs = eliminate(flow.slopes, *case)
-    return seen, least, logs
+    about = linearise(problem, fit, level)
+    _, _, least, logs = eliminate(*about)
+    return about, least, logs
 
 
 @np.errstate(over="ignore", invalid="ignore")  # `Gram.finite` says whether the result counts
@@ -281,7 +282,7 @@ def _step(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> tuple[Float[np.ndarray, " free"], list[np.ndarray]]:
     """One Gauss-Newton step: changes of the free coefficients and of every path."""
-    hessian, gradient, _, flow = hessian_on(problem, fit, fit.support, level)
+    hessian, gradient, _, about = hessian_on(problem, fit, fit.support, level)
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
         return np.full_like(fit.free, np.nan), []
     size = unit_sizes(hessian)
@@ -289,75 +290,80 @@ def _step(
     step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
     change = np.zeros_like(fit.free)
     change[fit.support] = step
-    return change, _moves(problem, fit, level, flow, step)
+    return change, np.split(_moves(about, step), problem.all_records.breaks + 1)
 
 
 def _moves(
+    about: Linearised, change: Float[np.ndarray, " support"]
+) -> Float[np.ndarray, "samples d"]:
+    """Changes of the paths, for a change of the coefficients."""
+    d = about.defects.shape[1]
+    defects = about.defects + about.slopes[:, :, d:] @ change
+    return departures(*about.of_states._replace(defects=defects))
+
+
+class Linearised(NamedTuple):
+    """The objective about a fit, as the kernels take it: `eliminate`, `filtered`, `departures`.
+
+    slopes: derivatives of the flow by the state, then by the parameters; zero between records, as
+    are the defects, what the flow from each sample misses of the next state of the path. residuals,
+    variance: see `Seen`. process: variances of the flow's error. start: of the first state.
+    """
+
+    slopes: Float[np.ndarray, "steps d columns"]
+    defects: Float[np.ndarray, "steps d"]
+    residuals: Float[np.ndarray, "samples d"]
+    variance: Float[np.ndarray, "samples d"]
+    process: Float[np.ndarray, "steps d"]
+    start: Float[np.ndarray, " d"]
+
+    @property
+    def of_states(self) -> Linearised:
+        """The same with the derivatives by the state alone."""
+        by_state = self.slopes[:, :, : self.defects.shape[1]]
+        return self._replace(slopes=np.ascontiguousarray(by_state))
+
+
+@np.errstate(over="ignore", invalid="ignore")  # callers look whether the result is finite
+def linearise(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level, flow: Flow | None = None
+) -> Linearised:
+    """The objective about a fit. flow: along the paths of all records; None for that of states."""
+    problem.watch.look()
+    record, path = problem.all_records, joined(fit.paths)
+    if flow is None:
+        flow = flow_by(problem, fit, np.zeros_like(fit.support), level)
+    defects = flow.ends - path[1:]
+    defects[record.breaks] = flow.slopes[record.breaks] = 0.0
+    residuals, variance, _ = observe(record, path, level.variance)
+    return Linearised(flow.slopes, defects, residuals, variance, *_errors(problem, fit, level))
+
+
+def flow_by(
     problem: EstimationProblem,
     fit: TrajectoryFit,
+    support: Bool[np.ndarray, " free"],
     level: Level,
-    flow: Flow,
-    change: Float[np.ndarray, " support"],
-) -> list[np.ndarray]:
-    """Changes of every path, for a change of the support's coefficients."""
-    d = len(problem.states)
-    misses = _misses(problem, fit, flow) + flow.slopes[:, :, d:] @ change
-    by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
-    residuals, variance, _ = observe(problem.all_records, joined(fit.paths), level.variance)
-    case = misses, residuals, variance, *_errors(problem, fit, level)
-    moves = departures(by_state, *case)
-    return np.split(moves, problem.all_records.breaks + 1)
-
-
-def _flow(
-    problem: EstimationProblem, fit: TrajectoryFit, support: Bool[np.ndarray, " free"], level: Level
+    *,
+    n_more: int = 0,
 ) -> Flow:
-    """The flow along the paths of all records, which ends with each of them."""
-    record, path = problem.all_records, joined(fit.paths)
-    flow = problem.flow(record, path[:-1], fit.free, support, level.n_substeps)
-    flow.slopes[record.breaks] = 0.0
-    return flow
-
-
-def _misses(
-    problem: EstimationProblem, fit: TrajectoryFit, flow: Flow
-) -> Float[np.ndarray, "steps d"]:
-    misses = flow.ends - joined(fit.paths)[1:]
-    misses[problem.all_records.breaks] = 0.0
-    return misses
+    """The flow along the paths of all records, with derivatives by a support's coefficients."""
+    starts = joined(fit.paths)[:-1]
+    return problem.flow(
+        problem.all_records, starts, fit.free, support, level.n_substeps, n_more=n_more
+    )
 
 
 def hessian_on(
     problem: EstimationProblem, fit: TrajectoryFit, support: Bool[np.ndarray, " free"], level: Level
-) -> tuple[np.ndarray, np.ndarray, float, Flow]:
-    """`hessian` with respect to the coefficients of a support."""
-    return hessian(
-        problem,
-        fit,
-        level,
-        lambda record, path: problem.flow(record, path[:-1], fit.free, support, level.n_substeps),
-    )
+) -> tuple[np.ndarray, np.ndarray, float, Linearised]:
+    """Derivatives of the squares by the coefficients of a support, the states eliminated.
 
-
-def hessian(
-    problem: EstimationProblem,
-    fit: TrajectoryFit,
-    level: Level,
-    flow_of: Callable[[ScaledRecord, np.ndarray], Flow],
-) -> tuple[np.ndarray, np.ndarray, float, Flow]:
-    """Derivatives of the squares by the parameters that the flow has slopes of, states eliminated.
-
-    flow_of: the flow along the paths of all records, joined. Returns half the second derivatives,
-    minus half the first, the least squares with these parameters unchanged, and the flow.
+    Returns half the second derivatives, minus half the first, the least squares with these
+    coefficients unchanged, and the linearisation.
     """
-    problem.watch.look()
-    record, path = problem.all_records, joined(fit.paths)
-    flow = flow_of(record, path)
-    flow.slopes[record.breaks] = 0.0
-    misses = _misses(problem, fit, flow)
-    residuals, apparent, _ = observe(record, path, level.variance)
-    case = misses, residuals, apparent, *_errors(problem, fit, level)
-    return *eliminate(flow.slopes, *case)[:3], flow
+    about = linearise(problem, fit, level, flow_by(problem, fit, support, level))
+    return *eliminate(*about)[:3], about
 
 
 def _errors(

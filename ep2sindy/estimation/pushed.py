@@ -7,7 +7,6 @@ against this stochastic model.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,31 +14,24 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.kernels import eliminate, filtered
-from ep2sindy.estimation.likelihood import (
-    FREE_START,
-    Level,
-    TrajectoryFit,
-    enough_substeps,
-    fit_paths,
-    gram,
-    observe,
-)
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit, linearise
 from ep2sindy.estimation.noise import MORE_DEGREES, noise_beside, powers_of
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.solver import (
     EXACT,
     AnnealedFit,
     Solution,
+    at_level,
+    exchange_terms,
     squares_of_steps,
     start_from_smooth,
 )
-from ep2sindy.estimation.supports import best_support, term_prices
+from ep2sindy.estimation.supports import term_prices
 
 # Bounds on noise and pushes, in RMS of the states.
 LEAST_NOISE, LEAST_PUSH, MOST = 1e-5, 1e-7, 3.0
 MAX_TRIALS = 120  # likelihoods per size of an error
 SHARES = (0.3, 1.0, 1.0, 1.0, 1.0)  # of the terms' prices, in every round
-MAX_EXCHANGES = 4  # of supports in one round
 LAGS = range(1, 9)  # at which innovations are correlated with themselves
 # Standard errors that random innovations may show: see `PushedFit`.
 MOST_SHOWN = (5.0, 4.0, 6.0)
@@ -100,36 +92,27 @@ class PushedFit:
         return self.errors.deviance + float(self.prices[self.fit.support].sum())
 
 
-def likely_errors(
-    linear: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
-    measured: Bool[np.ndarray, " d"],
-    samples: Float[np.ndarray, " d"],
-    process: Float[np.ndarray, " d"],
-) -> Errors:
-    """The likeliest noise and pushes about paths, from a first guess.
-
-    linear: for each record, slopes of the flow by the state, misses, and residuals, as `eliminate`
-    takes them. measured: states whose samples count.
-    """
+def likely_errors(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> Errors:
+    """The likeliest noise and pushes about the paths of a fit, from those of a level on."""
     from scipy.optimize import minimize  # imported only to estimate errors
 
+    measured, about = problem.measured, linearise(problem, fit, level)
     n, d = int(measured.sum()), len(measured)
     low = np.log(np.repeat([LEAST_NOISE, LEAST_PUSH], [n, d]))
 
-    def sizes(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def level_of(logs: np.ndarray) -> Level:
         held = np.exp(np.clip(logs, low, np.log(MOST)))
         own = np.ones(d)
         own[measured] = held[:n]
-        return own, held[n:]
+        return level.with_errors(own, held[n:])
 
     def unlikely(logs: np.ndarray) -> float:
-        total = float(np.square(logs - np.clip(logs, low, np.log(MOST))).sum())
-        for each in linear:
-            variances = error_variances(len(each[2]), *sizes(logs))
-            total += float(sum(eliminate(*each, *variances, FREE_START)[2:]))
-        return total
+        tried, bounded = level_of(logs), np.clip(logs, low, np.log(MOST))
+        case = about._replace(variance=tried.variance, process=tried.process)
+        return float(np.square(logs - bounded).sum() + sum(eliminate(*case)[2:]))
 
-    start = np.log(np.append(samples[measured], process))
+    assert level.push is not None
+    start = np.log(np.append(level.noise[0][0][measured], level.push))
     found = minimize(
         unlikely,
         start,
@@ -141,40 +124,21 @@ def likely_errors(
             "xatol": 0.05,
         },
     )
-    return Errors(*sizes(found.x), float(found.fun))
-
-
-def error_variances(
-    n: int, samples: np.ndarray, process: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Variances of n samples and of the pushes between them."""
-    return np.tile(np.square(samples), (n, 1)), np.tile(np.square(process), (n - 1, 1))
+    likely = level_of(found.x)
+    return Errors(likely.noise[0][0], likely.push, float(found.fun))
 
 
 def solve_pushed(problem: EstimationProblem, *, max_terms: int) -> PushedFit:
     """Errors and sparse coefficients in turn, from smoothed states with all coefficients free."""
-    start, by_record = start_from_smooth(problem, None)
-    noise = by_record[0][0]
-    errors = Errors(np.maximum(noise, LEAST_NOISE), np.maximum(noise, 1e-3), np.inf)
-    prices = term_prices(problem, float(problem.n_samples))
-    fit = start
+    fit, noise = start_from_smooth(problem, None)
+    std, prices = noise[0][0], term_prices(problem, float(problem.n_samples))
+    level = Level(noise, 1.0).with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
     for share in SHARES:
-        level = _level(problem, fit, errors)
-        fit = fit_paths(problem, fit, level)
-        for _ in range(MAX_EXCHANGES):
-            pair = gram(problem, fit, level)
-            if not pair.finite:
-                break
-            found = best_support(problem, pair, share * prices, fit.support, max_terms=max_terms)
-            same = np.array_equal(found.support, fit.support)
-            fit = fit_paths(problem, replace(fit, support=found.support, free=found.free), level)
-            if same:
-                break
-        errors = likely_errors(
-            _linear(problem, fit, level), problem.measured, errors.samples, errors.process
-        )
-    level = _level(problem, fit, errors)
-    fit = fit_paths(problem, fit, level)
+        fit, level = at_level(problem, fit, level)
+        fit, _ = exchange_terms(problem, fit, level, share * prices, max_terms)
+        errors = likely_errors(problem, fit, level)
+        level = level.with_errors(errors.samples, errors.process)
+    fit, level = at_level(problem, fit, level)
     missed = squares_of_steps(problem, fit, level)[0] / problem.n_samples
     allowed = np.square(MOST_MISSED * errors.process) + np.square(EXACT * errors.samples)
     moves = problem.coef(fit.free).any(axis=0) & (missed <= allowed)
@@ -212,10 +176,8 @@ def _left_over(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
     """What innovations show that random ones would not; see `PushedFit`."""
-    new = []
-    for each in _linear(problem, fit, level):
-        variances = error_variances(len(each[2]), level.noise[0][0], np.asarray(level.push))
-        new.append(np.nan_to_num(filtered(*each, *variances, FREE_START)[0][SETTLING:]))
+    found = np.nan_to_num(filtered(*linearise(problem, fit, level))[0])
+    new = [part[SETTLING:] for part in np.split(found, problem.all_records.breaks + 1)]
     joined = np.concatenate(new)
     if not (np.abs(joined) < RUNAWAY).all():
         all_of_it = np.full(joined.shape[1], np.inf)
@@ -250,23 +212,4 @@ def _largest_share(
         size = np.linalg.norm(beside, axis=0)
         kept = size > COLLINEAR * np.linalg.norm(powers, axis=0)
         found[k] = np.abs(unit[:, k] @ (beside[:, kept] / size[kept])).max(initial=0.0)
-    return found
-
-
-def _level(problem: EstimationProblem, fit: TrajectoryFit, errors: Errors) -> Level:
-    noise = tuple(np.tile(errors.samples, (len(path), 1)) for path in fit.paths)
-    level = Level(noise, 1.0, push=errors.process)
-    return replace(level, n_substeps=enough_substeps(problem, fit, level))
-
-
-def _linear(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Slopes of the flow by the state, misses and residuals of every record."""
-    none = np.zeros_like(fit.support)
-    found = []
-    for record, path, noise in zip(problem.records, fit.paths, level.noise, strict=True):
-        flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
-        residuals = observe(record, path, np.square(noise)).residuals
-        found.append((np.ascontiguousarray(flow.slopes), flow.ends - path[1:], residuals))
     return found

@@ -197,7 +197,7 @@ def anneal(
     for rho, share in schedule:
         fit, level = at_level(problem, fit, Level(noise, rho, n_substeps))
         n_substeps = level.n_substeps
-        fit, score = _exchange_terms(problem, fit, level, share * prices, max_terms)
+        fit, score = exchange_terms(problem, fit, level, share * prices, max_terms)
         if problem.watch.best is None or isinstance(problem.watch.best[1], AnnealedFit):
             problem.watch.best = problem, AnnealedFit(fit, level, score)
     return AnnealedFit(fit, level, score)
@@ -288,7 +288,7 @@ def at_level(
     return fit_paths(problem, fit, level), level
 
 
-def _exchange_terms(
+def exchange_terms(
     problem: EstimationProblem,
     fit: TrajectoryFit,
     level: Level,

@@ -16,11 +16,11 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.cost import SMALL
-from ep2sindy.estimation.flow import Flow
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import (
     FREE_START,
     Level,
+    Linearised,
     TrajectoryFit,
     hessian_on,
     joined,
@@ -236,19 +236,19 @@ def _gains(
     level: Level,
 ) -> Float[np.ndarray, " free"]:
     """Fall of the squares that each coefficient by itself would bring, to first order."""
-    quadratic, _, _, flow = hessian_on(part, fit, fit.support, level)
+    quadratic, _, _, about = hessian_on(part, fit, fit.support, level)
     if not np.isfinite(quadratic).all():
         return np.zeros(problem.n_free)
     # Neither terms nor slopes lead from one record to the next, whatever is missed there.
     terms, std = _integrals(problem, fit.paths), joined(level.noise)
-    score = np.square(terms.T @ ((flow.ends - joined(fit.paths)[1:]) / level.process))
+    score = np.square(terms.T @ (about.defects / level.process))
     with_states, with_all = np.zeros_like(score), np.zeros_like(score)
     rng, inverse = np.random.default_rng(0), inverse_of(quadratic)
     for _ in range(N_PROBES):
         noise = std * rng.standard_normal(std.shape)
-        without = _weighted_misses(part, fit, level, flow, noise, np.zeros(len(inverse)))
-        gradient = np.einsum("kd,kds->s", without, flow.slopes[:, :, len(part.states) :])
-        fitted = _weighted_misses(part, fit, level, flow, noise, -inverse @ gradient)
+        without = _weighted_misses(about, noise, np.zeros(len(inverse)))
+        gradient = np.einsum("kd,kds->s", without, about.slopes[:, :, len(part.states) :])
+        fitted = _weighted_misses(about, noise, -inverse @ gradient)
         with_states += np.square(terms.T @ without) / N_PROBES
         with_all += np.square(terms.T @ fitted) / N_PROBES
     # A term that the chosen ones span leaves only rounding: it is not available.
@@ -258,10 +258,7 @@ def _gains(
 
 
 def _weighted_misses(
-    part: EstimationProblem,
-    fit: TrajectoryFit,
-    level: Level,
-    flow: Flow,
+    about: Linearised,
     noise: Float[np.ndarray, "samples d"],
     change: Float[np.ndarray, " support"],
 ) -> Float[np.ndarray, "steps d"]:
@@ -269,13 +266,11 @@ def _weighted_misses(
 
     Over the variance of the flow's error.
     """
-    d, process = len(part.states), level.process
-    by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
-    moved = flow.slopes[:, :, d:] @ change
-    seen = observe(part.all_records, joined(fit.paths), level.variance)
-    draw = np.where(np.isfinite(seen.residuals), noise, np.nan)
-    off = departures(by_state, moved, draw, seen.variance, process, FREE_START)
-    return (np.einsum("kij,kj->ki", by_state, off[:-1]) + moved - off[1:]) / process
+    d, states = noise.shape[1], about.of_states
+    moved = about.slopes[:, :, d:] @ change
+    draw = np.where(np.isfinite(about.residuals), noise, np.nan)
+    off = departures(*states._replace(defects=moved, residuals=draw))
+    return (np.einsum("kij,kj->ki", states.slopes, off[:-1]) + moved - off[1:]) / about.process
 
 
 def _spread(values: np.ndarray, kept: Bool[np.ndarray, " free"]) -> np.ndarray:

@@ -25,7 +25,7 @@ from ep2sindy.estimation.problem import (
     ScaledRecord,
     scale_problem,
 )
-from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, error_variances, likely_errors
+from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, likely_errors
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
@@ -97,7 +97,7 @@ class Tracker:
         record = self.problem.record(_of_model(self.model, history)).end(self.memory)
         samples, process = self.scaled_noise()
         path = self.approach(record, record.samples.copy(), samples, process)
-        variances = error_variances(len(path), samples, process)
+        variances = _variances(len(path), samples, process)
         _, mean, covariance = filtered(*self.linear(record, path), *variances, FREE_START)
         end, scale = path[-1] + mean, self.problem.scale
         if not (np.isfinite(end).all() and np.isfinite(covariance).all()):
@@ -149,7 +149,7 @@ class Tracker:
         self, record: ScaledRecord, path: np.ndarray, samples: np.ndarray, process: np.ndarray
     ) -> np.ndarray:
         """Most likely path near the given one, by Gauss-Newton steps that are halved if needed."""
-        variances = error_variances(len(path), samples, process)
+        variances = _variances(len(path), samples, process)
         with np.errstate(over="ignore", invalid="ignore"):
             total = self._total(record, path, *variances)
             for _ in range(MAX_STEPS):
@@ -261,20 +261,33 @@ def _with_likely_noise(
     samples, process = tracker.scaled_noise()
     pairs = zip(tracker.problem.records, paths, strict=True)
     found = [(each, tracker.approach(each, path, samples, process)) for each, path in pairs]
-    linear = [tracker.linear(each, path) for each, path in found]
-    likely = likely_errors(linear, tracker.measured, samples, process)
+    paths = [path for _, path in found]
+    fit, level = _as_fit(paths, tracker.free, samples, tracker.n_substeps)
+    level = replace(level, push=process)
+    likely = likely_errors(tracker.problem, fit, level)
     noise = _noise_of(tracker.problem, likely.samples, likely.process)
-    return replace(tracker, noise=noise), [path for _, path in found]
+    return replace(tracker, noise=noise), paths
 
 
 def _substeps(
     problem: EstimationProblem, paths: Sequence[np.ndarray], free: np.ndarray, noise: np.ndarray
 ) -> int:
     """Number of Runge-Kutta steps from one sample to the next."""
-    level = Level(tuple(np.tile(noise, (len(path), 1)) for path in paths), 1.0)
+    return enough_substeps(problem, *_as_fit(paths, free, noise, 1))
+
+
+def _as_fit(
+    paths: Sequence[np.ndarray], free: np.ndarray, noise: np.ndarray, n_substeps: int
+) -> tuple[TrajectoryFit, Level]:
+    """Paths of the records as a fit under noise of a size."""
+    level = Level(tuple(np.tile(noise, (len(path), 1)) for path in paths), 1.0, n_substeps)
     everything = np.ones(len(free), dtype=np.bool_)
-    fit = TrajectoryFit(tuple(paths), free, everything, np.zeros(len(noise)))
-    return enough_substeps(problem, fit, level)
+    return TrajectoryFit(tuple(paths), free, everything, np.zeros(len(noise))), level
+
+
+def _variances(n: int, samples: np.ndarray, process: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Variances of n samples and of the pushes between them."""
+    return np.tile(np.square(samples), (n, 1)), np.tile(np.square(process), (n - 1, 1))
 
 
 def _noise_of(problem: EstimationProblem, samples: np.ndarray, process: np.ndarray) -> ModelNoise:
