@@ -31,7 +31,8 @@ from ep2sindy.estimation.likelihood import (
 )
 from ep2sindy.estimation.noise import _shown_by_samples
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import EXACT, Solution, from_smooth, smoothed, squares_of_steps
+from ep2sindy.estimation.solution import LackOfFit, Solution
+from ep2sindy.estimation.solver import EXACT, from_smooth, smoothed, squares_of_steps
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
@@ -385,8 +386,8 @@ def test_what_fits_comes_before_what_scores_lower(monkeypatch: pytest.MonkeyPatc
 
     def leaves(*given: object, max_terms: int) -> Solution:
         found = from_smooth(*given, max_terms=max_terms)
-        noise = replace(found.noise, deviance=found.noise.deviance - 1e4)
-        return replace(found, noise=noise, flow_error=0.1)
+        error = LackOfFit(np.full(2, 0.1), 0.0, "the states leave the model")
+        return replace(found, deviance=found.deviance - 1e4, tests=(error,), flow_error=0.1)
 
     monkeypatch.setattr(explanation, "from_smooth", leaves)
     system = ep.lotka_volterra()
@@ -707,7 +708,7 @@ def test_the_time_is_looked_at_within_a_step_of_a_fit() -> None:
     noise = (np.full(run.states.shape, 0.1),)
     free, support = np.zeros(problem.n_free), np.ones(problem.n_free, dtype=bool)
     fit = TrajectoryFit((problem.records[0].samples,), free, support, np.zeros(3))
-    now, watch.best = 2, (problem, fit)
+    now, watch.best = 2, fit
     for one_pass in (
         lambda: squares(problem, fit.paths, free, Level(noise, 0.1)),
         lambda: gram(problem, fit, Level(noise, 0.1)),
@@ -812,7 +813,7 @@ def test_right_models_meet_their_steps() -> None:
     run = LORENZ.trajectory(noise=0.2, rng=0)
     problem = scale_problem([run], LORENZ.model.library)
     found = from_smooth(problem, None, max_terms=7)
-    missed = squares_of_steps(problem, found.annealed.fit, found.annealed.level)[0]
+    missed = squares_of_steps(problem, found.fit, found.level)[0]
     assert found.flow_error == 0.0
     assert (np.sqrt(missed / problem.n_samples) < 1e-2 * EXACT * found.noise.std).all()
 

@@ -127,11 +127,11 @@ def test_a_delay_competes_with_products_of_one_degree_more(draw: str, lacks: boo
     )
     problem = replace(problem, widen=lambda: wider)
     found = from_smooth(problem, None, max_terms=7)
-    late = explanation._align(problem, found, 7)
+    late = explanation._align(found, 7)
     if lacks:  # whatever delay its false equations may have
-        late = explanation.Aligned(problem, found, np.array([0.5, 0.0]), found.score)
+        late = found
     assert late is not None
-    assert ("up to degree 3" in explanation._lacks_terms(problem, late, 7)) == lacks
+    assert ("up to degree 3" in explanation._lacks_terms(late, 7)) == lacks
 
 
 def test_a_delay_at_three_standard_errors_is_none() -> None:

@@ -9,7 +9,7 @@ import ep2sindy as ep
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit
 from ep2sindy.estimation.problem import scale_problem
-from ep2sindy.estimation.pushed import likely_errors, solve_pushed
+from ep2sindy.estimation.process_noise import likely_errors, solve_with_process_noise
 from ep2sindy.systems.systems import System
 
 VAN_DER_POL = replace(ep.systems.van_der_pol(), duration_s=12.0)
@@ -85,11 +85,12 @@ def test_the_sizes_of_pushes_and_noise_are_found() -> None:
 def test_what_a_library_lacks_is_no_push(noise: float) -> None:
     """x' lacks x^3."""
     run = ep.systems.van_der_pol().trajectory(noise=noise, rng=0)
-    found = solve_pushed(
+    found = solve_with_process_noise(
         scale_problem([run], ep.polynomial(run.state_names, degree=2)), max_terms=7
     )
-    assert found.single.max() > 6.0
-    assert not found.explains
+    _, _, single, _ = found.tests
+    assert single.statistic.max() > 6.0
+    assert not found.fits
 
 
 @pytest.mark.slow  # an equation without one of its states is told so in the fast suite

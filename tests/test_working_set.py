@@ -195,7 +195,7 @@ def test_scores_tell_what_a_term_would_bring() -> None:
     true = mask_of(problem, system)
     part = problem.restricted(true)
     found = from_smooth(part, None, max_terms=7)
-    fit, level = at_level(part, found.annealed.fit, found.annealed.level)
+    fit, level = at_level(part, found.fit, found.level)
     fit, level = at_level(part, fit, type(level)(level.noise, WEIGHED_AT, level.n_substeps))
     every = working_set._spread(fit.free, true)
     gains = working_set._gains(problem, part, fit, level)
@@ -217,12 +217,13 @@ def test_a_true_term_outside_the_set_enters(monkeypatch: pytest.MonkeyPatch) -> 
     kept[np.flatnonzero(true)[[1, 6]]] = False
     monkeypatch.setattr(working_set, "first_set", lambda problem, max_terms: kept)
     found = explain(problem, max_terms=7, align=False)
-    assert chosen(problem, found.problem, found.solution) == true.tolist()
+    assert chosen(problem, found.solution) == true.tolist()
 
 
-def chosen(problem: EstimationProblem, part: EstimationProblem, found: Solution) -> list[bool]:
+def chosen(problem: EstimationProblem, found: Solution) -> list[bool]:
+    part = found.problem
     coef = np.zeros((len(problem.library), len(problem.states)))
-    values = part.coef_SI(found.annealed.fit.free)
+    values = part.coef_SI(found.fit.free)
     coef[part.places[part.column], part.equation] = values
     return (coef[problem.column, problem.equation] != 0.0).tolist()
 

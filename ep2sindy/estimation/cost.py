@@ -41,15 +41,15 @@ class Watch:
     """Shows how a search goes, keeps the best that it has found, and ends it at its limit.
 
     limit_s: wall time after which the search ends, once there is a first model; None for no limit.
-    clock: tells the time, in s. best: a problem and its best solution so far, or its latest fit;
-    None before there is one. ended: true once the search was ended early.
+    clock: tells the time, in s. best: the best solution so far, or the latest fit before there is
+    one; None before that. ended: true once the search was ended early.
     """
 
     progress: Progress = SILENT
     limit_s: float | None = None
     clock: Callable[[], float] = field(default_factory=lambda: time.monotonic)
     advance: Advance = nothing
-    best: tuple[Any, Any] | None = None
+    best: Any = None
     ended: bool = False
 
     def __post_init__(self) -> None:

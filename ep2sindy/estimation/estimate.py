@@ -21,11 +21,8 @@ from ep2sindy.estimation.hidden import Entrance, with_guesses
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
 from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem, by_run, scale_problem
-from ep2sindy.estimation.solver import (
-    SAMPLES_PER_TERM,
-    Solution,
-    enough_samples,
-)
+from ep2sindy.estimation.solution import Solution
+from ep2sindy.estimation.solver import SAMPLES_PER_TERM, enough_samples
 from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Constraint, Relation, relations_of
@@ -212,7 +209,7 @@ def _held(answer: Explanation, task: Task, library: Library) -> Constraint | Non
     """What the roles that are played make of the model's coefficients; None without roles."""
     if task.roles is None:
         return None
-    used = answer.solution.annealed.fit.free != 0.0
+    used = answer.solution.fit.free != 0.0
     played = list(compress(answer.problem.processes, used))
     return constraint_of(library, task.states, played, task.roles.told)
 
@@ -298,8 +295,8 @@ def _report(
 ) -> Estimate:
     """Convert the solution to SI, and add its rivals."""
     problem, found = answer.problem, answer.solution
-    fit, few_terms = found.annealed.fit, answer.max_terms
-    pair = gram(problem, fit, found.annealed.level)
+    fit, few_terms = found.fit, answer.max_terms
+    pair = gram(problem, fit, found.level)
     supports = {
         state: _score_supports(problem, pair, found, block, few_terms)
         for block, state in count_pieces(
@@ -324,7 +321,7 @@ def _report(
         kurtosis=found.noise.kurtosis,
         growth=found.noise.growth,
         delays_s=answer.delays * problem.step_s,
-        push_std=answer.pushes * problem.scale,
+        push_std=found.observation.process * problem.scale,
         holds=answer.holds,
     )
 
@@ -360,7 +357,7 @@ def _model(
     answer: Explanation, library: Library, units: Mapping[str, str], provenance: Mapping[str, str]
 ) -> SparseModel:
     problem, found = answer.problem, answer.solution
-    fit = found.annealed.fit
+    fit = found.fit
     values = problem.coef_SI(fit.free)
     coef = np.zeros((len(library), len(problem.states)))
     column = problem.places[problem.column]
@@ -371,7 +368,7 @@ def _model(
     rows = (C[used][:, fit.support] * problem.to_SI[used, None])[order]
     # If the residuals exceed the noise, intervals would not cover the truth.
     known = found.fits and not answer.misfit
-    free_cov = covariance(problem, fit, found.annealed.level) if known else None
+    free_cov = covariance(problem, fit, found.level) if known else None
     cov = None if free_cov is None else rows @ free_cov @ rows.T
     courses = dict(zip(problem.inputs, problem.courses, strict=True))
     return SparseModel(library, problem.states, coef, units, provenance, cov, courses=courses)
@@ -381,7 +378,7 @@ def _score_supports(
     problem: EstimationProblem, pair: Gram, found: Solution, block: int, max_terms: int
 ) -> list[ScoredSupport]:
     """Supports of one equation, by size and then by deviance."""
-    fit = found.annealed.fit
+    fit = found.fit
     if not pair.finite:
         return [ScoredSupport(_named_coef(problem, fit.free, block), 0.0)]
     chosen = penalise(pair, fit.support, found.prices).score
@@ -399,7 +396,7 @@ def _score_supports(
 def _rivals(
     problem: EstimationProblem, found: Solution, supports: Mapping[str, Sequence[ScoredSupport]]
 ) -> tuple[Rival, ...]:
-    fit = found.annealed.fit
+    fit = found.fit
     rivals = []
     for block, state in enumerate(problem.states):
         chosen = set(_named_coef(problem, fit.free, block))

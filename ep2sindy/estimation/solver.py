@@ -8,17 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ep2sindy.data.coerce import keep_inside, noise_inside
 from ep2sindy.data.numbers import least_squares
-from ep2sindy.estimation.lateness import (
-    DelayedGram,
-    delayed_gram,
-)
+from ep2sindy.estimation.delay import DelayedGram, delayed_gram
 from ep2sindy.estimation.likelihood import (
     FAR,
     STEERED,
@@ -33,6 +29,7 @@ from ep2sindy.estimation.likelihood import (
 )
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
+from ep2sindy.estimation.solution import LackOfFit, Observation, Solution
 from ep2sindy.estimation.supports import alternatives, best_support, excess, penalise, term_prices
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 
@@ -73,35 +70,6 @@ def enough_samples(problem: EstimationProblem) -> bool:
     return problem.n_samples >= SAMPLES_PER_TERM * len(problem.candidates.library)
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Result from one start.
-
-    score: -2 log likelihood plus prices, comparable between starts. astray: (d,), True for hidden
-    states that do not follow their own equations. parting: see `likelihood.parting`.
-    """
-
-    annealed: AnnealedFit
-    noise: Noise
-    prices: Float[np.ndarray, " free"]
-    flow_error: float
-    astray: Bool[np.ndarray, " d"]
-    parting: float = 0.0
-
-    @property
-    def score(self) -> float:
-        if not np.isfinite(self.annealed.score):
-            return inf
-        return self.noise.deviance + float(self.prices[self.annealed.fit.support].sum())
-
-    @property
-    def fits(self) -> bool:
-        """True if the residuals look like noise."""
-        exact = self.flow_error == 0.0 and not self.noise.is_error.any()
-        followed = exact and not self.astray.any() and self.parting < STEERED
-        return followed and bool(np.isfinite(self.score))
-
-
 def from_smooth(
     problem: EstimationProblem, log10_ratio: float | None, *, max_terms: int
 ) -> Solution:
@@ -112,7 +80,7 @@ def from_smooth(
     fit, std = start_from_smooth(problem, log10_ratio)
     prices = term_prices(problem, float(problem.n_samples))
     found = anneal(problem, fit, std, prices, COOLING, max_terms=max_terms)
-    return _settle(problem, found, max_terms)
+    return _settle(found, max_terms)
 
 
 def settle(
@@ -125,19 +93,20 @@ def settle(
     """The exact solution near a fit whose states leave the flow a little."""
     prices = term_prices(problem, float(problem.n_samples))
     found = anneal(problem, fit, noise, prices, COLD, max_terms=max_terms)
-    return _settle(problem, found, max_terms)
+    return _settle(found, max_terms)
 
 
-def _settle(problem: EstimationProblem, found: AnnealedFit, max_terms: int) -> Solution:
+def _settle(found: AnnealedFit, max_terms: int) -> Solution:
     """Anneal again until noise and support agree, and compare with what is nearly as likely."""
+    problem = found.problem
     for _ in range(MAX_PASSES):
         before, noise = found.fit.support, noise_beside(problem, found.fit)
         prices = term_prices(problem, problem.n_samples * float(noise.independent.mean()))
         found = anneal(problem, found.fit, noise.effective, prices, COLD, max_terms=max_terms)
         if np.array_equal(before, found.fit.support):
             break
-    found = polish(problem, found, prices, max_terms=max_terms)
-    found = reheat(problem, found, prices, max_terms=max_terms)
+    found = polish(found, prices, max_terms=max_terms)
+    found = reheat(found, prices, max_terms=max_terms)
     noise = noise_beside(problem, found.fit)
     error = steered = 0.0
     defects, _ = squares_of_steps(problem, found.fit, found.level)
@@ -146,16 +115,70 @@ def _settle(problem: EstimationProblem, found: AnnealedFit, max_terms: int) -> S
         defect = np.sqrt((defects / np.square(noise.std)).max() / problem.n_samples)
         error = error if defect < EXACT else max(error, float(defect))  # it lives on the slack
         steered = parting(problem, found.fit, replace(found.level, noise=noise.white))
-    return Solution(found, noise, prices, error, astray(problem, found), steered)
+    return _exact_solution(found, noise, prices, error, steered)
 
 
-def astray(problem: EstimationProblem, found: AnnealedFit) -> Bool[np.ndarray, " d"]:
-    """Hidden states whose steps are not those of the flow.
+def unfinished_solution(found: AnnealedFit) -> Solution:
+    """What a search that was ended on its way has, whose states still leave the flow."""
+    noise = noise_beside(found.problem, found.fit)
+    n_independent = found.problem.n_samples * float(noise.independent.mean())
+    return _exact_solution(
+        found, noise, term_prices(found.problem, n_independent), found.level.rho, 0.0
+    )
+
+
+def _exact_solution(
+    found: AnnealedFit, noise: Noise, prices: np.ndarray, error: float, steered: float
+) -> Solution:
+    """The solution of a trajectory without process noise, and its tests."""
+    none = np.zeros(len(noise.std))
+    apart = np.exp(min(steered, 100.0) / 2.0)
+    tests = (
+        LackOfFit(
+            none + found.fit.total,
+            float(np.finfo(np.float64).max),
+            "whatever was tried runs away between two samples",
+        ),
+        LackOfFit(
+            none + error, 0.0, "the states leave the model by {value:g} of the noise per sample"
+        ),
+        LackOfFit(
+            none + apart,
+            float(np.exp(STEERED / 2.0)),
+            "paths beside the fit part by a factor of {value:.2g} per sample, so it could follow "
+            "any samples",
+        ),
+        LackOfFit(
+            noise.unexplained, 0.0, "what is left of {state} lasts ({value:.2f} from sample to "
+            "sample)",
+        ),
+        LackOfFit(
+            noise.patterned, 0.0, "what is left of {state} holds a line or follows the states"
+        ),
+        LackOfFit(astray(found), ASTRAY, "{state} does not follow its own equation"),
+    )  # fmt: skip
+    return Solution(
+        problem=found.problem,
+        fit=found.fit,
+        level=found.level,
+        observation=Observation(noise, none, none),
+        prices=prices,
+        deviance=noise.deviance,
+        tests=tests,
+        flow_error=error,
+        around=found.around,
+    )
+
+
+def astray(found: AnnealedFit) -> Float[np.ndarray, " d"]:
+    """RMS miss of the flow of hidden states, as a share of their steps; zero for measured ones.
 
     One that has become very small leaves the flow freely, and large coefficients make it count.
     """
-    defects, steps = squares_of_steps(problem, found.fit, found.level)
-    return ~problem.measured & ~(defects <= ASTRAY**2 * steps)
+    defects, steps = squares_of_steps(found.problem, found.fit, found.level)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(defects > 0.0, np.sqrt(defects / steps), defects)
+    return np.where(found.problem.measured, 0.0, share)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
@@ -177,6 +200,7 @@ class AnnealedFit:
     around: linearisation about the fit at the level where its support was compared with others.
     """
 
+    problem: EstimationProblem
     fit: TrajectoryFit
     level: Level
     score: float
@@ -198,26 +222,24 @@ def anneal(
         fit, level = at_level(problem, fit, Level(noise, rho, n_substeps))
         n_substeps = level.n_substeps
         fit, score = exchange_terms(problem, fit, level, share * prices, max_terms)
-        if problem.watch.best is None or isinstance(problem.watch.best[1], AnnealedFit):
-            problem.watch.best = problem, AnnealedFit(fit, level, score)
-    return AnnealedFit(fit, level, score)
+        found = AnnealedFit(problem, fit, level, score)
+        if not isinstance(problem.watch.best, Solution):
+            problem.watch.best = found
+    return found
 
 
 def polish(
-    problem: EstimationProblem,
-    found: AnnealedFit,
-    prices: Float[np.ndarray, " free"],
-    *,
-    max_terms: int,
+    found: AnnealedFit, prices: Float[np.ndarray, " free"], *, max_terms: int
 ) -> AnnealedFit:
     """Refit each support that is nearly as likely by the linear model, and keep a likelier one.
 
     A fit that does not follow its samples is returned unchanged: its linearisation tells nothing.
     """
+    problem = found.problem
     if not found.fit.total < FAR * problem.n_squares:
         return found
     fit, cold = at_level(problem, found.fit, found.level)
-    found = AnnealedFit(fit, cold, float(fit.total + prices[fit.support].sum()))
+    found = AnnealedFit(problem, fit, cold, float(fit.total + prices[fit.support].sum()))
     tried = {found.fit.support.tobytes()}
     for _ in range(MAX_ROUNDS):
         warmer, level = at_level(problem, found.fit, replace(found.level, rho=WEIGHED_AT))
@@ -236,7 +258,7 @@ def polish(
             fit, cold = at_level(problem, fit, replace(cold, rho=found.level.rho))
             score = float(fit.total + prices[fit.support].sum())
             if score < found.score and parting(problem, fit, cold) < STEERED:
-                found = AnnealedFit(fit, cold, score)
+                found = AnnealedFit(problem, fit, cold, score)
                 break
         else:
             return replace(found, around=around)
@@ -244,11 +266,7 @@ def polish(
 
 
 def reheat(
-    problem: EstimationProblem,
-    found: AnnealedFit,
-    prices: Float[np.ndarray, " free"],
-    *,
-    max_terms: int,
+    found: AnnealedFit, prices: Float[np.ndarray, " free"], *, max_terms: int
 ) -> AnnealedFit:
     """Anneal again if states that are let go show a better support; the likelier of both.
 
@@ -256,6 +274,7 @@ def reheat(
     hide part of what a term explains, so a support counts as better there only if it explains more
     by no more terms.
     """
+    problem = found.problem
     if not found.fit.total < FAR * problem.n_squares:
         return found
     rho, share = REHEATED
@@ -273,7 +292,7 @@ def reheat(
     start = replace(warm, support=other.support, free=other.free)
     schedule = (*COOLING, COLD[-1])
     again = anneal(problem, start, found.level.noise, prices, schedule, max_terms=max_terms)
-    again = polish(problem, again, prices, max_terms=max_terms)
+    again = polish(again, prices, max_terms=max_terms)
     likelier = again.score < found.score and parting(problem, again.fit, again.level) < STEERED
     return again if likelier else found
 

@@ -27,11 +27,11 @@ from ep2sindy.estimation.likelihood import (
     observe,
 )
 from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.solution import Solution
 from ep2sindy.estimation.solver import (
     OTHER_STARTS,
     SAMPLES_PER_COEFFICIENT,
     WEIGHED_AT,
-    Solution,
     at_level,
     from_smooth,
     settle,
@@ -47,10 +47,8 @@ DEPENDENT = 1e-6  # share of a score's scatter that the chosen terms leave, if t
 N_PROBES = 40  # draws of noise that tell how far a score scatters: to 22 % of its square
 
 
-def search_within(
-    problem: EstimationProblem, *, max_terms: int
-) -> tuple[EstimationProblem, Solution]:
-    """The solution from smoothed states by a working set, and the problem of the set's terms.
+def search_within(problem: EstimationProblem, *, max_terms: int) -> Solution:
+    """The solution from smoothed states by a working set, whose terms its problem has.
 
     Of a library that is large for its samples the linear terms are tried alone first: where they
     explain the samples and no other term would pay for itself, that is the solution. A search that
@@ -61,12 +59,12 @@ def search_within(
     few = problem.n_samples < SAMPLES_PER_COEFFICIENT * len(problem.library)
     if few and linear.n_free < problem.n_free > part.n_free:
         found = _linear_solution(linear, max_terms)
-        if found.fits and with_entrances(linear, found, max_terms=max_terms)[1] is found:
-            return linear, found
+        if found.fits and with_entrances(found, max_terms=max_terms) is found:
+            return found
     with problem.watch.stage(_weighed(part)):
         found = from_smooth(part, None, max_terms=max_terms)
     # About a solution that does not fit first order tells little, and other starts cost less.
-    return with_entrances(part, found, max_terms=max_terms) if found.fits else (part, found)
+    return with_entrances(found, max_terms=max_terms) if found.fits else found
 
 
 def _linear_solution(linear: EstimationProblem, max_terms: int) -> Solution:
@@ -76,21 +74,19 @@ def _linear_solution(linear: EstimationProblem, max_terms: int) -> Solution:
             from_smooth(linear, log10_ratio, max_terms=max_terms)
             for log10_ratio in (None, *OTHER_STARTS)
         ]
-    return min(tried, key=lambda each: (not each.fits, each.score))
+    return min(tried, key=lambda each: each.rank)
 
 
-def with_entrances(
-    part: EstimationProblem, found: Solution, *, max_terms: int
-) -> tuple[EstimationProblem, Solution]:
+def with_entrances(found: Solution, *, max_terms: int) -> Solution:
     """Let terms into the working set as long as they make the solution likelier."""
-    problem = part.candidates
-    problem.watch.best = part, found
+    problem = found.problem.candidates
+    problem.watch.best = found
     for _ in range(MAX_ENTRANCES):
-        kept = part.taken
-        entering = ~kept & _would_pay(problem, kept, part, found)
+        kept = found.problem.taken
+        entering = ~kept & _would_pay(problem, kept, found)
         if not entering.any():
             break
-        larger, fit = kept | entering, found.annealed.fit
+        larger, fit = kept | entering, found.fit
         whole = problem.restricted(larger)
         widened = replace(
             fit,
@@ -99,11 +95,10 @@ def with_entrances(
         )
         with problem.watch.stage(_weighed(whole)):
             tried = settle(whole, widened, found.noise.effective, max_terms=max_terms)
-        if (not tried.fits, tried.score) >= (not found.fits, found.score):
+        if tried.rank >= found.rank:
             break
-        part, found = whole, tried
-        problem.watch.best = part, found
-    return part, found
+        found = problem.watch.best = tried
+    return found
 
 
 def _weighed(part: EstimationProblem) -> str:
@@ -206,7 +201,6 @@ def _own_squares(
 def _would_pay(
     problem: EstimationProblem,
     kept: Bool[np.ndarray, " free"],
-    part: EstimationProblem,
     found: Solution,
 ) -> Bool[np.ndarray, " free"]:
     """Terms that would lower the squares by more than their price, at most a few per equation.
@@ -219,7 +213,8 @@ def _would_pay(
     enters = np.zeros_like(kept)
     if kept.all() or not np.isfinite(found.score):
         return enters
-    fit, level = at_level(part, found.annealed.fit, replace(found.annealed.level, rho=WEIGHED_AT))
+    part = found.problem
+    fit, level = at_level(part, found.fit, replace(found.level, rho=WEIGHED_AT))
     gains = _gains(problem, part, fit, level)
     gains -= term_prices(problem, float(part.n_samples))
     gains[kept] = -np.inf

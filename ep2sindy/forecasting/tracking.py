@@ -25,7 +25,7 @@ from ep2sindy.estimation.problem import (
     ScaledRecord,
     scale_problem,
 )
-from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, likely_errors
+from ep2sindy.estimation.process_noise import LEAST_NOISE, MOST, likely_errors
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread

@@ -10,17 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.kernels import eliminate, filtered
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, linearise
 from ep2sindy.estimation.noise import MORE_DEGREES, noise_beside, powers_of
 from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.solution import LackOfFit, Observation, Solution
 from ep2sindy.estimation.solver import (
     EXACT,
-    AnnealedFit,
-    Solution,
     at_level,
     exchange_terms,
     squares_of_steps,
@@ -33,7 +32,7 @@ LEAST_NOISE, LEAST_PUSH, MOST = 1e-5, 1e-7, 3.0
 MAX_TRIALS = 120  # likelihoods per size of an error
 SHARES = (0.3, 1.0, 1.0, 1.0, 1.0)  # of the terms' prices, in every round
 LAGS = range(1, 9)  # at which innovations are correlated with themselves
-# Standard errors that random innovations may show: see `PushedFit`.
+# Standard errors that random innovations may show: see `_left_over`.
 MOST_SHOWN = (5.0, 4.0, 6.0)
 COLLINEAR = 1e-3  # share of a product that is left beside an equation's terms, if it is another
 RUNAWAY = 1e6  # innovations, in RMS of the states, of a model that follows no samples
@@ -48,48 +47,6 @@ class Errors:
     samples: Float[np.ndarray, " d"]
     process: Float[np.ndarray, " d"]
     deviance: float
-
-
-@dataclass(frozen=True, eq=False)
-class PushedFit:
-    """A fit under random pushes. prices: of the free coefficients.
-
-    moves: (d,), false for a state without a law: one whose equation has no term, and which nothing
-    but pushes moves, or one whose path misses its steps by more than pushes and noise allow.
-
-    lasting, single, together: (d,), what innovations show that random ones would not, in standard
-    errors: the largest autocorrelation over a few lags, the largest share that one product of
-    states explains beside the terms of the equation, and the share that all of them explain.
-    """
-
-    fit: TrajectoryFit
-    errors: Errors
-    level: Level
-    prices: Float[np.ndarray, " free"]
-    moves: Bool[np.ndarray, " d"]
-    lasting: Float[np.ndarray, " d"]
-    single: Float[np.ndarray, " d"]
-    together: Float[np.ndarray, " d"]
-
-    @property
-    def explains(self) -> bool:
-        """True if random pushes explain all states."""
-        return bool(self.explained.all())
-
-    @property
-    def explained(self) -> Bool[np.ndarray, " d"]:
-        """Mask of the states whose samples bring what is new, as they do under random pushes.
-
-        What an equation lacks is a function of the states, and lasts as long as these.
-        """
-        shown = self.lasting, self.single, self.together
-        is_random = [value < most for value, most in zip(shown, MOST_SHOWN, strict=True)]
-        return np.all([self.moves, *is_random], axis=0) & bool(np.isfinite(self.fit.total))
-
-    @property
-    def score(self) -> float:
-        """-2 log likelihood plus the prices of the terms."""
-        return self.errors.deviance + float(self.prices[self.fit.support].sum())
 
 
 def likely_errors(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> Errors:
@@ -128,7 +85,7 @@ def likely_errors(problem: EstimationProblem, fit: TrajectoryFit, level: Level) 
     return Errors(likely.noise[0][0], likely.push, float(found.fun))
 
 
-def solve_pushed(problem: EstimationProblem, *, max_terms: int) -> PushedFit:
+def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> Solution:
     """Errors and sparse coefficients in turn, from smoothed states with all coefficients free."""
     fit, noise = start_from_smooth(problem, None)
     std, prices = noise[0][0], term_prices(problem, float(problem.n_samples))
@@ -139,32 +96,43 @@ def solve_pushed(problem: EstimationProblem, *, max_terms: int) -> PushedFit:
         errors = likely_errors(problem, fit, level)
         level = level.with_errors(errors.samples, errors.process)
     fit, level = at_level(problem, fit, level)
-    missed = squares_of_steps(problem, fit, level)[0] / problem.n_samples
-    allowed = np.square(MOST_MISSED * errors.process) + np.square(EXACT * errors.samples)
-    moves = problem.coef(fit.free).any(axis=0) & (missed <= allowed)
-    return PushedFit(fit, errors, level, prices, moves, *_left_over(problem, fit, level))
-
-
-def solution_under_pushes(problem: EstimationProblem, pushed: PushedFit) -> Solution:
-    """The fit as a solution: what it leaves of the samples is noise of the estimated size."""
-    noise = noise_beside(problem, pushed.fit)
-    zero = np.zeros_like(noise.memory)
+    noise, none = noise_beside(problem, fit), np.zeros(len(problem.states))
     explained = replace(
         noise,
-        std=pushed.errors.samples,
-        memory=zero,
-        unexplained=zero,
-        patterned=zero > 0.0,
-        deviance=pushed.errors.deviance,
+        std=errors.samples,
+        memory=none,
+        unexplained=none,
+        patterned=none > 0.0,
+        deviance=errors.deviance,
     )
-    annealed = AnnealedFit(pushed.fit, pushed.level, pushed.score)
-    astray = np.zeros(len(problem.states), dtype=np.bool_)
-    return Solution(annealed, explained, pushed.prices, 0.0, astray)
+    return Solution(
+        problem=problem,
+        fit=fit,
+        level=level,
+        observation=Observation(explained, none, errors.process),
+        prices=prices,
+        deviance=errors.deviance,
+        tests=(_defects_of_steps(problem, fit, level, errors), *_left_over(problem, fit, level)),
+    )
 
 
-def push_words(problem: EstimationProblem, pushed: PushedFit) -> str:
-    """Sentence on the sizes of the pushes."""
-    sizes = zip(problem.states, (pushed.errors.process * problem.scale).tolist(), strict=True)
+def _defects_of_steps(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level, errors: Errors
+) -> LackOfFit:
+    """RMS of the steps that a path misses, in what process noise and noise allow.
+
+    Infinite for a state without a law: one whose equation has no term, which noise alone moves.
+    """
+    missed = squares_of_steps(problem, fit, level)[0] / problem.n_samples
+    allowed = np.square(MOST_MISSED * errors.process) + np.square(EXACT * errors.samples)
+    moves = problem.coef(fit.free).any(axis=0)
+    return LackOfFit(np.where(moves, np.sqrt(missed / allowed), np.inf), 1.0)
+
+
+def process_noise_words(solution: Solution) -> str:
+    """Sentence on the sizes of the process noise."""
+    problem, process = solution.problem, solution.observation.process
+    sizes = zip(problem.states, (process * problem.scale).tolist(), strict=True)
     words = ", ".join(f"{name} by {size:.2g}" for name, size in sizes)
     return (
         f"no exact trajectory explains these samples: states are pushed at random, {words} from "
@@ -172,16 +140,18 @@ def push_words(problem: EstimationProblem, pushed: PushedFit) -> str:
     )
 
 
-def _left_over(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-    """What innovations show that random ones would not; see `PushedFit`."""
+def _left_over(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> list[LackOfFit]:
+    """What innovations show that random ones would not, in standard errors.
+
+    Their largest autocorrelation over a few lags, the largest share that one product of states
+    explains beside the terms of the equation, and the share that all of them explain: what an
+    equation lacks is a function of the states, and lasts as long as these.
+    """
     found = np.nan_to_num(filtered(*linearise(problem, fit, level))[0])
     new = [part[SETTLING:] for part in np.split(found, problem.all_records.breaks + 1)]
     joined = np.concatenate(new)
     if not (np.abs(joined) < RUNAWAY).all():
-        all_of_it = np.full(joined.shape[1], np.inf)
-        return all_of_it, all_of_it, all_of_it
+        return [LackOfFit(np.full(joined.shape[1], np.inf), MOST_SHOWN[0])]
     size = np.maximum(np.linalg.norm(joined, axis=0), 1e-150)
     products = [sum((own[lag:] * own[:-lag]).sum(axis=0) for own in new) for lag in LAGS]
     root = np.sqrt(len(joined))
@@ -191,7 +161,8 @@ def _left_over(
     unit = root * joined / size
     together = np.square(np.linalg.qr(powers)[0].T @ unit).sum(axis=0) - powers.shape[1]
     single = _largest_share(problem, fit, before, powers, unit)
-    return lasting, single, together / np.sqrt(2.0 * powers.shape[1])
+    shown = lasting, single, together / np.sqrt(2.0 * powers.shape[1])
+    return [LackOfFit(each, most) for each, most in zip(shown, MOST_SHOWN, strict=True)]
 
 
 def _largest_share(
