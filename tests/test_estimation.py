@@ -27,7 +27,6 @@ from ep2sindy.estimation.likelihood import (
     gram,
     innovations,
     parting,
-    squares,
 )
 from ep2sindy.estimation.noise import _shown_by_samples
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
@@ -207,28 +206,26 @@ def test_sensitivities_are_derivatives_of_the_flow(relations: Sequence[str]) -> 
         np.testing.assert_allclose(flow.slopes[:, :, i], (up - down) / (2 * h), atol=1e-7)
 
 
-def fit_of_truth(problem: EstimationProblem, model: ep.SparseModel) -> TrajectoryFit:
-    free = truth(problem, model)
+def fit_of_truth(
+    problem: EstimationProblem, model: ep.SparseModel, process: float
+) -> TrajectoryFit:
+    free, path = truth(problem, model), problem.all_records.samples.copy()
     return TrajectoryFit(
-        tuple(r.samples.copy() for r in problem.records),
-        free,
-        free != 0.0,
-        np.full(len(problem.states), np.inf),
+        problem, Level(np.full(path.shape, 0.05), process), path, free, free != 0.0
     )
 
 
-def fitted_lorenz(process: float) -> tuple[EstimationProblem, Level, TrajectoryFit]:
+def fitted_lorenz(process: float) -> tuple[EstimationProblem, TrajectoryFit]:
     problem, _ = lorenz_problem()
-    level = Level((np.full((200, 3), 0.05),), process)
-    return problem, level, fit_paths(problem, fit_of_truth(problem, ep.lorenz().model), level)
+    return problem, fit_paths(fit_of_truth(problem, ep.lorenz().model, process))
 
 
 def test_a_fit_is_where_the_squares_have_no_slope() -> None:
-    problem, level, fit = fitted_lorenz(0.01)
+    _, fit = fitted_lorenz(0.01)
     step = np.where(fit.support, 1e-4 * np.abs(fit.free), 0.0)
     for j in np.flatnonzero(fit.support):
         change = step * (np.arange(len(step)) == j)
-        tried = [squares(problem, fit.paths, fit.free + s * change, level).sum() for s in (1, -1)]
+        tried = [replace(fit, free=fit.free + s * change).total for s in (1, -1)]
         curvature = (tried[0] + tried[1] - 2 * fit.total) / 2.0
         assert abs(tried[0] - tried[1]) < 0.05 * np.sqrt(max(curvature, 0.0))
 
@@ -238,29 +235,28 @@ def test_paths_of_the_same_record_twice_part_as_fast_as_of_one() -> None:
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 200)
     for runs in ([run], [run, run]):
         problem = scale_problem(runs, ep.lorenz().model.library)
-        level = Level(tuple(np.full((200, 3), 0.05) for _ in runs), 0.01)
-        found.append(parting(problem, fit_of_truth(problem, ep.lorenz().model), level))
+        found.append(parting(fit_of_truth(problem, ep.lorenz().model, 0.01)))
     assert found[0] > 0.001
     assert found[1] == pytest.approx(found[0], rel=1e-9)
 
 
 def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
-    problem, level, fit = fitted_lorenz(0.1)
-    pair = gram(problem, fit, level)
+    _, fit = fitted_lorenz(0.1)
+    pair = gram(fit)
     nothing = np.zeros(len(fit.free))
     assert penalise(pair, fit.support, nothing).score == pytest.approx(fit.total, abs=0.01)
     for j in np.flatnonzero(fit.support):
         support = fit.support & (np.arange(len(nothing)) != j)
         foretold = penalise(pair, support, nothing)
-        start = TrajectoryFit(fit.paths, foretold.free, support, fit.squares)
+        start = replace(fit, free=foretold.free, support=support)
         if foretold.score < fit.total + 30.0:  # within the reach of a line
-            refit = fit_paths(problem, start, level)
+            refit = fit_paths(start)
             assert refit.total == pytest.approx(foretold.score, rel=0.05)
 
 
 def test_block_by_block_finds_the_best_support_of_all() -> None:
-    problem, level, fit = fitted_lorenz(0.1)
-    pair, prices = gram(problem, fit, level), term_prices(problem, 200.0)
+    problem, fit = fitted_lorenz(0.1)
+    pair, prices = gram(fit), term_prices(problem, 200.0)
     full = best_support(problem, pair, prices, np.ones_like(fit.support), max_terms=10)
     empty = best_support(problem, pair, prices, np.zeros_like(fit.support), max_terms=10)
     assert full.score == pytest.approx(empty.score)
@@ -564,7 +560,7 @@ def many_states(n_states: int) -> ep.Trajectory:
     return ep.Trajectory(t, states, [f"x{k}" for k in range(n_states)])
 
 
-def three_runs(rng: np.random.Generator) -> tuple[EstimationProblem, TrajectoryFit, Level]:
+def three_runs(rng: np.random.Generator) -> TrajectoryFit:
     """Runs with an input, of which one lacks samples and one has limits, about some paths."""
     runs = []
     for k, n in enumerate((30, 12, 21)):
@@ -581,35 +577,37 @@ def three_runs(rng: np.random.Generator) -> tuple[EstimationProblem, TrajectoryF
     upper = np.where(rng.random(last.samples.shape) < 0.3, np.inf, last.samples)
     last = replace(last, limits=Bounds(last.samples, upper, ()))
     problem = replace(problem, records=(first, second, last))
-    paths = tuple(r.samples + 0.1 * rng.normal(size=r.samples.shape) for r in problem.records)
-    free = 0.1 * rng.normal(size=problem.n_free)
-    noise = tuple(rng.uniform(0.2, 0.5, path.shape) for path in paths)
-    fit = TrajectoryFit(paths, free, np.ones(len(free), dtype=bool), np.zeros(2))
-    return problem, fit, Level(noise, 0.3, n_substeps=2)
+    samples = problem.all_records.samples
+    path, noise = samples + 0.1 * rng.normal(size=samples.shape), rng.uniform(0.2, 0.5, (63, 2))
+    free, level = 0.1 * rng.normal(size=problem.n_free), Level(noise, 0.3, n_substeps=2)
+    return TrajectoryFit(problem, level, path, free, np.ones(len(free), dtype=bool))
 
 
 @pytest.mark.parametrize("push", [None, np.array([0.1, 0.2])])
 def test_runs_are_joined_without_a_way_from_one_to_the_next(
     rng: np.random.Generator, push: np.ndarray | None
 ) -> None:
-    problem, fit, level = three_runs(rng)
-    level, change = replace(level, push=push), 0.1 * rng.normal(size=problem.n_free)
-    about = likelihood.hessian_on(problem, fit, fit.support, level)[3]
-    moves = np.split(likelihood._moves(about, change), problem.all_records.breaks + 1)
+    fit = three_runs(rng)
+    problem, level = fit.problem, replace(fit.level, push=push)
+    fit, change = replace(fit, level=level), 0.1 * rng.normal(size=problem.n_free)
+
+    def parts_of(fit: TrajectoryFit) -> tuple:
+        pair, (_, least, logs) = gram(fit), innovations(fit)
+        return pair.quadratic, pair.linear, least, logs, fit.squares
+
+    def move_of(fit: TrajectoryFit) -> np.ndarray:
+        return likelihood._move(likelihood.hessian_on(fit, fit.support)[3], change)
+
     totals = [0.0] * 5
     for record, path, noise, move in zip(
-        problem.records, fit.paths, level.noise, moves, strict=True
-    ):
-        alone, own = replace(problem, records=(record,)), replace(fit, paths=(path,))
-        its = replace(level, noise=(noise,))
-        about = likelihood.hessian_on(alone, own, fit.support, its)[3]
-        expected = likelihood._moves(about, change)
-        np.testing.assert_allclose(move, expected, rtol=1e-9, atol=1e-12)
-        pair, (_, least, logs) = gram(alone, own, its), innovations(alone, own, its)
-        parts = pair.quadratic, pair.linear, least, logs, squares(alone, (path,), fit.free, its)
-        totals = [total + part for total, part in zip(totals, parts, strict=True)]
-    pair, (_, least, logs) = gram(problem, fit, level), innovations(problem, fit, level)
-    joined = pair.quadratic, pair.linear, least, logs, squares(problem, fit.paths, fit.free, level)
+        problem.records, fit.paths, problem.split(level.noise), problem.split(move_of(fit)),
+        strict=True,
+    ):  # fmt: skip
+        alone, its = replace(problem, records=(record,)), replace(level, noise=noise)
+        own = replace(fit, problem=alone, level=its, path=path)
+        np.testing.assert_allclose(move, move_of(own), rtol=1e-9, atol=1e-12)
+        totals = [total + part for total, part in zip(totals, parts_of(own), strict=True)]
+    joined = parts_of(fit)
     for one, other in zip(joined, totals, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
 
@@ -617,7 +615,7 @@ def test_runs_are_joined_without_a_way_from_one_to_the_next(
 def test_a_pass_over_many_runs_is_a_single_call(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem, fit, level = three_runs(rng)
+    fit = three_runs(rng)
     calls: list[int] = []
 
     def tell(flow: np.ndarray, *rest: np.ndarray) -> tuple:
@@ -625,8 +623,8 @@ def test_a_pass_over_many_runs_is_a_single_call(
         return eliminate(flow, *rest)
 
     monkeypatch.setattr(likelihood, "eliminate", tell)
-    gram(problem, fit, level)
-    assert calls == [problem.n_samples - 1]
+    gram(fit)
+    assert calls == [len(fit.path) - 1]
 
 
 def test_more_coefficients_than_memory_holds_are_refused_first(
@@ -705,20 +703,20 @@ def test_the_time_is_looked_at_within_a_step_of_a_fit() -> None:
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 100)
     watch = cost.Watch(limit_s=1.0, clock=clock, advance=advance)
     problem = scale_problem([run], ep.polynomial(run.state_names, degree=2), watch=watch)
-    noise = (np.full(run.states.shape, 0.1),)
+    level = Level(np.full(run.states.shape, 0.1), 0.1)
     free, support = np.zeros(problem.n_free), np.ones(problem.n_free, dtype=bool)
-    fit = TrajectoryFit((problem.records[0].samples,), free, support, np.zeros(3))
+    fit = TrajectoryFit(problem, level, problem.records[0].samples, free, support)
     now, watch.best = 2, fit
     for one_pass in (
-        lambda: squares(problem, fit.paths, free, Level(noise, 0.1)),
-        lambda: gram(problem, fit, Level(noise, 0.1)),
+        lambda: fit.squares,
+        lambda: gram(fit),
         lambda: smoothed(problem, None),
     ):
         with pytest.raises(cost.OutOfTimeError, match="must end within limit_s=1 s"):
             one_pass()
     assert steps == 0
     watch.best = None  # a first model is waited for
-    assert np.isfinite(squares(problem, fit.paths, free, Level(noise, 0.1))).all()
+    assert np.isfinite(fit.squares).all()
 
 
 @pytest.mark.parametrize(
@@ -789,8 +787,9 @@ def test_an_interruption_within_a_kernel_is_one() -> None:
 
 
 def test_squares_whose_sum_overflows_are_infinite_and_warn_of_nothing() -> None:
-    nothing = np.zeros(0)
-    fit = TrajectoryFit((), nothing, nothing.astype(np.bool_), np.full(2, 1.5e308))
+    _, fit = fitted_lorenz(0.1)
+    fit = replace(fit, path=np.full(fit.path.shape, 3.9e151), free=np.zeros_like(fit.free))
+    assert np.isfinite(fit.squares).all()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert fit.total == np.inf
@@ -813,7 +812,7 @@ def test_right_models_meet_their_steps() -> None:
     run = LORENZ.trajectory(noise=0.2, rng=0)
     problem = scale_problem([run], LORENZ.model.library)
     found = from_smooth(problem, None, max_terms=7)
-    missed = squares_of_steps(problem, found.fit, found.level)[0]
+    missed = squares_of_steps(found.fit)[0]
     assert found.flow_error == 0.0
     assert (np.sqrt(missed / problem.n_samples) < 1e-2 * EXACT * found.noise.std).all()
 

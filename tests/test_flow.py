@@ -71,9 +71,9 @@ def test_paths_part_by_twice_the_positive_exponents(rate: float, expected: float
     run = ep.Trajectory(np.arange(400.0), np.exp(np.arange(400.0)[:, None] / 400.0), ["x"])
     problem = scale_problem([run], ep.polynomial(["x"], degree=1))
     free = np.array([0.0, rate])
-    fit = TrajectoryFit((np.zeros((400, 1)),), free, free != 0.0, np.array([np.inf]))
-    level = Level((np.full((400, 1), 0.1),), 1e-4, n_substeps=4)
-    assert parting(problem, fit, level) == pytest.approx(expected, abs=0.05)
+    level = Level(np.full((400, 1), 0.1), 1e-4, n_substeps=4)
+    fit = TrajectoryFit(problem, level, np.zeros((400, 1)), free, free != 0.0)
+    assert parting(fit) == pytest.approx(expected, abs=0.05)
 
 
 def test_a_model_that_could_follow_any_samples_is_a_misfit() -> None:

@@ -14,7 +14,7 @@ from benchmarks.known_systems import KINDS, noisy
 from benchmarks.spoilt import spoilt
 from ep2sindy.data.gaps import between_gaps
 from ep2sindy.estimation import explanation
-from ep2sindy.estimation.likelihood import TrajectoryFit
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit
 from ep2sindy.estimation.noise import ALIKE_SAMPLES, Noise, noise_beside
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
@@ -26,10 +26,10 @@ def noise_of(
 ) -> Noise:
     """The noise beside given paths, in SI, of a model of no terms."""
     problem = scale_problem(runs, library or ep.polynomial(runs[0].state_names, degree=2))
-    n, d = problem.n_free, len(problem.states)
-    scaled = tuple(path / problem.scale for path in paths)
-    none = np.zeros(n, dtype=np.bool_)
-    return noise_beside(problem, TrajectoryFit(scaled, np.zeros(n), none, np.zeros(d)))
+    path, none = np.concatenate(paths) / problem.scale, np.zeros(problem.n_free)
+    return noise_beside(
+        TrajectoryFit(problem, Level(np.ones(path.shape), 1.0), path, none, none > 0.0)
+    )
 
 
 def at_rest(run: ep.Trajectory) -> np.ndarray:

@@ -4,6 +4,7 @@ as assumed, states and samples that come twice."""
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -169,7 +170,10 @@ def late_record(delays: tuple[float, ...]) -> tuple[EstimationProblem, System]:
 
 def fit_of_samples(problem: EstimationProblem, system: System) -> TrajectoryFit:
     free = system.model.coef[problem.column, problem.equation] / problem.to_SI
-    return TrajectoryFit(tuple(r.samples for r in problem.records), free, free != 0.0, np.zeros(3))
+    path = problem.all_records.samples
+    return TrajectoryFit(
+        problem, Level(np.full(path.shape, 1e-2), 1e-2, 2), path, free, free != 0.0
+    )
 
 
 def test_delays_are_found_to_second_order_beside_the_true_equations() -> None:
@@ -178,9 +182,9 @@ def test_delays_are_found_to_second_order_beside_the_true_equations() -> None:
         delays = (0.0, size, -0.5 * size)
         problem, system = late_record(delays)
         fit = fit_of_samples(problem, system)
-        level = Level((np.full(fit.paths[0].shape, 1e-2),), 1e-2, 4)
+        fit = replace(fit, level=replace(fit.level, n_substeps=4))
         late = np.array([False, True, True])
-        found, std = delayed_gram(problem, fit, level).of(late).delays(fit.support)
+        found, std = delayed_gram(fit).of(late).delays(fit.support)
         errors.append(np.abs(found - delays[1:]).max())
         assert (std > 0.0).all()
     assert errors[0] < 0.01
@@ -190,8 +194,7 @@ def test_delays_are_found_to_second_order_beside_the_true_equations() -> None:
 def test_without_delays_the_gram_pair_is_the_plain_one() -> None:
     problem, system = late_record((0.0, 0.3, 0.0))
     fit = fit_of_samples(problem, system)
-    level = Level((np.full(fit.paths[0].shape, 1e-2),), 1e-2, 2)
-    plain, delayed = gram(problem, fit, level), delayed_gram(problem, fit, level).at_rest
+    plain, delayed = gram(fit), delayed_gram(fit).at_rest
     np.testing.assert_allclose(delayed.quadratic, plain.quadratic, rtol=1e-9)
     np.testing.assert_allclose(delayed.linear, plain.linear, rtol=1e-9, atol=1e-9)
     assert delayed.offset == pytest.approx(plain.offset)

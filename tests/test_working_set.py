@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -195,12 +196,12 @@ def test_scores_tell_what_a_term_would_bring() -> None:
     true = mask_of(problem, system)
     part = problem.restricted(true)
     found = from_smooth(part, None, max_terms=7)
-    fit, level = at_level(part, found.fit, found.level)
-    fit, level = at_level(part, fit, type(level)(level.noise, WEIGHED_AT, level.n_substeps))
+    fit = at_level(found.fit, found.fit.level)
+    fit = at_level(fit, replace(fit.level, rho=WEIGHED_AT))
     every = working_set._spread(fit.free, true)
-    gains = working_set._gains(problem, part, fit, level)
-    whole = type(fit)(fit.paths, every, true, fit.squares)
-    exact = exact_gains(gram(problem, whole, level), true)
+    gains = working_set._gains(problem, fit)
+    whole = replace(fit, problem=problem, free=every, support=true)
+    exact = exact_gains(gram(whole), true)
     large = ~true & (exact > 1.0)
     assert large.sum() > 20
     ratio = gains[large] / exact[large]

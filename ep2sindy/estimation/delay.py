@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.estimation.kernels import eliminate
-from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, flow_by, joined, linearise
+from ep2sindy.estimation.likelihood import Gram, TrajectoryFit, flow_by, linearise
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.supports import PenalisedFit, best_support, inverse_of, penalise
 
@@ -63,19 +63,19 @@ class DelayedGram:
         return best, np.sqrt(np.maximum(np.diag(inverse), 0.0))
 
 
-def delayed_gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> DelayedGram:
+def delayed_gram(fit: TrajectoryFit) -> DelayedGram:
     """Linearise about a fit, with a delay of every state.
 
     Without inputs, a common delay of all states leaves no trace in the data. To first order, a
     state that is read tau early lies tau times its rate further on. At the start of a step this
     displacement goes through the flow; at the end of the step it is what the samples show.
     """
-    d, n, record = len(problem.states), len(fit.support), problem.all_records
-    flow = flow_by(problem, fit, np.ones_like(fit.support), level, n_more=d)
-    rates = problem.rates(record, joined(fit.paths), fit.free)
+    problem, d, n = fit.problem, fit.path.shape[1], len(fit.support)
+    flow = flow_by(fit, np.ones_like(fit.support), n_more=d)
+    rates = problem.rates(problem.all_records, fit.path, fit.free)
     flow.slopes[:, :, -d:] = flow.slopes[:, :, :d] * rates[:-1, None, :]
     flow.slopes[:, np.arange(d), np.arange(-d, 0)] -= rates[1:]
-    quadratic, gradient, least, _ = eliminate(*linearise(problem, fit, level, flow))
+    quadratic, gradient, least, _ = eliminate(*linearise(fit, flow))
     linear = quadratic[:, :n] @ fit.free + gradient
     own = quadratic[:n, :n]
     offset = least + fit.free @ own @ fit.free + 2.0 * fit.free @ gradient[:n]

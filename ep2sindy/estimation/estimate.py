@@ -296,7 +296,7 @@ def _report(
     """Convert the solution to SI, and add its rivals."""
     problem, found = answer.problem, answer.solution
     fit, few_terms = found.fit, answer.max_terms
-    pair = gram(problem, fit, found.level)
+    pair = gram(fit)
     supports = {
         state: _score_supports(problem, pair, found, block, few_terms)
         for block, state in count_pieces(
@@ -368,7 +368,7 @@ def _model(
     rows = (C[used][:, fit.support] * problem.to_SI[used, None])[order]
     # If the residuals exceed the noise, intervals would not cover the truth.
     known = found.fits and not answer.misfit
-    free_cov = covariance(problem, fit, found.level) if known else None
+    free_cov = covariance(fit) if known else None
     cov = None if free_cov is None else rows @ free_cov @ rows.T
     courses = dict(zip(problem.inputs, problem.courses, strict=True))
     return SparseModel(library, problem.states, coef, units, provenance, cov, courses=courses)

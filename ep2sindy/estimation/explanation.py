@@ -26,14 +26,13 @@ from ep2sindy.estimation.delay import (
     move_channels,
     suspect_delays,
 )
-from ep2sindy.estimation.likelihood import Level
+from ep2sindy.estimation.likelihood import TrajectoryFit
 from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem
 from ep2sindy.estimation.process_noise import process_noise_words, solve_with_process_noise
 from ep2sindy.estimation.solution import Solution
 from ep2sindy.estimation.solver import (
     ENOUGH_SAMPLES,
     OTHER_STARTS,
-    AnnealedFit,
     at_level,
     enough_samples,
     from_smooth,
@@ -115,7 +114,7 @@ def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -
         watch.best = None  # what follows is a report, which nothing ends
 
 
-def _unfinished(best: Solution | AnnealedFit, ended: str, max_terms: int | None) -> Explanation:
+def _unfinished(best: Solution | TrajectoryFit, ended: str, max_terms: int | None) -> Explanation:
     """The best so far of a search that was ended."""
     solution = best if isinstance(best, Solution) else unfinished_solution(best)
     limit = max_terms or FIRST_MAX_TERMS
@@ -170,8 +169,7 @@ def _compare(first: Solution, max_terms: int) -> tuple[Solution, Solution]:
     if not first.fits:
         with problem.watch.stage("process noise"):
             under_noise = solve_with_process_noise(problem, max_terms=max_terms)
-            noise = under_noise.level.noise
-            exact = _best(first, settle(problem, under_noise.fit, noise, max_terms=max_terms))
+            exact = _best(first, settle(under_noise.fit, max_terms=max_terms))
         problem.watch.best = exact
     best = _best(exact, _align(first, max_terms))
     if best is not exact:
@@ -324,11 +322,13 @@ def on_likeliest_courses(problem: EstimationProblem, *, max_terms: int) -> Estim
     if all(len(options) == 1 for options in problem.allowed_courses):
         return problem
     part = problem.restricted(first_set(problem, max_terms))
-    start, noise = start_from_smooth(part, None)
+    start = start_from_smooth(part, None)
 
     @cache
     def unlikely(courses: tuple[str, ...]) -> float:
-        fit, _ = at_level(part.on_courses(courses), start, Level(noise, WARM))
+        fit = at_level(
+            replace(start, problem=part.on_courses(courses)), replace(start.level, rho=WARM)
+        )
         return part.n_squares * log(max(fit.total, np.finfo(np.float64).tiny))
 
     best = problem.courses

@@ -12,8 +12,8 @@ an apparent noise, so that the same filter serves both.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import log, pi
 from typing import NamedTuple
 
@@ -45,59 +45,70 @@ LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
 class Level:
     """How closely states must follow the samples and the flow.
 
-    noise: for each record, (samples, d), standard deviations of the samples, scaled. rho: the
-    flow's error as a share of the noise. push: (d,), the flow's error itself, if it is known.
+    noise: (samples, d), standard deviations of the samples of all records, scaled. rho: the flow's
+    error as a share of the noise. push: (d,), the flow's error itself, if it is known.
     """
 
-    noise: tuple[np.ndarray, ...]
+    noise: Float[np.ndarray, "samples d"]
     rho: float
     n_substeps: int = 1
     push: Float[np.ndarray, " d"] | None = None
 
     def with_errors(self, noise: Float[np.ndarray, " d"], push: Float[np.ndarray, " d"]) -> Level:
-        """The same records with other errors, alike at all samples."""
-        own = tuple(np.tile(noise, (len(each), 1)) for each in self.noise)
-        return Level(own, 1.0, push=push)
+        """The same samples with other errors, alike at all of them."""
+        return Level(np.tile(noise, (len(self.noise), 1)), 1.0, push=push)
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryFit:
+    """States and coefficients of a problem, fitted at a level of errors.
+
+    path: states at the samples of all records, one after the other, scaled. free: zero outside the
+    support. at_zero: states that start at zero, and would start below it; None for none.
+    """
+
+    problem: EstimationProblem
+    level: Level
+    path: Float[np.ndarray, "samples d"]
+    free: Float[np.ndarray, " free"]
+    support: Bool[np.ndarray, " free"]
+    at_zero: Bool[np.ndarray, "records d"] | None = None
 
     @property
-    def variance(self) -> Float[np.ndarray, "samples d"]:
-        """Variances of the samples of all records, one after the other."""
-        return np.square(joined(self.noise))
+    def paths(self) -> list[Float[np.ndarray, "samples d"]]:
+        """The path of each record."""
+        return self.problem.split(self.path)
+
+    @cached_property
+    def squares(self) -> Float[np.ndarray, " d"]:
+        """The objective (see the module), by state; infinite if the flow is not finite."""
+        self.problem.watch.look()
+        record, level = self.problem.all_records, self.level
+        with np.errstate(over="ignore", invalid="ignore"):
+            defects = self.problem.ends(record, self.path[:-1], self.free, level.n_substeps)
+            defects -= self.path[1:]
+            defects[record.breaks] = 0.0
+            total = observe(record, self.path, np.square(level.noise)).squares.sum(axis=0)
+            total = total + (np.square(defects) / self.process).sum(axis=0)
+        return np.where(np.isfinite(total), total, np.inf)
+
+    @property
+    def total(self) -> float:
+        with np.errstate(over="ignore"):  # the sum is infinite then, as if one of them were
+            return float(self.squares.sum())
 
     @property
     def process(self) -> Float[np.ndarray, "steps d"]:
         """Variances of the flow's error over all steps.
 
         Those between records are of states of which nothing is known, so that a filter whose slopes
-        and misses are zero there begins each record anew.
+        and defects are zero there begins each record anew.
         """
-        if self.push is not None:
-            found = np.tile(np.square(self.push), (sum(map(len, self.noise)) - 1, 1))
-        else:
-            found = np.square(self.rho * joined(self.noise)[:-1])
-        found[np.cumsum([len(noise) for noise in self.noise])[:-1] - 1] = FREE_START
+        level = self.level
+        error = level.rho * level.noise[:-1] if level.push is None else level.push
+        found = np.square(np.broadcast_to(error, level.noise[:-1].shape))
+        found[self.problem.all_records.breaks] = FREE_START
         return found
-
-
-@dataclass(frozen=True, eq=False)
-class TrajectoryFit:
-    """Fitted states and coefficients.
-
-    paths: for each record, (samples, d), scaled. free: (free,), zero outside the support.
-    squares: (d,), the objective by state; infinite if the flow is not finite. at_zero: (records,
-    d), states that start at zero, and would start below it; None for none.
-    """
-
-    paths: tuple[np.ndarray, ...]
-    free: Float[np.ndarray, " free"]
-    support: Bool[np.ndarray, " free"]
-    squares: Float[np.ndarray, " d"]
-    at_zero: Bool[np.ndarray, "records d"] | None = None
-
-    @property
-    def total(self) -> float:
-        with np.errstate(over="ignore"):  # the sum is infinite then, as if one of them were
-            return float(self.squares.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,189 +128,161 @@ class Gram:
         return bool(np.isfinite(self.quadratic).all() and np.isfinite(self.linear).all())
 
 
-def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """The parts of all records as one array; that of a single record is not copied."""
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
-def squares(
-    problem: EstimationProblem, paths: Sequence[np.ndarray], free: np.ndarray, level: Level
-) -> Float[np.ndarray, " d"]:
-    """The objective (see the module), by state."""
-    problem.watch.look()
-    record, path = problem.all_records, joined(paths)
-    with np.errstate(over="ignore", invalid="ignore"):
-        misses = problem.ends(record, path[:-1], free, level.n_substeps) - path[1:]
-        misses[record.breaks] = 0.0
-        total = observe(record, path, level.variance).squares.sum(axis=0)
-        total = total + (np.square(misses) / level.process).sum(axis=0)
-    return np.where(np.isfinite(total), total, np.inf)
-
-
-def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> TrajectoryFit:
+def fit_paths(fit: TrajectoryFit) -> TrajectoryFit:
     """Minimise the squares over states and coefficients, which keep their signs.
 
     The result is the nearest local minimum. A coefficient that must be positive and would not be
     leaves the support, and a state that is nonnegative and would start below zero starts there.
     """
-    fit = _descend(problem, replace(fit, at_zero=None), level)
+    problem, fit = fit.problem, _descend(replace(fit, at_zero=None))
     while np.isfinite(fit.total):
         below = problem.nonnegative & [path[0] < 0.0 for path in fit.paths]
         below &= True if fit.at_zero is None else ~fit.at_zero
         if (fit.free[problem.positive] < 0.0).any():
-            fit = _without_negative(problem, fit, level)
+            fit = _without_negative(fit)
         elif below.any():
             fit = _from_zero(fit, below)
         else:
             break
-        fit = _descend(problem, fit, level)
+        fit = _descend(fit)
     return fit
 
 
-def _without_negative(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> TrajectoryFit:
+def _without_negative(fit: TrajectoryFit) -> TrajectoryFit:
     """The fit without what least squares with bounds puts to zero, or all that is negative."""
-    negative = problem.positive & (fit.free < 0.0)
+    positive = fit.problem.positive
+    negative = positive & (fit.free < 0.0)
     kept, own = fit.support & ~negative, np.flatnonzero(fit.support)
-    quadratic, gradient = hessian_on(problem, fit, fit.support, level)[:2]
+    quadratic, gradient = hessian_on(fit, fit.support)[:2]
     if np.isfinite(quadratic).all() and np.isfinite(gradient).all():
         linear = quadratic @ fit.free[own] + gradient
-        bounded = within_bounds(quadratic, linear, problem.positive[own])
+        bounded = within_bounds(quadratic, linear, positive[own])
         kept[own] = kept[own] if bounded.all() else bounded
     return replace(fit, support=kept, free=np.where(kept & ~negative, fit.free, 0.0))
 
 
 def _from_zero(fit: TrajectoryFit, below: Bool[np.ndarray, "records d"]) -> TrajectoryFit:
     """The fit with states that start below zero at zero, where they are held."""
-    paths = tuple(path.copy() for path in fit.paths)
-    for path, own in zip(paths, below, strict=True):
-        path[0, own] = 0.0
+    path, starts = fit.path.copy(), np.append(0, fit.problem.all_records.breaks + 1)
+    path[starts] = np.where(below, 0.0, path[starts])
     held = below if fit.at_zero is None else below | fit.at_zero
-    return replace(fit, paths=paths, at_zero=held)
+    return replace(fit, path=path, at_zero=held)
 
 
-def _descend(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> TrajectoryFit:
+def _descend(fit: TrajectoryFit) -> TrajectoryFit:
     """Gauss-Newton with step halving, whatever the signs."""
-    fit = replace(fit, squares=squares(problem, fit.paths, fit.free, level))
     if not np.isfinite(fit.total):
         return fit  # no gradient to follow
     for _ in range(MAX_STEPS):
-        problem.watch.step()
-        change, moves = _step(problem, fit, level)
+        fit.problem.watch.step()
+        change, move = _step(fit)
         if not np.isfinite(change).all():
             return fit  # derivatives overflow before the flow itself does
         share = 1.0
         while share > SHORTEST:
-            paths = tuple(p + share * m for p, m in zip(fit.paths, moves, strict=True))
-            tried = _at(problem, replace(fit, free=fit.free + share * change), paths, level)
+            tried = replace(fit, path=fit.path + share * move, free=fit.free + share * change)
             if tried.total < fit.total:
                 break
             share /= 2.0
         else:
             return fit
         gain, fit = fit.total - tried.total, tried
-        crawls = fit.total > FAR * problem.n_squares and gain < CRAWLS * fit.total
+        crawls = fit.total > FAR * fit.problem.n_squares and gain < CRAWLS * fit.total
         if crawls or (share == 1.0 and gain < SETTLED):
             return fit
     return fit
 
 
-def _at(
-    problem: EstimationProblem, fit: TrajectoryFit, paths: tuple[np.ndarray, ...], level: Level
-) -> TrajectoryFit:
-    return replace(fit, paths=paths, squares=squares(problem, paths, fit.free, level))
+def _step(
+    fit: TrajectoryFit,
+) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "samples d"]]:
+    """One Gauss-Newton step: changes of the free coefficients and of the path.
+
+    The states are marginalised, so that the normal equations of the coefficients alone remain; the
+    change of the states follows from theirs by the smoother.
+    """
+    change = np.full_like(fit.free, np.nan)
+    # Reduced normal equations, H c = g: the Schur complement of the states' block.
+    hessian, gradient, _, about = hessian_on(fit, fit.support)
+    if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
+        return change, fit.path
+    # In units of H's diagonal, with a ridge for directions that the samples do not tell.
+    size = unit_sizes(hessian)
+    scaled = hessian / np.outer(size, size) + RIDGE * np.eye(len(size))
+    step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
+    change[:] = 0.0
+    change[fit.support] = step
+    # Back-substitution into the states' block, which is block tridiagonal.
+    return change, _move(about, step)
 
 
-def parting(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> float:
+def _move(
+    about: Linearised, change: Float[np.ndarray, " support"]
+) -> Float[np.ndarray, "samples d"]:
+    """Change of the path, for a change of the coefficients."""
+    d = about.defects.shape[1]
+    defects = about.defects + about.slopes[:, :, d:] @ change
+    return departures(*about.of_states._replace(defects=defects))
+
+
+def parting(fit: TrajectoryFit) -> float:
     """How fast paths beside a fit part: nats per sample that are new, beyond a first state's.
 
     In a long record it is twice the sum of the positive Lyapunov exponents, per mean step. Where it
     is large, the least error of the flow steers the path to any sample, and the squares are no
     likelihood.
     """
-    about, _, logs = innovations(problem, fit, level)
+    about, _, logs = innovations(fit)
     precision = np.where(np.isfinite(about.residuals), 1.0 / about.variance, 0.0)
-    by_record = np.add.reduceat(precision, np.append(0, problem.all_records.breaks + 1))
+    by_record = np.add.reduceat(precision, np.append(0, fit.problem.all_records.breaks + 1))
     told = logs + np.log(precision[precision > 0.0]).sum() - np.log1p(FREE_START * by_record).sum()
-    return max(float(told), 0.0) / problem.n_samples
+    return max(float(told), 0.0) / fit.problem.n_samples
 
 
-def innovations(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[Linearised, float, float]:
+def innovations(fit: TrajectoryFit) -> tuple[Linearised, float, float]:
     """The linearisation about a fit, and what all samples add to what came before.
 
     The latter are the sum of the squares of the innovations, in their standard deviations, and the
     sum of the logarithms of their variances.
     """
-    about = linearise(problem, fit, level)
+    about = linearise(fit)
     _, _, least, logs = eliminate(*about)
     return about, least, logs
 
 
 @np.errstate(over="ignore", invalid="ignore")  # `Gram.finite` says whether the result counts
-def gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> Gram:
+def gram(fit: TrajectoryFit) -> Gram:
     """Linearise about a fit: all free coefficients of all equations, the states eliminated."""
-    everything = np.ones_like(fit.support)
-    quadratic, gradient, least = hessian_on(problem, fit, everything, level)[:3]
+    quadratic, gradient, least, _ = hessian_on(fit, np.ones_like(fit.support))
     linear = quadratic @ fit.free + gradient
     offset = least + fit.free @ quadratic @ fit.free + 2.0 * fit.free @ gradient
     return Gram(quadratic, linear, float(offset))
 
 
-def covariance(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> Float[np.ndarray, "support support"] | None:
+def covariance(fit: TrajectoryFit) -> Float[np.ndarray, "support support"] | None:
     """Covariance of the support's free coefficients, scaled; None if the fit is not finite."""
-    hessian = hessian_on(problem, fit, fit.support, level)[0]
+    hessian = hessian_on(fit, fit.support)[0]
     if not np.isfinite(hessian).all():
         return None
     size = unit_sizes(hessian)
     return np.linalg.pinv(hessian / np.outer(size, size), hermitian=True) / np.outer(size, size)
 
 
-def enough_substeps(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, share: float = 0.1
-) -> int:
+def enough_substeps(fit: TrajectoryFit, *, share: float = 0.1) -> int:
     """Number of Runge-Kutta steps between samples for an error below a share of the flow's."""
-    n = level.n_substeps
+    problem, n = fit.problem, fit.level.n_substeps
     most = min(MAX_SUBSTEPS, max(MIN_ALLOWED, MAX_IN_ALL // problem.n_samples))
-    record, starts = problem.all_records, joined(fit.paths)[:-1]
+    record, starts = problem.all_records, fit.path[:-1]
     while 2 * n <= most:
         problem.watch.look()
         with np.errstate(over="ignore", invalid="ignore"):
             change = problem.ends(record, starts, fit.free, n)
             change -= problem.ends(record, starts, fit.free, 2 * n)
-            errors = np.delete(np.square(change) / level.process, record.breaks, axis=0)
+            errors = np.delete(np.square(change) / fit.process, record.breaks, axis=0)
         if (errors.mean(axis=0) <= share**2).all():
             break
         n *= 2
     return n
-
-
-def _step(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[Float[np.ndarray, " free"], list[np.ndarray]]:
-    """One Gauss-Newton step: changes of the free coefficients and of every path."""
-    hessian, gradient, _, about = hessian_on(problem, fit, fit.support, level)
-    if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
-        return np.full_like(fit.free, np.nan), []
-    size = unit_sizes(hessian)
-    scaled = hessian / np.outer(size, size) + RIDGE * np.eye(len(size))
-    step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
-    change = np.zeros_like(fit.free)
-    change[fit.support] = step
-    return change, np.split(_moves(about, step), problem.all_records.breaks + 1)
-
-
-def _moves(
-    about: Linearised, change: Float[np.ndarray, " support"]
-) -> Float[np.ndarray, "samples d"]:
-    """Changes of the paths, for a change of the coefficients."""
-    d = about.defects.shape[1]
-    defects = about.defects + about.slopes[:, :, d:] @ change
-    return departures(*about.of_states._replace(defects=defects))
 
 
 class Linearised(NamedTuple):
@@ -325,56 +308,40 @@ class Linearised(NamedTuple):
 
 
 @np.errstate(over="ignore", invalid="ignore")  # callers look whether the result is finite
-def linearise(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level, flow: Flow | None = None
-) -> Linearised:
-    """The objective about a fit. flow: along the paths of all records; None for that of states."""
+def linearise(fit: TrajectoryFit, flow: Flow | None = None) -> Linearised:
+    """The objective about a fit. flow: along its path; None for one with slopes by the state."""
+    problem, record = fit.problem, fit.problem.all_records
     problem.watch.look()
-    record, path = problem.all_records, joined(fit.paths)
-    if flow is None:
-        flow = flow_by(problem, fit, np.zeros_like(fit.support), level)
-    defects = flow.ends - path[1:]
+    flow = flow or flow_by(fit, np.zeros_like(fit.support))
+    # Rows of the steps: what the flow from each state misses of the next one.
+    defects = flow.ends - fit.path[1:]
     defects[record.breaks] = flow.slopes[record.breaks] = 0.0
-    residuals, variance, _ = observe(record, path, level.variance)
-    return Linearised(flow.slopes, defects, residuals, variance, *_errors(problem, fit, level))
+    # Rows of the samples: residuals, and the variances of their noise.
+    residuals, variance, _ = observe(record, fit.path, np.square(fit.level.noise))
+    # Weights of the steps, and of the first states, of which nothing is known unless held at zero.
+    process, start = fit.process, np.full(len(problem.states), FREE_START)
+    if fit.at_zero is not None:
+        first, *others = np.where(fit.at_zero, HELD_START, FREE_START)
+        process[record.breaks], start = np.reshape(others, (-1, len(start))), first
+    return Linearised(flow.slopes, defects, residuals, variance, process, start)
 
 
-def flow_by(
-    problem: EstimationProblem,
-    fit: TrajectoryFit,
-    support: Bool[np.ndarray, " free"],
-    level: Level,
-    *,
-    n_more: int = 0,
-) -> Flow:
-    """The flow along the paths of all records, with derivatives by a support's coefficients."""
-    starts = joined(fit.paths)[:-1]
-    return problem.flow(
-        problem.all_records, starts, fit.free, support, level.n_substeps, n_more=n_more
-    )
+def flow_by(fit: TrajectoryFit, support: Bool[np.ndarray, " free"], *, n_more: int = 0) -> Flow:
+    """The flow along the path of a fit, with derivatives by the coefficients of a support."""
+    problem, n = fit.problem, fit.level.n_substeps
+    return problem.flow(problem.all_records, fit.path[:-1], fit.free, support, n, n_more=n_more)
 
 
 def hessian_on(
-    problem: EstimationProblem, fit: TrajectoryFit, support: Bool[np.ndarray, " free"], level: Level
+    fit: TrajectoryFit, support: Bool[np.ndarray, " free"]
 ) -> tuple[np.ndarray, np.ndarray, float, Linearised]:
     """Derivatives of the squares by the coefficients of a support, the states eliminated.
 
     Returns half the second derivatives, minus half the first, the least squares with these
     coefficients unchanged, and the linearisation.
     """
-    about = linearise(problem, fit, level, flow_by(problem, fit, support, level))
+    about = linearise(fit, flow_by(fit, support))
     return *eliminate(*about)[:3], about
-
-
-def _errors(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[Float[np.ndarray, "steps d"], Float[np.ndarray, " d"]]:
-    """Variances of the flow's error over all steps, and of the first state."""
-    process, start = level.process, np.full(len(problem.states), FREE_START)
-    if fit.at_zero is not None:
-        first, *others = np.where(fit.at_zero, HELD_START, FREE_START)
-        process[problem.all_records.breaks], start = np.reshape(others, (-1, len(start))), first
-    return process, start
 
 
 def within_bounds(

@@ -251,6 +251,10 @@ class EstimationProblem:
         """All records as one."""
         return ScaledRecord.joined(self.records)
 
+    def split(self, values: Float[np.ndarray, "samples _"]) -> list[np.ndarray]:
+        """The part of each record of what all records have, one after the other."""
+        return np.split(values, self.all_records.breaks + 1)
+
     @property
     def courses(self) -> tuple[str, ...]:
         """The most plausible course of every input that is allowed."""

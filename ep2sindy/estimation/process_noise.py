@@ -49,11 +49,11 @@ class Errors:
     deviance: float
 
 
-def likely_errors(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> Errors:
-    """The likeliest noise and pushes about the paths of a fit, from those of a level on."""
+def likely_errors(fit: TrajectoryFit) -> Errors:
+    """The likeliest noise and pushes about the path of a fit, from those of its level on."""
     from scipy.optimize import minimize  # imported only to estimate errors
 
-    measured, about = problem.measured, linearise(problem, fit, level)
+    measured, level, about = fit.problem.measured, fit.level, linearise(fit)
     n, d = int(measured.sum()), len(measured)
     low = np.log(np.repeat([LEAST_NOISE, LEAST_PUSH], [n, d]))
 
@@ -64,12 +64,13 @@ def likely_errors(problem: EstimationProblem, fit: TrajectoryFit, level: Level) 
         return level.with_errors(own, held[n:])
 
     def unlikely(logs: np.ndarray) -> float:
-        tried, bounded = level_of(logs), np.clip(logs, low, np.log(MOST))
-        case = about._replace(variance=tried.variance, process=tried.process)
+        tried, bounded = replace(fit, level=level_of(logs)), np.clip(logs, low, np.log(MOST))
+        variance = np.square(tried.level.noise)
+        case = about._replace(variance=variance, process=tried.process)
         return float(np.square(logs - bounded).sum() + sum(eliminate(*case)[2:]))
 
     assert level.push is not None
-    start = np.log(np.append(level.noise[0][0][measured], level.push))
+    start = np.log(np.append(level.noise[0, measured], level.push))
     found = minimize(
         unlikely,
         start,
@@ -82,21 +83,20 @@ def likely_errors(problem: EstimationProblem, fit: TrajectoryFit, level: Level) 
         },
     )
     likely = level_of(found.x)
-    return Errors(likely.noise[0][0], likely.push, float(found.fun))
+    return Errors(likely.noise[0], likely.push, float(found.fun))
 
 
 def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> Solution:
     """Errors and sparse coefficients in turn, from smoothed states with all coefficients free."""
-    fit, noise = start_from_smooth(problem, None)
-    std, prices = noise[0][0], term_prices(problem, float(problem.n_samples))
-    level = Level(noise, 1.0).with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
+    fit = start_from_smooth(problem, None)
+    std, prices = fit.level.noise[0], term_prices(problem, float(problem.n_samples))
+    level = fit.level.with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
     for share in SHARES:
-        fit, level = at_level(problem, fit, level)
-        fit, _ = exchange_terms(problem, fit, level, share * prices, max_terms)
-        errors = likely_errors(problem, fit, level)
+        fit = exchange_terms(at_level(fit, level), share * prices, max_terms)
+        errors = likely_errors(fit)
         level = level.with_errors(errors.samples, errors.process)
-    fit, level = at_level(problem, fit, level)
-    noise, none = noise_beside(problem, fit), np.zeros(len(problem.states))
+    fit = at_level(fit, level)
+    noise, none = noise_beside(fit), np.zeros(len(problem.states))
     explained = replace(
         noise,
         std=errors.samples,
@@ -106,26 +106,22 @@ def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> S
         deviance=errors.deviance,
     )
     return Solution(
-        problem=problem,
         fit=fit,
-        level=level,
         observation=Observation(explained, none, errors.process),
         prices=prices,
         deviance=errors.deviance,
-        tests=(_defects_of_steps(problem, fit, level, errors), *_left_over(problem, fit, level)),
+        tests=(_defects_of_steps(fit, errors), *_left_over(fit)),
     )
 
 
-def _defects_of_steps(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level, errors: Errors
-) -> LackOfFit:
+def _defects_of_steps(fit: TrajectoryFit, errors: Errors) -> LackOfFit:
     """RMS of the steps that a path misses, in what process noise and noise allow.
 
     Infinite for a state without a law: one whose equation has no term, which noise alone moves.
     """
-    missed = squares_of_steps(problem, fit, level)[0] / problem.n_samples
+    missed = squares_of_steps(fit)[0] / len(fit.path)
     allowed = np.square(MOST_MISSED * errors.process) + np.square(EXACT * errors.samples)
-    moves = problem.coef(fit.free).any(axis=0)
+    moves = fit.problem.coef(fit.free).any(axis=0)
     return LackOfFit(np.where(moves, np.sqrt(missed / allowed), np.inf), 1.0)
 
 
@@ -140,15 +136,15 @@ def process_noise_words(solution: Solution) -> str:
     )
 
 
-def _left_over(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> list[LackOfFit]:
+def _left_over(fit: TrajectoryFit) -> list[LackOfFit]:
     """What innovations show that random ones would not, in standard errors.
 
     Their largest autocorrelation over a few lags, the largest share that one product of states
     explains beside the terms of the equation, and the share that all of them explain: what an
     equation lacks is a function of the states, and lasts as long as these.
     """
-    found = np.nan_to_num(filtered(*linearise(problem, fit, level))[0])
-    new = [part[SETTLING:] for part in np.split(found, problem.all_records.breaks + 1)]
+    problem, found = fit.problem, np.nan_to_num(filtered(*linearise(fit))[0])
+    new = [part[SETTLING:] for part in problem.split(found)]
     joined = np.concatenate(new)
     if not (np.abs(joined) < RUNAWAY).all():
         return [LackOfFit(np.full(joined.shape[1], np.inf), MOST_SHOWN[0])]
@@ -160,20 +156,20 @@ def _left_over(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> 
     powers = powers_of(before, int(problem.candidates.library.degrees.max()) + MORE_DEGREES)
     unit = root * joined / size
     together = np.square(np.linalg.qr(powers)[0].T @ unit).sum(axis=0) - powers.shape[1]
-    single = _largest_share(problem, fit, before, powers, unit)
+    single = _largest_share(fit, before, powers, unit)
     shown = lasting, single, together / np.sqrt(2.0 * powers.shape[1])
     return [LackOfFit(each, most) for each, most in zip(shown, MOST_SHOWN, strict=True)]
 
 
 def _largest_share(
-    problem: EstimationProblem,
     fit: TrajectoryFit,
     before: Float[np.ndarray, "samples d"],
     powers: Float[np.ndarray, "samples _"],
     unit: Float[np.ndarray, "samples d"],
 ) -> Float[np.ndarray, " d"]:
     """The most that one of the powers explains of unit innovations beside an equation's terms."""
-    used, found = problem.coef(fit.free) != 0.0, np.zeros(unit.shape[1])
+    problem, found = fit.problem, np.zeros(unit.shape[1])
+    used = problem.coef(fit.free) != 0.0
     inputs = np.concatenate([r.inputs[SETTLING - 1 : -1] for r in problem.records])
     terms = problem.library.evaluate(np.concatenate([before, inputs], axis=1))
     for k in range(unit.shape[1]):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.estimation.delay import DelayedGram
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit
+from ep2sindy.estimation.likelihood import TrajectoryFit
 from ep2sindy.estimation.noise import Noise
 from ep2sindy.estimation.problem import EstimationProblem
 
@@ -62,15 +62,17 @@ class Solution:
     around: linearisation with delays, where the support was compared with others.
     """
 
-    problem: EstimationProblem
     fit: TrajectoryFit
-    level: Level
     observation: Observation
     prices: Float[np.ndarray, " free"]
     deviance: float
     tests: tuple[LackOfFit, ...]
     flow_error: float = 0.0
     around: DelayedGram | None = None
+
+    @property
+    def problem(self) -> EstimationProblem:
+        return self.fit.problem
 
     @property
     def noise(self) -> Noise:

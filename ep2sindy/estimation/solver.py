@@ -7,7 +7,8 @@ are chosen at every level on the way (`anneal`), and compared again at its end (
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,9 +24,7 @@ from ep2sindy.estimation.likelihood import (
     enough_substeps,
     fit_paths,
     gram,
-    joined,
     parting,
-    squares,
 )
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
@@ -77,65 +76,57 @@ def from_smooth(
 
     log10_ratio: of the smoother, see `start_from_smooth`.
     """
-    fit, std = start_from_smooth(problem, log10_ratio)
+    start = start_from_smooth(problem, log10_ratio)
     prices = term_prices(problem, float(problem.n_samples))
-    found = anneal(problem, fit, std, prices, COOLING, max_terms=max_terms)
-    return _settle(found, max_terms)
+    return _settle(anneal(start, prices, COOLING, max_terms=max_terms), max_terms)
 
 
-def settle(
-    problem: EstimationProblem,
-    fit: TrajectoryFit,
-    noise: tuple[np.ndarray, ...],
-    *,
-    max_terms: int,
-) -> Solution:
+def settle(start: TrajectoryFit, *, max_terms: int) -> Solution:
     """The exact solution near a fit whose states leave the flow a little."""
-    prices = term_prices(problem, float(problem.n_samples))
-    found = anneal(problem, fit, noise, prices, COLD, max_terms=max_terms)
-    return _settle(found, max_terms)
+    prices = term_prices(start.problem, float(start.problem.n_samples))
+    return _settle(anneal(start, prices, COLD, max_terms=max_terms), max_terms)
 
 
-def _settle(found: AnnealedFit, max_terms: int) -> Solution:
+def _settle(fit: TrajectoryFit, max_terms: int) -> Solution:
     """Anneal again until noise and support agree, and compare with what is nearly as likely."""
-    problem = found.problem
     for _ in range(MAX_PASSES):
-        before, noise = found.fit.support, noise_beside(problem, found.fit)
-        prices = term_prices(problem, problem.n_samples * float(noise.independent.mean()))
-        found = anneal(problem, found.fit, noise.effective, prices, COLD, max_terms=max_terms)
-        if np.array_equal(before, found.fit.support):
+        before, noise = fit.support, noise_beside(fit)
+        prices = _prices_beside(fit, noise)
+        start = replace(fit, level=replace(fit.level, noise=noise.effective))
+        fit = anneal(start, prices, COLD, max_terms=max_terms)
+        if np.array_equal(before, fit.support):
             break
-    found = polish(found, prices, max_terms=max_terms)
-    found = reheat(found, prices, max_terms=max_terms)
-    noise = noise_beside(problem, found.fit)
-    error = steered = 0.0
-    defects, _ = squares_of_steps(problem, found.fit, found.level)
-    if np.isfinite(found.score) and (noise.std > FLOOR).any():
-        error = flow_error(problem, found.fit, noise, found.level)
-        defect = np.sqrt((defects / np.square(noise.std)).max() / problem.n_samples)
+    fit, around = polish(fit, prices, max_terms=max_terms)
+    fit, around = reheat(fit, around, prices, max_terms=max_terms)
+    noise, error, steered = noise_beside(fit), 0.0, 0.0
+    if np.isfinite(fit.total) and (noise.std > FLOOR).any():
+        error = flow_error(fit, noise)
+        defect = np.sqrt((squares_of_steps(fit)[0] / np.square(noise.std)).max() / len(fit.path))
         error = error if defect < EXACT else max(error, float(defect))  # it lives on the slack
-        steered = parting(problem, found.fit, replace(found.level, noise=noise.white))
-    return _exact_solution(found, noise, prices, error, steered)
+        steered = parting(replace(fit, level=replace(fit.level, noise=noise.white)))
+    return replace(_exact_solution(fit, noise, prices, error, steered), around=around)
 
 
-def unfinished_solution(found: AnnealedFit) -> Solution:
+def _prices_beside(fit: TrajectoryFit, noise: Noise) -> Float[np.ndarray, " free"]:
+    """Prices of the terms for samples whose noise is correlated in time."""
+    return term_prices(fit.problem, fit.problem.n_samples * float(noise.independent.mean()))
+
+
+def unfinished_solution(fit: TrajectoryFit) -> Solution:
     """What a search that was ended on its way has, whose states still leave the flow."""
-    noise = noise_beside(found.problem, found.fit)
-    n_independent = found.problem.n_samples * float(noise.independent.mean())
-    return _exact_solution(
-        found, noise, term_prices(found.problem, n_independent), found.level.rho, 0.0
-    )
+    noise = noise_beside(fit)
+    return _exact_solution(fit, noise, _prices_beside(fit, noise), fit.level.rho, 0.0)
 
 
 def _exact_solution(
-    found: AnnealedFit, noise: Noise, prices: np.ndarray, error: float, steered: float
+    fit: TrajectoryFit, noise: Noise, prices: np.ndarray, error: float, steered: float
 ) -> Solution:
     """The solution of a trajectory without process noise, and its tests."""
     none = np.zeros(len(noise.std))
     apart = np.exp(min(steered, 100.0) / 2.0)
     tests = (
         LackOfFit(
-            none + found.fit.total,
+            none + fit.total,
             float(np.finfo(np.float64).max),
             "whatever was tried runs away between two samples",
         ),
@@ -155,198 +146,181 @@ def _exact_solution(
         LackOfFit(
             noise.patterned, 0.0, "what is left of {state} holds a line or follows the states"
         ),
-        LackOfFit(astray(found), ASTRAY, "{state} does not follow its own equation"),
+        LackOfFit(astray(fit), ASTRAY, "{state} does not follow its own equation"),
     )  # fmt: skip
     return Solution(
-        problem=found.problem,
-        fit=found.fit,
-        level=found.level,
+        fit=fit,
         observation=Observation(noise, none, none),
         prices=prices,
         deviance=noise.deviance,
         tests=tests,
         flow_error=error,
-        around=found.around,
     )
 
 
-def astray(found: AnnealedFit) -> Float[np.ndarray, " d"]:
+def astray(fit: TrajectoryFit) -> Float[np.ndarray, " d"]:
     """RMS miss of the flow of hidden states, as a share of their steps; zero for measured ones.
 
     One that has become very small leaves the flow freely, and large coefficients make it count.
     """
-    defects, steps = squares_of_steps(found.problem, found.fit, found.level)
+    defects, steps = squares_of_steps(fit)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(defects > 0.0, np.sqrt(defects / steps), defects)
-    return np.where(found.problem.measured, 0.0, share)
+    return np.where(fit.problem.measured, 0.0, share)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
 def squares_of_steps(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
+    fit: TrajectoryFit,
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
     """Sums of squares, by state: of what the flow from each sample misses, and of the steps."""
-    record, path = problem.all_records, joined(fit.paths)
+    record, path, n = fit.problem.all_records, fit.path, fit.level.n_substeps
     steps = np.diff(path, axis=0)
-    missed = problem.ends(record, path[:-1], fit.free, level.n_substeps) - path[1:]
+    missed = fit.problem.ends(record, path[:-1], fit.free, n) - path[1:]
     missed[record.breaks] = steps[record.breaks] = 0.0
     return np.square(missed).sum(axis=0), np.square(steps).sum(axis=0)
 
 
-@dataclass(frozen=True, eq=False)
-class AnnealedFit:
-    """A fit, the level that it ended at, and its score: the squares plus the prices of its terms.
-
-    around: linearisation about the fit at the level where its support was compared with others.
-    """
-
-    problem: EstimationProblem
-    fit: TrajectoryFit
-    level: Level
-    score: float
-    around: DelayedGram | None = None
+def _penalised(fit: TrajectoryFit, prices: Float[np.ndarray, " free"]) -> float:
+    """The squares plus the prices of the terms, which decide between supports at one level."""
+    return float(fit.total + prices[fit.support].sum())
 
 
 def anneal(
-    problem: EstimationProblem,
     fit: TrajectoryFit,
-    noise: tuple[np.ndarray, ...],
     prices: Float[np.ndarray, " free"],
     schedule: Sequence[tuple[float, float]],
     *,
     max_terms: int,
-) -> AnnealedFit:
-    """Fit level by level; at each level, exchange terms as long as squares plus prices fall."""
-    n_substeps, score = 1, np.inf
+) -> TrajectoryFit:
+    """Fit level by level; at each level, exchange terms as long as squares plus prices fall.
+
+    The noise is that of the fit's level.
+    """
+    watch, level = fit.problem.watch, replace(fit.level, n_substeps=1, push=None)
     for rho, share in schedule:
-        fit, level = at_level(problem, fit, Level(noise, rho, n_substeps))
-        n_substeps = level.n_substeps
-        fit, score = exchange_terms(problem, fit, level, share * prices, max_terms)
-        found = AnnealedFit(problem, fit, level, score)
-        if not isinstance(problem.watch.best, Solution):
-            problem.watch.best = found
-    return found
+        fit = at_level(fit, replace(level, rho=rho))
+        level = fit.level
+        fit = exchange_terms(fit, share * prices, max_terms)
+        if not isinstance(watch.best, Solution):
+            watch.best = fit
+    return fit
 
 
 def polish(
-    found: AnnealedFit, prices: Float[np.ndarray, " free"], *, max_terms: int
-) -> AnnealedFit:
+    fit: TrajectoryFit, prices: Float[np.ndarray, " free"], *, max_terms: int
+) -> tuple[TrajectoryFit, DelayedGram | None]:
     """Refit each support that is nearly as likely by the linear model, and keep a likelier one.
 
-    A fit that does not follow its samples is returned unchanged: its linearisation tells nothing.
+    Returns the linearisation in which none is likelier too; None if it tells nothing, as about a
+    fit that does not follow its samples.
     """
-    problem = found.problem
-    if not found.fit.total < FAR * problem.n_squares:
-        return found
-    fit, cold = at_level(problem, found.fit, found.level)
-    found = AnnealedFit(problem, fit, cold, float(fit.total + prices[fit.support].sum()))
-    tried = {found.fit.support.tobytes()}
+    problem = fit.problem
+    if not fit.total < FAR * problem.n_squares:
+        return fit, None
+    fit = at_level(fit, fit.level)
+    tried = {fit.support.tobytes()}
     for _ in range(MAX_ROUNDS):
-        warmer, level = at_level(problem, found.fit, replace(found.level, rho=WEIGHED_AT))
-        around = delayed_gram(problem, warmer, level)
-        pair = around.at_rest
-        if not (pair.finite and np.isfinite(found.score)):
-            return found
+        warm = at_level(fit, replace(fit.level, rho=WEIGHED_AT))
+        around = delayed_gram(warm)
+        if not (around.at_rest.finite and np.isfinite(fit.total)):
+            break
         others = alternatives(
-            problem, pair, prices, warmer.support, within=WITHIN, max_terms=max_terms
+            problem, around.at_rest, prices, warm.support, within=WITHIN, max_terms=max_terms
         )
         others = [each for each in others if each.support.tobytes() not in tried]
         for each in others[:MAX_TRIED]:
             tried.add(each.support.tobytes())
-            start = replace(warmer, support=each.support, free=each.free)
-            fit, cold = at_level(problem, start, level)
-            fit, cold = at_level(problem, fit, replace(cold, rho=found.level.rho))
-            score = float(fit.total + prices[fit.support].sum())
-            if score < found.score and parting(problem, fit, cold) < STEERED:
-                found = AnnealedFit(problem, fit, cold, score)
+            other = at_level(replace(warm, support=each.support, free=each.free), warm.level)
+            other = at_level(other, replace(other.level, rho=fit.level.rho))
+            if _is_likelier(other, fit, prices):
+                fit = other
                 break
         else:
-            return replace(found, around=around)
-    return found
+            return fit, around
+    return fit, None
+
+
+def _is_likelier(
+    fit: TrajectoryFit, than: TrajectoryFit, prices: Float[np.ndarray, " free"]
+) -> bool:
+    """True if a fit is likelier, prices included, and does not live on steering its path."""
+    return _penalised(fit, prices) < _penalised(than, prices) and parting(fit) < STEERED
 
 
 def reheat(
-    found: AnnealedFit, prices: Float[np.ndarray, " free"], *, max_terms: int
-) -> AnnealedFit:
+    fit: TrajectoryFit,
+    around: DelayedGram | None,
+    prices: Float[np.ndarray, " free"],
+    *,
+    max_terms: int,
+) -> tuple[TrajectoryFit, DelayedGram | None]:
     """Anneal again if states that are let go show a better support; the likelier of both.
 
     Exchanges between nearly exact flows cannot leave a wrong optimum of many terms. Free states
     hide part of what a term explains, so a support counts as better there only if it explains more
-    by no more terms.
+    by no more terms. around: of the fit, see `polish`.
     """
-    problem = found.problem
-    if not found.fit.total < FAR * problem.n_squares:
-        return found
+    if not fit.total < FAR * fit.problem.n_squares:
+        return fit, around
     rho, share = REHEATED
-    warm, level = at_level(problem, found.fit, replace(found.level, rho=rho))
-    pair = gram(problem, warm, level)
-    if not (pair.finite and np.isfinite(found.score)):
-        return found
-    cheap = share * prices
+    warm = at_level(fit, replace(fit.level, rho=rho))
+    pair, cheap = gram(warm), share * prices
+    if not pair.finite:
+        return fit, around
     here = penalise(pair, warm.support, cheap)
-    other = best_support(problem, pair, cheap, warm.support, max_terms=max_terms)
+    other = best_support(fit.problem, pair, cheap, warm.support, max_terms=max_terms)
     n_more = int(other.support.sum()) - int(here.support.sum())
     gain = here.score - other.score - float(cheap[here.support].sum() - cheap[other.support].sum())
     if n_more > 0 or gain < EXPLAINS_MORE:
-        return found
+        return fit, around
     start = replace(warm, support=other.support, free=other.free)
-    schedule = (*COOLING, COLD[-1])
-    again = anneal(problem, start, found.level.noise, prices, schedule, max_terms=max_terms)
-    again = polish(again, prices, max_terms=max_terms)
-    likelier = again.score < found.score and parting(problem, again.fit, again.level) < STEERED
-    return again if likelier else found
+    again = anneal(start, prices, (*COOLING, COLD[-1]), max_terms=max_terms)
+    again, beside = polish(again, prices, max_terms=max_terms)
+    return (again, beside) if _is_likelier(again, fit, prices) else (fit, around)
 
 
-def at_level(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[TrajectoryFit, Level]:
+def at_level(fit: TrajectoryFit, level: Level) -> TrajectoryFit:
     """Fit at a level, with as many substeps as it needs."""
-    level = replace(level, n_substeps=enough_substeps(problem, fit, level))
-    if not np.isfinite(squares(problem, fit.paths, fit.free, level)).all():
+    n_substeps = enough_substeps(replace(fit, level=level))
+    fit = replace(fit, level=replace(level, n_substeps=n_substeps))
+    if not np.isfinite(fit.squares).all():
         fit = replace(fit, free=np.zeros_like(fit.free))  # the zero flow is finite
-    return fit_paths(problem, fit, level), level
+    return fit_paths(fit)
 
 
 def exchange_terms(
-    problem: EstimationProblem,
-    fit: TrajectoryFit,
-    level: Level,
-    prices: Float[np.ndarray, " free"],
-    max_terms: int,
-) -> tuple[TrajectoryFit, float]:
+    fit: TrajectoryFit, prices: Float[np.ndarray, " free"], max_terms: int
+) -> TrajectoryFit:
     """Exchange terms by the Gram matrix, refit, and accept any fall of squares plus prices."""
-    score = fit.total + prices[fit.support].sum()
+    problem = fit.problem
     for _ in range(MAX_EXCHANGES):
-        pair = gram(problem, fit, level)
+        pair, score = gram(fit), _penalised(fit, prices)
         if not (pair.finite and np.isfinite(score)):
             break
         found = best_support(problem, pair, prices, fit.support, max_terms=max_terms)
         if np.array_equal(found.support, fit.support):
             break
-        tried = fit_paths(problem, replace(fit, support=found.support, free=found.free), level)
-        tried_score = tried.total + prices[tried.support].sum()
+        tried = fit_paths(replace(fit, support=found.support, free=found.free))
         too_large = excess(problem, fit.support, max_terms) > 0
-        if not (tried_score < score or (too_large and np.isfinite(tried_score))):
+        if not (_penalised(tried, prices) < score or (too_large and np.isfinite(tried.total))):
             break
-        fit, score = tried, tried_score
-    return fit, float(score)
+        fit = tried
+    return fit
 
 
-def start_from_smooth(
-    problem: EstimationProblem, log10_ratio: float | None
-) -> tuple[TrajectoryFit, tuple[np.ndarray, ...]]:
+def start_from_smooth(problem: EstimationProblem, log10_ratio: float | None) -> TrajectoryFit:
     """Start on smoothed states with all coefficients free.
 
     log10_ratio: of the smoother, process to measurement noise; None takes the most likely ratio of
     each record and state. Below about twenty samples a period this ratio may take signal for noise.
-    Returns the fit, and the residuals' standard deviations, by record (samples, d).
+    The noise of its level is that of the residuals.
     """
     start = smoothed(problem, log10_ratio)
-    values = np.concatenate([joined(start.paths), problem.all_records.inputs], axis=1)
-    free = _regress(problem, problem.library.evaluate(values), joined(start.rates))
+    values = np.concatenate([start.path, problem.all_records.inputs], axis=1)
+    free = _regress(problem, problem.library.evaluate(values), start.rates)
     support = np.ones(problem.n_free, dtype=np.bool_)
-    fit = TrajectoryFit(start.paths, free, support, np.full(len(problem.states), np.inf))
-    return fit, start.noise
+    return TrajectoryFit(problem, Level(start.noise, 1.0), start.path, free, support)
 
 
 def _estimated(
@@ -372,38 +346,35 @@ def _estimated(
     return replace(found, smoothed=smooth, derivative=rates, noise_std=std)
 
 
-@dataclass(frozen=True, eq=False)
-class Smoothed:
-    """Smoothed states, their rates, and standard deviations of the noise, by record (samples, d).
+class Smoothed(NamedTuple):
+    """Smoothed states, in the domains of the library's functions, their rates, and the noise.
 
-    They lie in the domains of the library's functions.
+    noise: standard deviations at all samples.
     """
 
-    paths: tuple[np.ndarray, ...]
-    rates: tuple[np.ndarray, ...]
-    noise: tuple[np.ndarray, ...]
+    path: Float[np.ndarray, "samples d"]
+    rates: Float[np.ndarray, "samples d"]
+    noise: Float[np.ndarray, "samples d"]
 
 
 def smoothed(problem: EstimationProblem, log10_ratio: float | None) -> Smoothed:
     """Smooth the samples; log10_ratio as in `start_from_smooth`."""
-    estimates = []
+    estimates, paths = [], []
     for record in problem.records:
         problem.watch.look()
-        estimates.append(_estimated(problem, record, log10_ratio))
-    variance = np.mean([np.square(e.noise_std) for e in estimates], axis=0)
-    paths = []
-    for each, record in zip(estimates, problem.records, strict=True):
-        samples = np.concatenate([record.samples, record.inputs], axis=1)
-        values = np.concatenate([each.smoothed, record.inputs], axis=1)
+        each = _estimated(problem, record, log10_ratio)
+        samples, values = (
+            np.concatenate([states, record.inputs], axis=1)
+            for states in (record.samples, each.smoothed)
+        )
         inside = keep_inside(problem.library, values, noise_inside(problem.library, samples))
+        estimates.append(each)
         paths.append(inside[:, : len(problem.states)])
+    variance = np.mean([np.square(each.noise_std) for each in estimates], axis=0)
     std = np.maximum(np.sqrt(variance), FLOOR if log10_ratio is None else UNSURE)
     std[~problem.measured] = std[problem.measured].mean()
-    return Smoothed(
-        paths=tuple(paths),
-        rates=tuple(each.derivative for each in estimates),
-        noise=tuple(np.tile(std, (len(path), 1)) for path in paths),
-    )
+    rates = np.concatenate([each.derivative for each in estimates])
+    return Smoothed(np.concatenate(paths), rates, np.tile(std, (len(rates), 1)))
 
 
 def _regress(

@@ -25,8 +25,7 @@ def unobserved_state(problem: EstimationProblem) -> str:
     if problem.driven or d > 2 or not problem.measured.all():
         return ""
     start = smoothed(problem, None)
-    noise = start.noise[0][0]
-    paths = [_clear_steps(path / noise) for path in start.paths]
+    paths = [_clear_steps(path) for path in problem.split(start.path / start.noise)]
     name = problem.states[0]
     if d == 1 and sum(_turns(path[:, 0]) for path in paths) >= LEAST_CROSSINGS:
         return f"{name} passes the same values up and down, which no law of {name} alone does"

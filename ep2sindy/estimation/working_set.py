@@ -8,7 +8,6 @@ slowly with those of the library.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +22,6 @@ from ep2sindy.estimation.likelihood import (
     Linearised,
     TrajectoryFit,
     hessian_on,
-    joined,
     observe,
 )
 from ep2sindy.estimation.problem import EstimationProblem
@@ -90,11 +88,13 @@ def with_entrances(found: Solution, *, max_terms: int) -> Solution:
         whole = problem.restricted(larger)
         widened = replace(
             fit,
+            problem=whole,
+            level=replace(fit.level, noise=found.noise.effective),
             free=_spread(fit.free, kept)[larger],
             support=_spread(fit.support, kept)[larger] | entering[larger],
         )
         with problem.watch.stage(_weighed(whole)):
-            tried = settle(whole, widened, found.noise.effective, max_terms=max_terms)
+            tried = settle(widened, max_terms=max_terms)
         if tried.rank >= found.rank:
             break
         found = problem.watch.best = tried
@@ -117,7 +117,7 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
     if problem.C is not None or not problem.measured.all() or (sizes <= SMALL).all():
         return np.ones_like(kept)
     start = smoothed(problem, None)
-    steps = _integrals(problem, start.paths)
+    steps = _integrals(problem, start.path)
     for block in np.flatnonzero(sizes).tolist():
         own = np.flatnonzero((problem.block == block) & ~problem.required)
         if len(own) <= SMALL:
@@ -125,7 +125,8 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
             continue
         for rho in WARM:
             level = Level(start.noise, rho)
-            quadratic, linear, offset = _own_squares(problem, start.paths, level, steps, block, own)
+            fit = TrajectoryFit(problem, level, start.path, np.zeros(problem.n_free), kept)
+            quadratic, linear, offset = _own_squares(fit, steps, block, own)
             size = np.sqrt(zero_to_one(np.diag(quadratic)))
             masks = exchanged_supports(
                 (quadratic / np.outer(size, size))[None],
@@ -153,13 +154,13 @@ def _mimicked(
 
 
 def _integrals(
-    problem: EstimationProblem, paths: Sequence[Float[np.ndarray, "samples d"]]
+    problem: EstimationProblem, path: Float[np.ndarray, "samples d"]
 ) -> Float[np.ndarray, "steps terms"]:
     """Integral of every term over each step along all paths, by the trapezoidal rule.
 
     It is zero from one path to the next. A term that overflows is not available: zero.
     """
-    record, path = problem.all_records, joined(paths)
+    record = problem.all_records
     with np.errstate(over="ignore", invalid="ignore"):
         ends = [
             problem.library.evaluate(np.concatenate([states, record.inputs_at(share)], axis=1))
@@ -171,9 +172,7 @@ def _integrals(
 
 @np.errstate(over="ignore", invalid="ignore")  # a term that overflows is not chosen
 def _own_squares(
-    problem: EstimationProblem,
-    paths: tuple[np.ndarray, ...],
-    level: Level,
+    fit: TrajectoryFit,
     steps: Float[np.ndarray, "steps terms"],
     block: int,
     own: np.ndarray,
@@ -182,15 +181,15 @@ def _own_squares(
 
     steps: integrals of the terms over each step. Returns the parts of `likelihood.Gram`.
     """
-    record, path, one = problem.all_records, joined(paths), slice(block, block + 1)
-    columns = steps[:, problem.column[own]]
+    record, path, one = fit.problem.all_records, fit.path, slice(block, block + 1)
+    columns = steps[:, fit.problem.column[own]]
     flow = np.concatenate([np.ones((len(columns), 1)), columns], axis=1)[:, None]
-    residuals, apparent, _ = observe(record, path, level.variance)
+    residuals, apparent, _ = observe(record, path, np.square(fit.level.noise))
     misses = -np.diff(path[:, one], axis=0)
     flow[record.breaks] = misses[record.breaks] = 0.0
     quadratic, linear, offset, _ = eliminate(
         np.ascontiguousarray(flow), misses, np.ascontiguousarray(residuals[:, one]),
-        np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(level.process[:, one]),
+        np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(fit.process[:, one]),
         FREE_START,
     )  # fmt: skip
     tells = np.isfinite(np.diag(quadratic)) & np.isfinite(linear)
@@ -213,10 +212,8 @@ def _would_pay(
     enters = np.zeros_like(kept)
     if kept.all() or not np.isfinite(found.score):
         return enters
-    part = found.problem
-    fit, level = at_level(part, found.fit, replace(found.level, rho=WEIGHED_AT))
-    gains = _gains(problem, part, fit, level)
-    gains -= term_prices(problem, float(part.n_samples))
+    fit = at_level(found.fit, replace(found.fit.level, rho=WEIGHED_AT))
+    gains = _gains(problem, fit) - term_prices(problem, float(problem.n_samples))
     gains[kept] = -np.inf
     for block in range(len(problem.states)):
         own = np.flatnonzero((problem.block == block) & (gains > 0.0))
@@ -224,25 +221,20 @@ def _would_pay(
     return enters
 
 
-def _gains(
-    problem: EstimationProblem,
-    part: EstimationProblem,
-    fit: TrajectoryFit,
-    level: Level,
-) -> Float[np.ndarray, " free"]:
+def _gains(problem: EstimationProblem, fit: TrajectoryFit) -> Float[np.ndarray, " free"]:
     """Fall of the squares that each coefficient by itself would bring, to first order."""
-    quadratic, _, _, about = hessian_on(part, fit, fit.support, level)
+    quadratic, _, _, about = hessian_on(fit, fit.support)
     if not np.isfinite(quadratic).all():
         return np.zeros(problem.n_free)
     # Neither terms nor slopes lead from one record to the next, whatever is missed there.
-    terms, std = _integrals(problem, fit.paths), joined(level.noise)
-    score = np.square(terms.T @ (about.defects / level.process))
+    terms, std = _integrals(problem, fit.path), fit.level.noise
+    score = np.square(terms.T @ (about.defects / about.process))
     with_states, with_all = np.zeros_like(score), np.zeros_like(score)
     rng, inverse = np.random.default_rng(0), inverse_of(quadratic)
     for _ in range(N_PROBES):
         noise = std * rng.standard_normal(std.shape)
         without = _weighted_misses(about, noise, np.zeros(len(inverse)))
-        gradient = np.einsum("kd,kds->s", without, about.slopes[:, :, len(part.states) :])
+        gradient = np.einsum("kd,kds->s", without, about.slopes[:, :, fit.path.shape[1] :])
         fitted = _weighted_misses(about, noise, -inverse @ gradient)
         with_states += np.square(terms.T @ without) / N_PROBES
         with_all += np.square(terms.T @ fitted) / N_PROBES

@@ -221,7 +221,7 @@ def track(
         model=model,
         problem=problem,
         free=free,
-        n_substeps=_substeps(problem, paths, free, rough),
+        n_substeps=enough_substeps(_as_fit(problem, paths, free, rough, rough)),
         per_period=_per_period(own, names),
         noise=_noise_of(problem, rough, 0.1 * rough),
     )
@@ -262,27 +262,26 @@ def _with_likely_noise(
     pairs = zip(tracker.problem.records, paths, strict=True)
     found = [(each, tracker.approach(each, path, samples, process)) for each, path in pairs]
     paths = [path for _, path in found]
-    fit, level = _as_fit(paths, tracker.free, samples, tracker.n_substeps)
-    level = replace(level, push=process)
-    likely = likely_errors(tracker.problem, fit, level)
+    n = tracker.n_substeps
+    fit = _as_fit(tracker.problem, paths, tracker.free, samples, process, n_substeps=n)
+    likely = likely_errors(fit)
     noise = _noise_of(tracker.problem, likely.samples, likely.process)
     return replace(tracker, noise=noise), paths
 
 
-def _substeps(
-    problem: EstimationProblem, paths: Sequence[np.ndarray], free: np.ndarray, noise: np.ndarray
-) -> int:
-    """Number of Runge-Kutta steps from one sample to the next."""
-    return enough_substeps(problem, *_as_fit(paths, free, noise, 1))
-
-
 def _as_fit(
-    paths: Sequence[np.ndarray], free: np.ndarray, noise: np.ndarray, n_substeps: int
-) -> tuple[TrajectoryFit, Level]:
-    """Paths of the records as a fit under noise of a size."""
-    level = Level(tuple(np.tile(noise, (len(path), 1)) for path in paths), 1.0, n_substeps)
-    everything = np.ones(len(free), dtype=np.bool_)
-    return TrajectoryFit(tuple(paths), free, everything, np.zeros(len(noise))), level
+    problem: EstimationProblem,
+    paths: Sequence[np.ndarray],
+    free: np.ndarray,
+    samples: np.ndarray,
+    process: np.ndarray,
+    *,
+    n_substeps: int = 1,
+) -> TrajectoryFit:
+    """Paths of all records as a fit under errors of these sizes."""
+    path = np.concatenate(paths)
+    level = Level(np.tile(samples, (len(path), 1)), 1.0, n_substeps, process)
+    return TrajectoryFit(problem, level, path, free, np.ones(len(free), dtype=np.bool_))
 
 
 def _variances(n: int, samples: np.ndarray, process: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
