@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -190,8 +191,9 @@ def estimate_task(
     tied = bool(task.relations or task.hidden or task.roles)
     bytes_each = check_size(task.runs, task.library, task.terms, tied=tied, limit_s=limit_s)
     watch, found, part = Watch(progress, limit_s), None, task.runs
+    settings = _Settings(max_terms, align, courses, watch)
     for larger in growing_parts(task.runs, bytes_each, watch):
-        latest = _answer(replace(task, runs=larger), max_terms, align, courses, watch)
+        latest = _answer(replace(task, runs=larger), settings)
         if found is None or not watch.ended:  # a larger part tells more, once it is done with
             found, part = latest, larger
     assert found is not None
@@ -214,19 +216,22 @@ def _held(answer: Explanation, task: Task, library: Library) -> Constraint | Non
     return constraint_of(library, task.states, played, task.roles.told)
 
 
-def _answer(
-    task: Task,
-    max_terms: int | None,
-    align: bool,
-    courses: Mapping[str, str] | None,
-    watch: Watch,
-) -> tuple[Explanation, Sequence[Trajectory]]:
+class _Settings(NamedTuple):
+    """Of a search, see `estimate`; watch: shows and limits it."""
+
+    max_terms: int | None
+    align: bool
+    courses: Mapping[str, str] | None
+    watch: Watch
+
+
+def _answer(task: Task, settings: _Settings) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task from all of its runs."""
-    best = []
+    best, watch = [], settings.watch
     for group in with_guesses(task) if task.hidden else [[(task, ())]]:
         tried = []
         for known, ways in group:
-            tried.append(_try(task, known, ways, max_terms, align, courses, watch))
+            tried.append(_try(task, known, ways, settings))
             if watch.ended:
                 break
         best.append(min(tried, key=lambda each: each[0].rank))
@@ -247,13 +252,7 @@ def _part_words(
 
 
 def _try(
-    task: Task,
-    known: Task,
-    ways: Sequence[Entrance],
-    max_terms: int | None,
-    align: bool,
-    courses: Mapping[str, str] | None,
-    watch: Watch,
+    task: Task, known: Task, ways: Sequence[Entrance], settings: _Settings
 ) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task by one way in which its hidden states may enter."""
     check_runs(known)
@@ -262,13 +261,14 @@ def _try(
     def problem_of(library: Library) -> EstimationProblem:
         return scale_problem(
             known.runs, library, known.relations, known.terms, measured=measured,
-            exclude=known.exclude, courses=courses, roles=known.roles, watch=watch,
+            exclude=known.exclude, courses=settings.courses, roles=known.roles,
+            watch=settings.watch,
         )  # fmt: skip
 
     problem = replace(
         problem_of(known.library), widen=lambda: problem_of(_with_degree_more(known.library))
     )
-    found = explain(problem, max_terms=max_terms, align=align)
+    found = explain(problem, max_terms=settings.max_terms, align=settings.align)
     said = (*_lonely_words(known.runs, problem), *(way.words for way in ways), *found.said)
     return replace(found, said=said), known.runs
 

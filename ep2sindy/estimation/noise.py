@@ -192,9 +192,16 @@ def _pulls(fit: TrajectoryFit, std: Float[np.ndarray, " d"]) -> Float[np.ndarray
 
 def _memory(left: Sequence[Float[np.ndarray, "samples d"]]) -> Float[np.ndarray, " d"]:
     """Correlation of residuals from one sample to the next."""
-    squares = sum(np.square(e).sum(axis=0) for e in left)
-    lagged = sum((e[1:] * e[:-1]).sum(axis=0) for e in left)
-    return np.clip(lagged / np.maximum(squares, TINY), 0.0, MAX_LASTING)
+    return np.clip(autocorrelations(left, [1])[0], 0.0, MAX_LASTING)
+
+
+def autocorrelations(
+    pieces: Sequence[Float[np.ndarray, "samples d"]], lags: Sequence[int]
+) -> Float[np.ndarray, "lags d"]:
+    """Correlations of pieces of a record with themselves some samples later."""
+    squares = sum(np.square(e).sum(axis=0) for e in pieces)
+    products = [sum((e[lag:] * e[:-lag]).sum(axis=0) for e in pieces) for lag in lags]
+    return np.array(products) / np.maximum(squares, TINY)
 
 
 def _shape(
@@ -281,12 +288,8 @@ def _forgets(
 
     The error of a model on a signal with white noise stays correlated over longer lags.
     """
-    squares = sum(np.square(e).sum(axis=0) for e in left)
-    faster = np.ones(len(memory), dtype=np.bool_)
-    for lag in LAGS:
-        products = sum((e[lag:] * e[:-lag]).sum(axis=0) for e in left)
-        faster &= products / np.maximum(squares, TINY) - memory**lag < LONGER / np.sqrt(n)
-    return faster
+    excess = autocorrelations(left, LAGS) - memory ** np.array(LAGS)[:, None]
+    return np.all(excess < LONGER / np.sqrt(n), axis=0)
 
 
 def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray]) -> Bool[np.ndarray, " d"]:
@@ -313,16 +316,25 @@ def _follow_states(
 ) -> Bool[np.ndarray, " d"]:
     """True if products of the states explain more of the residuals than they would of noise.
 
-    What a library lacks is a function of the states, also where it lasts as noise does. The squares
-    that random residuals share with the products are expected from the squares of each sample
-    alone, so neither outliers nor noise that grows with the state pass for such a function.
+    What a library lacks is a function of the states, also where it lasts as noise does.
     """
     degree = int(fit.problem.candidates.library.degrees.max()) + MORE_DEGREES
     powers = powers_of(np.column_stack([fit.path, fit.problem.all_records.inputs]), degree)
-    basis, joined = np.linalg.qr(powers)[0], np.concatenate(new)
-    shared = np.square(basis.T @ joined).sum(axis=0)
-    expected = np.square(basis).sum(axis=1) @ np.square(joined)
-    return shared - expected > FOLLOWS * np.sqrt(2.0 / basis.shape[1]) * expected
+    return excess_explained(powers, np.concatenate(new)) > FOLLOWS
+
+
+def excess_explained(
+    columns: Float[np.ndarray, "samples columns"], residuals: Float[np.ndarray, "samples d"]
+) -> Float[np.ndarray, " d"]:
+    """How much more columns explain of residuals than of random ones, in standard errors.
+
+    The squares that random residuals share with the columns are expected from the squares of each
+    sample alone, so neither outliers nor noise that grows with the state pass for a function.
+    """
+    basis = np.linalg.qr(columns)[0]
+    shared = np.square(basis.T @ residuals).sum(axis=0)
+    expected = np.maximum(np.square(basis).sum(axis=1) @ np.square(residuals), TINY)
+    return (shared / expected - 1.0) * np.sqrt(basis.shape[1] / 2.0)
 
 
 def powers_of(states: Float[np.ndarray, "samples d"], degree: int) -> np.ndarray:

@@ -7,7 +7,7 @@ against this stochastic model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +15,13 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.kernels import eliminate, filtered
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, linearise
-from ep2sindy.estimation.noise import MORE_DEGREES, noise_beside, powers_of
+from ep2sindy.estimation.noise import (
+    MORE_DEGREES,
+    autocorrelations,
+    excess_explained,
+    noise_beside,
+    powers_of,
+)
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.solution import LackOfFit, Observation, Solution
 from ep2sindy.estimation.solver import (
@@ -40,17 +46,11 @@ MOST_MISSED = 3.0  # RMS miss of a step, in pushes: the likeliest pushes are sma
 SETTLING = 5  # samples from whose start on innovations count
 
 
-@dataclass(frozen=True, eq=False)
-class Errors:
-    """Standard deviations of noise and pushes by state, scaled; deviance: -2 log likelihood."""
+def likely_errors(fit: TrajectoryFit) -> tuple[Level, float]:
+    """The likeliest noise and pushes about the path of a fit, and their -2 log likelihood.
 
-    samples: Float[np.ndarray, " d"]
-    process: Float[np.ndarray, " d"]
-    deviance: float
-
-
-def likely_errors(fit: TrajectoryFit) -> Errors:
-    """The likeliest noise and pushes about the path of a fit, from those of its level on."""
+    The search for them starts from those of the fit's level.
+    """
     from scipy.optimize import minimize  # imported only to estimate errors
 
     measured, level, about = fit.problem.measured, fit.level, linearise(fit)
@@ -82,8 +82,7 @@ def likely_errors(fit: TrajectoryFit) -> Errors:
             "xatol": 0.05,
         },
     )
-    likely = level_of(found.x)
-    return Errors(likely.noise[0], likely.push, float(found.fun))
+    return level_of(found.x), float(found.fun)
 
 
 def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> Solution:
@@ -93,34 +92,34 @@ def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> S
     level = fit.level.with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
     for share in SHARES:
         fit = exchange_terms(at_level(fit, level), share * prices, max_terms)
-        errors = likely_errors(fit)
-        level = level.with_errors(errors.samples, errors.process)
+        level, deviance = likely_errors(fit)
+    process = level.push
     fit = at_level(fit, level)
     noise, none = noise_beside(fit), np.zeros(len(problem.states))
     explained = replace(
         noise,
-        std=errors.samples,
+        std=level.noise[0],
         memory=none,
         unexplained=none,
         patterned=none > 0.0,
-        deviance=errors.deviance,
+        deviance=deviance,
     )
     return Solution(
         fit=fit,
-        observation=Observation(explained, none, errors.process),
+        observation=Observation(explained, none, process),
         prices=prices,
-        deviance=errors.deviance,
-        tests=(_defects_of_steps(fit, errors), *_left_over(fit)),
+        deviance=deviance,
+        tests=(_defects_of_steps(fit), *_left_over(fit)),
     )
 
 
-def _defects_of_steps(fit: TrajectoryFit, errors: Errors) -> LackOfFit:
+def _defects_of_steps(fit: TrajectoryFit) -> LackOfFit:
     """RMS of the steps that a path misses, in what process noise and noise allow.
 
     Infinite for a state without a law: one whose equation has no term, which noise alone moves.
     """
     missed = squares_of_steps(fit)[0] / len(fit.path)
-    allowed = np.square(MOST_MISSED * errors.process) + np.square(EXACT * errors.samples)
+    allowed = np.square(MOST_MISSED * fit.level.push) + np.square(EXACT * fit.level.noise[0])
     moves = fit.problem.coef(fit.free).any(axis=0)
     return LackOfFit(np.where(moves, np.sqrt(missed / allowed), np.inf), 1.0)
 
@@ -148,16 +147,10 @@ def _left_over(fit: TrajectoryFit) -> list[LackOfFit]:
     joined = np.concatenate(new)
     if not (np.abs(joined) < RUNAWAY).all():
         return [LackOfFit(np.full(joined.shape[1], np.inf), MOST_SHOWN[0])]
-    size = np.maximum(np.linalg.norm(joined, axis=0), 1e-150)
-    products = [sum((own[lag:] * own[:-lag]).sum(axis=0) for own in new) for lag in LAGS]
-    root = np.sqrt(len(joined))
-    lasting = root * np.abs(products).max(axis=0) / np.square(size)
+    lasting = np.sqrt(len(joined)) * np.abs(autocorrelations(new, LAGS)).max(axis=0)
     before = np.concatenate([path[SETTLING - 1 : -1] for path in fit.paths])
     powers = powers_of(before, int(problem.candidates.library.degrees.max()) + MORE_DEGREES)
-    unit = root * joined / size
-    together = np.square(np.linalg.qr(powers)[0].T @ unit).sum(axis=0) - powers.shape[1]
-    single = _largest_share(fit, before, powers, unit)
-    shown = lasting, single, together / np.sqrt(2.0 * powers.shape[1])
+    shown = lasting, _largest_share(fit, before, powers, joined), excess_explained(powers, joined)
     return [LackOfFit(each, most) for each, most in zip(shown, MOST_SHOWN, strict=True)]
 
 
@@ -165,9 +158,10 @@ def _largest_share(
     fit: TrajectoryFit,
     before: Float[np.ndarray, "samples d"],
     powers: Float[np.ndarray, "samples _"],
-    unit: Float[np.ndarray, "samples d"],
+    new: Float[np.ndarray, "samples d"],
 ) -> Float[np.ndarray, " d"]:
-    """The most that one of the powers explains of unit innovations beside an equation's terms."""
+    """The most that one of the powers explains of innovations beside an equation's terms."""
+    unit = np.sqrt(len(new)) * new / np.maximum(np.linalg.norm(new, axis=0), 1e-150)
     problem, found = fit.problem, np.zeros(unit.shape[1])
     used = problem.coef(fit.free) != 0.0
     inputs = np.concatenate([r.inputs[SETTLING - 1 : -1] for r in problem.records])

@@ -76,19 +76,18 @@ def from_smooth(
 
     log10_ratio: of the smoother, see `start_from_smooth`.
     """
-    start = start_from_smooth(problem, log10_ratio)
-    prices = term_prices(problem, float(problem.n_samples))
-    return _settle(anneal(start, prices, COOLING, max_terms=max_terms), max_terms)
+    return settle(start_from_smooth(problem, log10_ratio), COOLING, max_terms=max_terms)
 
 
-def settle(start: TrajectoryFit, *, max_terms: int) -> Solution:
-    """The exact solution near a fit whose states leave the flow a little."""
+def settle(
+    start: TrajectoryFit, schedule: Sequence[tuple[float, float]] = COLD, *, max_terms: int
+) -> Solution:
+    """The exact solution near a fit whose states leave the flow.
+
+    Anneals again until noise and support agree, and compares with what is nearly as likely.
+    """
     prices = term_prices(start.problem, float(start.problem.n_samples))
-    return _settle(anneal(start, prices, COLD, max_terms=max_terms), max_terms)
-
-
-def _settle(fit: TrajectoryFit, max_terms: int) -> Solution:
-    """Anneal again until noise and support agree, and compare with what is nearly as likely."""
+    fit = anneal(start, prices, schedule, max_terms=max_terms)
     for _ in range(MAX_PASSES):
         before, noise = fit.support, noise_beside(fit)
         prices = _prices_beside(fit, noise)
