@@ -23,15 +23,15 @@ from ep2sindy.estimation.likelihood import (
     Gram,
     Level,
     TrajectoryFit,
+    divergence_rate,
     fit_paths,
     gram,
     innovations,
-    parting,
 )
 from ep2sindy.estimation.noise import _shown_by_samples
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solution import LackOfFit, Solution
-from ep2sindy.estimation.solver import EXACT, from_smooth, smoothed, squares_of_steps
+from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states, squares_of_steps
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
@@ -56,7 +56,7 @@ def linear_case(
 
 def dense_rows(
     flow: np.ndarray,
-    misses: np.ndarray,
+    defects: np.ndarray,
     residuals: np.ndarray,
     variance: np.ndarray,
     process: np.ndarray,
@@ -70,12 +70,12 @@ def dense_rows(
     rows = [
         states[0] / np.sqrt(free_start),
         (states / np.sqrt(variance)[..., None])[seen],
-        (steps / np.sqrt(process)[..., None]).reshape(misses.size, -1),
+        (steps / np.sqrt(process)[..., None]).reshape(defects.size, -1),
     ]
     targets = [
         np.zeros(d),
         (residuals / np.sqrt(variance))[seen],
-        (misses / np.sqrt(process)).ravel(),
+        (defects / np.sqrt(process)).ravel(),
     ]
     return np.concatenate(rows), np.concatenate(targets)
 
@@ -97,9 +97,9 @@ def test_the_spread_of_innovations_is_the_determinant_of_the_samples(
     rng: np.random.Generator, n: int, size: float
 ) -> None:
     """Products of many small variances would leave the range of numbers."""
-    flow, misses, residuals, variance, process = linear_case(rng, n=n, p=0)
+    flow, defects, residuals, variance, process = linear_case(rng, n=n, p=0)
     flow, variance, process = flow / 3.0, size * variance, size * process
-    _, _, _, log_spread = eliminate(flow, misses, residuals, variance, process, 10.0)
+    _, _, _, log_spread = eliminate(flow, defects, residuals, variance, process, 10.0)
     n, d = residuals.shape
     # Covariance of all states, from the first one's and the steps'.
     to = np.zeros((n * d, n * d))
@@ -140,10 +140,10 @@ def test_the_last_state_of_the_filter_is_that_of_the_dense_problem(
 
 
 def test_departures_are_those_of_the_dense_problem(rng: np.random.Generator) -> None:
-    flow, misses, residuals, variance, process = linear_case(rng, p=0)
-    rows, targets = dense_rows(flow, misses, residuals, variance, process, 10.0)
+    flow, defects, residuals, variance, process = linear_case(rng, p=0)
+    rows, targets = dense_rows(flow, defects, residuals, variance, process, 10.0)
     expected = np.linalg.lstsq(rows, targets, rcond=None)[0].reshape(residuals.shape)
-    found = departures(flow, misses, residuals, variance, process, 10.0)
+    found = departures(flow, defects, residuals, variance, process, 10.0)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
@@ -235,7 +235,7 @@ def test_paths_of_the_same_record_twice_part_as_fast_as_of_one() -> None:
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 200)
     for runs in ([run], [run, run]):
         problem = scale_problem(runs, ep.lorenz().model.library)
-        found.append(parting(fit_of_truth(problem, ep.lorenz().model, 0.01)))
+        found.append(divergence_rate(fit_of_truth(problem, ep.lorenz().model, 0.01)))
     assert found[0] > 0.001
     assert found[1] == pytest.approx(found[0], rel=1e-9)
 
@@ -285,7 +285,7 @@ def test_alternatives_hold_an_exchange_between_equations_that_neither_wants_alon
 
 
 def test_a_near_miss_of_the_search_is_polished() -> None:
-    system, run = noisy("van_der_pol", 0.4, 45)  # annealed only, y^3 and x^2*y stand for x
+    system, run = noisy("van_der_pol", 0.4, 45)  # by continuation alone, y^3 and x^2*y stand for x
     assert is_right(ep.estimate([run], system.model.library).model, system)
 
 
@@ -583,12 +583,12 @@ def three_runs(rng: np.random.Generator) -> TrajectoryFit:
     return TrajectoryFit(problem, level, path, free, np.ones(len(free), dtype=bool))
 
 
-@pytest.mark.parametrize("push", [None, np.array([0.1, 0.2])])
+@pytest.mark.parametrize("process_noise", [None, np.array([0.1, 0.2])])
 def test_runs_are_joined_without_a_way_from_one_to_the_next(
-    rng: np.random.Generator, push: np.ndarray | None
+    rng: np.random.Generator, process_noise: np.ndarray | None
 ) -> None:
     fit = three_runs(rng)
-    problem, level = fit.problem, replace(fit.level, push=push)
+    problem, level = fit.problem, replace(fit.level, process_noise=process_noise)
     fit, change = replace(fit, level=level), 0.1 * rng.normal(size=problem.n_free)
 
     def parts_of(fit: TrajectoryFit) -> tuple:
@@ -701,21 +701,21 @@ def test_the_time_is_looked_at_within_a_step_of_a_fit() -> None:
         steps += n_more
 
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 100)
-    watch = cost.Watch(limit_s=1.0, clock=clock, advance=advance)
-    problem = scale_problem([run], ep.polynomial(run.state_names, degree=2), watch=watch)
+    monitor = cost.SearchMonitor(limit_s=1.0, clock=clock, advance=advance)
+    problem = scale_problem([run], ep.polynomial(run.state_names, degree=2), monitor=monitor)
     level = Level(np.full(run.states.shape, 0.1), 0.1)
     free, support = np.zeros(problem.n_free), np.ones(problem.n_free, dtype=bool)
     fit = TrajectoryFit(problem, level, problem.records[0].samples, free, support)
-    now, watch.best = 2, fit
+    now, monitor.best = 2, fit
     for one_pass in (
         lambda: fit.squares,
         lambda: gram(fit),
-        lambda: smoothed(problem, None),
+        lambda: smooth_states(problem, None),
     ):
         with pytest.raises(cost.OutOfTimeError, match="must end within limit_s=1 s"):
             one_pass()
     assert steps == 0
-    watch.best = None  # a first model is waited for
+    monitor.best = None  # a first model is waited for
     assert np.isfinite(fit.squares).all()
 
 
@@ -728,13 +728,13 @@ def test_a_search_with_a_limit_takes_parts_of_a_long_record_first(
     """Each is as much larger as the time allows, at the pace of the one before."""
     t, now, found = np.arange(1_000_000.0), 0.0, []
     run = ep.Trajectory(t, np.sin(0.01 * t)[:, None], ["x"])
-    watch = cost.Watch(limit_s=limit_s, clock=lambda: now)
-    for part in cost.growing_parts([run], 1.0, watch):
+    monitor = cost.SearchMonitor(limit_s=limit_s, clock=lambda: now)
+    for part in cost.growing_parts([run], 1.0, monitor):
         found.append(sum(each.n_samples for each in part))
         now += 2e-4 * found[-1]
         assert part[-1].t[-1] == t[-1]  # all of the record is seen
     np.testing.assert_allclose(found, sizes, rtol=0.02)  # whole blocks
-    (whole,) = cost.growing_parts([run], 1.0, cost.Watch())
+    (whole,) = cost.growing_parts([run], 1.0, cost.SearchMonitor())
     assert whole == [run]
 
 
@@ -796,7 +796,7 @@ def test_squares_whose_sum_overflows_are_infinite_and_warn_of_nothing() -> None:
 
 
 def test_a_path_that_misses_the_steps_of_its_model_is_no_trajectory() -> None:
-    """What annealing lets pass can hold a model up: y' = a x - b x z with b of 5e3, and z' = 0."""
+    """What the continuation lets pass may hold up a model: y' = a x - b x z, b = 5e3, z' = 0."""
     rng = np.random.default_rng([5, 300, 3])
     start = rng.uniform([-10.0, -10.0, 15.0], [10.0, 10.0, 30.0])
     run = LORENZ.trajectory(noise=0.2, rng=503, initial=start).window(0, 300)
@@ -818,7 +818,7 @@ def test_right_models_meet_their_steps() -> None:
 
 
 @pytest.mark.slow
-def test_pushes_alone_are_no_law() -> None:
+def test_process_noise_alone_is_no_law() -> None:
     found = ep.estimate(SHORT["60 samples, 20 %"](3), LORENZ.model.library)
     assert found.misfit or found.model.coef.any(axis=0).all()
 
@@ -826,6 +826,7 @@ def test_pushes_alone_are_no_law() -> None:
 def test_samples_that_leave_the_terms_open_are_said_to_tell_nothing() -> None:
     found = ep.estimate(SHORT["60 samples, 20 %"](0), LORENZ.model.library)
     assert re.match(
-        r"60 samples do not tell these equations from others: the chance .* is \d+%", found.few
+        r"60 samples do not tell these equations from others: the chance .* is \d+%",
+        found.too_few_samples,
     )
-    assert found.note.startswith(found.few)
+    assert found.note.startswith(found.too_few_samples)

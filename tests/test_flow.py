@@ -7,7 +7,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.estimation.flow import RightHandSides, Steps
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit, parting
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit, divergence_rate
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.model.flow_kernels import _advance
@@ -73,7 +73,7 @@ def test_paths_part_by_twice_the_positive_exponents(rate: float, expected: float
     free = np.array([0.0, rate])
     level = Level(np.full((400, 1), 0.1), 1e-4, n_substeps=4)
     fit = TrajectoryFit(problem, level, np.zeros((400, 1)), free, free != 0.0)
-    assert parting(fit) == pytest.approx(expected, abs=0.05)
+    assert divergence_rate(fit) == pytest.approx(expected, abs=0.05)
 
 
 def test_a_model_that_could_follow_any_samples_is_a_misfit() -> None:
@@ -83,9 +83,9 @@ def test_a_model_that_could_follow_any_samples_is_a_misfit() -> None:
     assert found.fits
     (apart,) = [test for test in found.tests if "paths beside" in test.words]
     assert (apart.statistic < np.exp(0.05 / 2.0)).all()
-    steered = replace(found, tests=(replace(apart, statistic=np.full(2, np.exp(4.0 / 2.0))),))
-    assert not steered.fits
-    (sign,) = steered.signs
+    diverging = replace(found, tests=(replace(apart, statistic=np.full(2, np.exp(4.0 / 2.0))),))
+    assert not diverging.fits
+    (sign,) = diverging.signs
     assert "part by a factor of 7.4 per sample, so it could follow any samples" in sign
 
 

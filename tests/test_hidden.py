@@ -12,7 +12,7 @@ from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_gue
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, hessian_on, observe
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import scale_problem
-from ep2sindy.estimation.solver import ASTRAY, astray
+from ep2sindy.estimation.solver import MAX_HIDDEN_DEFECT, hidden_defects
 from ep2sindy.library.relations import relations_of
 from tests.programs import composed, computed
 
@@ -184,8 +184,8 @@ def test_a_hidden_state_that_follows_nothing_is_astray() -> None:
         (still, False),
     ):
         path = np.column_stack([np.sin(np.arange(40.0)), hidden])
-        share = astray(TrajectoryFit(problem, cold, path, free, everything))
-        assert (share > ASTRAY).tolist() == [False, is_astray]
+        share = hidden_defects(TrajectoryFit(problem, cold, path, free, everything))
+        assert (share > MAX_HIDDEN_DEFECT).tolist() == [False, is_astray]
 
 
 def test_what_was_not_measured_counts_nothing() -> None:

@@ -113,10 +113,10 @@ def test_an_equation_that_is_closed_holds_beside_one_that_is_not() -> None:
     run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 1500)
     two = ep.Trajectory(run.t, run.states[:, :2], ["x", "y"])
     found = ep.estimate(two, ep.polynomial(["x", "y"], degree=2))
-    assert found.holds == ("x",)
+    assert found.explained_states == ("x",)
     assert found.misfit.startswith("no law of this library explains y: a term or a state is missi")
     assert found.model.terms("x") == pytest.approx({"x": -10.0, "y": 10.0}, rel=0.02)
-    assert found.push_std[1] > 5.0 * found.push_std[0]
+    assert found.process_noise_std[1] > 5.0 * found.process_noise_std[0]
     assert found.model.covariance is None
 
 

@@ -15,7 +15,7 @@ import ep2sindy as ep
 from benchmarks.spoilt import spoilt
 from ep2sindy.data.coerce import check_repeats
 from ep2sindy.data.sensor import bounds_of
-from ep2sindy.estimation.delay import delayed_gram, move_channels
+from ep2sindy.estimation.delay import delayed_gram, shift_channels
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, between, gram, observe
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.systems.systems import System
@@ -203,7 +203,7 @@ def test_without_delays_the_gram_pair_is_the_plain_one() -> None:
 def test_moved_samples_are_those_of_the_time_they_belong_to() -> None:
     late, _ = late_record((0.0, 1.5, -2.25))
     right, _ = late_record((0.0, 0.0, 0.0))
-    (found,) = move_channels(
+    (found,) = shift_channels(
         late, [r.samples for r in late.records], np.array([0.0, 1.5, -2.25])
     ).records
     assert len(found.samples) == 300 - 3 - 2  # 2.25 steps at the start, 1.5 at the end

@@ -15,7 +15,7 @@ from ep2sindy.estimation import working_set
 from ep2sindy.estimation.explanation import explain
 from ep2sindy.estimation.likelihood import Gram, gram
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import WEIGHED_AT, Solution, at_level, from_smooth
+from ep2sindy.estimation.solver import COMPARED_AT, Solution, at_level, from_smooth
 from ep2sindy.estimation.supports import inverse_of, term_prices
 from ep2sindy.estimation.working_set import first_set
 from ep2sindy.regression import searches
@@ -197,7 +197,7 @@ def test_scores_tell_what_a_term_would_bring() -> None:
     part = problem.restricted(true)
     found = from_smooth(part, None, max_terms=7)
     fit = at_level(found.fit, found.fit.level)
-    fit = at_level(fit, replace(fit.level, rho=WEIGHED_AT))
+    fit = at_level(fit, replace(fit.level, model_error=COMPARED_AT))
     every = working_set._spread(fit.free, true)
     gains = working_set._gains(problem, fit)
     whole = replace(fit, problem=problem, free=every, support=true)
@@ -284,4 +284,4 @@ def test_products_do_not_stand_in_for_linear_terms_of_a_transient(noise: float, 
     assert not found.model.coef[library.degrees > 1].any()
     right = ((found.model.coef[1:7].T != 0.0) == (matrix != 0.0)).all()
     # Six decaying states of one transient look alike: where terms are wrong, it is said.
-    assert right or "samples do not tell these equations from others" in found.few
+    assert right or "samples do not tell these equations from others" in found.too_few_samples

@@ -1,7 +1,12 @@
 """Channels that come late: a delay of each state, as one more parameter of how it is sampled.
 
-With a delayed channel, wrong equations with more terms fit the data no worse. So the delay is not
-read from the residuals: the test is whether fewer terms suffice with it.
+    y_k(t) = x_k(t - tau_k) + noise, about x_k(t) - tau_k x_k'(t) + noise
+
+With a delayed channel, wrong equations with more terms fit the data no worse. So the delays are not
+read from the residuals. They are unknowns beside the coefficients, and are believed if the squares
+plus the prices of terms and delays fall: fewer terms then suffice, or likelier ones. Assumed is
+that each delay is constant, and short beside the times on which the states change; without inputs
+a delay that all states share leaves no trace.
 """
 
 from __future__ import annotations
@@ -25,7 +30,9 @@ MAX_SAMPLES = 10.0  # largest delay that is believed: more is no small clock err
 
 @dataclass(frozen=True, eq=False)
 class DelayedGram:
-    """The squares as a quadratic function of all free coefficients and of delays of some states.
+    """The squares as a quadratic function of the free coefficients z and some states' delays tau.
+
+        S(z, tau) = at_rest(z) + 2 tau' of_both' z + tau' of_delays tau - 2 linear' tau
 
     Linearised about a fit without delays. at_rest: the part without delays. of_both: (free,
     delays), of_delays: (delays, delays), both quadratic; linear: (delays,).
@@ -100,7 +107,7 @@ def suspect_delays(
     gain = penalise(around.at_rest, support, prices).score - best.score
     if gain < delay_price(problem) + PAYS:
         return None
-    delays = _those_that_show(problem, around, best.support, late)
+    delays = _significant_delays(problem, around, best.support, late)
     gain -= np.count_nonzero(delays) * delay_price(problem)
     return delays if gain > PAYS and 0.0 < np.abs(delays).max() <= MAX_SAMPLES else None
 
@@ -127,7 +134,7 @@ def fit_delays(
     return best, delays, errors
 
 
-def _those_that_show(
+def _significant_delays(
     problem: EstimationProblem,
     around: DelayedGram,
     support: Bool[np.ndarray, " free"],
@@ -152,7 +159,7 @@ def _those_that_show(
     return np.zeros(len(late))
 
 
-def move_channels(
+def shift_channels(
     problem: EstimationProblem, paths: Sequence[np.ndarray], delays: Float[np.ndarray, " d"]
 ) -> EstimationProblem:
     """The problem with every channel brought forward by its delay, in mean steps.
@@ -186,7 +193,7 @@ def delay_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> 
     return " and ".join(parts)
 
 
-def late_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
+def delay_misfit(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
     """Explanation why samples with a late channel are a misfit, and what to do about it."""
     return (
         f"{delay_words(problem, delays)}: brought together, the samples are better explained "

@@ -19,11 +19,11 @@ from ep2sindy.estimation.cost import OutOfTimeError
 from ep2sindy.estimation.delay import (
     PAYS,
     SURE,
+    delay_misfit,
     delay_price,
     delay_words,
     fit_delays,
-    late_words,
-    move_channels,
+    shift_channels,
     suspect_delays,
 )
 from ep2sindy.estimation.likelihood import TrajectoryFit
@@ -42,14 +42,15 @@ from ep2sindy.estimation.solver import (
     unfinished_solution,
 )
 from ep2sindy.estimation.unobserved import unobserved_state
-from ep2sindy.estimation.working_set import first_set, search_within, with_entrances
+from ep2sindy.estimation.working_set import admit_terms, first_set, search_within
 from ep2sindy.runtime.progress import SILENT
 from ep2sindy.trust.interruption import is_interruption
 
-ROADS = (
+ADVICE = (
     "Name a hidden state (hidden=[...]), embed one signal (+exp=trace), or measure another state"
 )
-WARM = 0.1  # rho of the fits that are compared: an input half a step late shows, with all terms
+# Model error of the fits that compare courses: an input half a step late shows, with all terms.
+COURSES_AT = 0.1
 BETTER = 4.0  # least fall of -2 log likelihood for which the most plausible course is left
 FIRST_MAX_TERMS, MORE_TERMS = 7, 5  # of one equation, and how many more where all are used
 # Moves of late channels (the delay model is linear), and the move, in mean steps, that ends them.
@@ -62,22 +63,22 @@ class Explanation:
     """The solution that is reported: of the samples as given, or of the aligned ones if asked for.
 
     max_terms: the most terms of one equation that were tried. misfit: the reason why it does not
-    explain the samples; empty if it does. delays: (d,), in mean steps. said: remarks on how the
-    samples were changed or explained.
+    explain the samples; empty if it does. delays: (d,), in mean steps. remarks: on how the samples
+    were changed or explained.
     """
 
     solution: Solution
     max_terms: int
     misfit: str
     delays: Float[np.ndarray, " d"]
-    said: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def problem(self) -> EstimationProblem:
         return self.solution.problem
 
     @property
-    def holds(self) -> tuple[str, ...]:
+    def explained_states(self) -> tuple[str, ...]:
         """States whose equations explain their samples although others do not."""
         solution = self.solution
         return () if solution.fits else tuple(compress(self.problem.states, solution.explained))
@@ -95,23 +96,25 @@ def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -
     At the limit of its time, or interrupted while its progress is shown, the search ends with the
     best that it has.
     """
-    watch = problem.watch
-    watch.best = None
+    monitor = problem.monitor
+    monitor.best = None
     try:
         return _explain(problem, max_terms, align)
     except (OutOfTimeError, KeyboardInterrupt, SystemError) as stop:
         late, interrupted = isinstance(stop, OutOfTimeError), is_interruption(stop)
         # Nobody follows a silent search, which may be one of many: an interruption ends them all.
-        watched = interrupted and watch.progress is not SILENT
-        if watch.best is None or not (late or watched):
+        watched = interrupted and monitor.progress is not SILENT
+        if monitor.best is None or not (late or watched):
             if interrupted:
                 raise KeyboardInterrupt("the search was interrupted") from stop
             raise
-        watch.ended = True
+        monitor.ended = True
         by = "limit_s" if late else "an interruption"
-        return _unfinished(watch.best, f"ended by {by} after {watch.elapsed_s:.3g} s", max_terms)
+        return _unfinished(
+            monitor.best, f"ended by {by} after {monitor.elapsed_s:.3g} s", max_terms
+        )
     finally:
-        watch.best = None  # what follows is a report, which nothing ends
+        monitor.best = None  # what follows is a report, which nothing ends
 
 
 def _unfinished(best: Solution | TrajectoryFit, ended: str, max_terms: int | None) -> Explanation:
@@ -119,8 +122,8 @@ def _unfinished(best: Solution | TrajectoryFit, ended: str, max_terms: int | Non
     solution = best if isinstance(best, Solution) else unfinished_solution(best)
     limit = max_terms or FIRST_MAX_TERMS
     if solution.fits:
-        said = f"the search was {ended}: other starts and terms were not tried"
-        return _explanation(solution, limit, said=(said,))
+        words = f"the search was {ended}: other starts and terms were not tried"
+        return _explanation(solution, limit, remarks=(words,))
     words = (
         f"the search was {ended}, and nothing fits as far as the noise yet: the equations are the "
         "best so far; raise limit_s, or take fewer terms"
@@ -129,12 +132,12 @@ def _unfinished(best: Solution | TrajectoryFit, ended: str, max_terms: int | Non
 
 
 def _explanation(
-    solution: Solution, max_terms: int, misfit: str = "", said: tuple[str, ...] = ()
+    solution: Solution, max_terms: int, misfit: str = "", remarks: tuple[str, ...] = ()
 ) -> Explanation:
     """A solution, which explains the samples unless there is a misfit or a limit to its terms."""
     few_terms = max_terms_for(solution.problem, max_terms)
     misfit = misfit or _at_limit(solution, max_terms)
-    return Explanation(solution, few_terms, misfit, solution.observation.delays, said)
+    return Explanation(solution, few_terms, misfit, solution.observation.delays, remarks)
 
 
 def _explain(problem: EstimationProblem, max_terms: int | None, align: bool) -> Explanation:
@@ -148,14 +151,14 @@ def _explain(problem: EstimationProblem, max_terms: int | None, align: bool) -> 
         if words := _lacks_terms(best, few_terms):
             return _explanation(exact, limit, words)
         if not align:
-            words = late_words(problem, observed.delays)
+            words = delay_misfit(problem, observed.delays)
             return replace(_explanation(exact, limit, words), delays=observed.delays)
         words = f"{delay_words(problem, observed.delays)}: brought together with the others"
-        return _explanation(best, limit, said=(words,))
+        return _explanation(best, limit, remarks=(words,))
     if not best.fits:
         return _explanation(best, limit, _misfit(best))
     return _explanation(
-        best, limit, said=(process_noise_words(best),) if observed.process.any() else ()
+        best, limit, remarks=(process_noise_words(best),) if observed.process.any() else ()
     )
 
 
@@ -167,10 +170,10 @@ def _compare(first: Solution, max_terms: int) -> tuple[Solution, Solution]:
     problem, under_noise = first.problem, None
     exact = first
     if not first.fits:
-        with problem.watch.stage("process noise"):
+        with problem.monitor.stage("process noise"):
             under_noise = solve_with_process_noise(problem, max_terms=max_terms)
             exact = _best(first, settle(under_noise.fit, max_terms=max_terms))
-        problem.watch.best = exact
+        problem.monitor.best = exact
     best = _best(exact, _align(first, max_terms))
     if best is not exact:
         return exact, best
@@ -178,7 +181,7 @@ def _compare(first: Solution, max_terms: int) -> tuple[Solution, Solution]:
     for log10_ratio in OTHER_STARTS if problem.measured.all() else ():
         if exact.fits and problem.n_samples >= ENOUGH_SAMPLES:
             break
-        with problem.watch.stage("another start"):
+        with problem.monitor.stage("another start"):
             exact = _best(exact, from_smooth(problem, log10_ratio, max_terms=max_terms))
     if exact is not first:
         best = _best(exact, _align(exact, max_terms))
@@ -186,7 +189,7 @@ def _compare(first: Solution, max_terms: int) -> tuple[Solution, Solution]:
             return exact, best
     # Terms outside the set were tested beside the first solution, if it fits.
     if not (exact is first if exact.fits else under_noise is not None and under_noise.fits):
-        wider = with_entrances(exact if exact.fits else first, max_terms=max_terms)
+        wider = admit_terms(exact if exact.fits else first, max_terms=max_terms)
         exact = wider if wider.fits else exact
     # A hidden state under process noise explains whatever there is.
     return exact, _best(exact, under_noise if problem.measured.all() else None)
@@ -209,7 +212,7 @@ def _search_by_size(problem: EstimationProblem, max_terms: int | None) -> tuple[
         if better.rank >= found.rank:
             break
         found, limit = better, wider
-    problem.watch.best = found
+    problem.monitor.best = found
     return found, limit
 
 
@@ -228,10 +231,10 @@ def _align(found: Solution, max_terms: int) -> Solution | None:
     now, late, delays = found, step != 0.0, np.zeros(len(step))
     for _ in range(MAX_MOVES):
         delays = delays + step
-        here = move_channels(now.problem, now.fit.paths, step)
+        here = shift_channels(now.problem, now.fit.paths, step)
         if min(len(record.samples) for record in here.records) < MIN_SAMPLES:
             return None  # shifts as long as a record are no delays
-        with problem.watch.stage("channels that come late"):
+        with problem.monitor.stage("channels that come late"):
             now = from_smooth(here, None, max_terms=max_terms)
         if now.around is None:
             return None
@@ -273,11 +276,10 @@ def _misfit(found: Solution) -> str:
     """Why a solution does not explain the samples, and what to do."""
     states, explained = found.problem.states, found.explained
     if explained.any():
-        holds = " and ".join(compress(states, explained))
+        lacking, known = (" and ".join(compress(states, each)) for each in (~explained, explained))
         words = (
-            f"no law of this library explains {' and '.join(compress(states, ~explained))}: a term "
-            f"or a state is missing there. What was measured of {holds} is explained, with random "
-            "pushes of the size given"
+            f"no law of this library explains {lacking}: a term or a state is missing there. What "
+            f"was measured of {known} is explained, with process noise of the size given"
         )
     else:
         words = (
@@ -286,7 +288,7 @@ def _misfit(found: Solution) -> str:
             "or judge them by free run"
         )
     sign = unobserved_state(found.problem)
-    return f"{words}. A state is missing for certain: {sign}. {ROADS}" if sign else words
+    return f"{words}. A state is missing for certain: {sign}. {ADVICE}" if sign else words
 
 
 def _full(found: Solution, max_terms: int) -> list[str]:
@@ -327,7 +329,8 @@ def on_likeliest_courses(problem: EstimationProblem, *, max_terms: int) -> Estim
     @cache
     def unlikely(courses: tuple[str, ...]) -> float:
         fit = at_level(
-            replace(start, problem=part.on_courses(courses)), replace(start.level, rho=WARM)
+            replace(start, problem=part.on_courses(courses)),
+            replace(start.level, model_error=COURSES_AT),
         )
         return part.n_squares * log(max(fit.total, np.finfo(np.float64).tiny))
 

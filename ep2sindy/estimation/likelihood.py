@@ -1,8 +1,18 @@
 """The likelihood of whole trajectories: states at every sample and coefficients, fitted together.
 
-The objective is the sum over all samples of ((sample - state) / noise)^2, plus the sum over all
-steps of ((flow of the state - next state) / (rho noise))^2. With rho large the states are nearly
-free; as rho falls they become an exact trajectory of the model, and the objective its chi-squared.
+The objective is, over the states x at all samples and the free coefficients z,
+
+    S(x, z) = sum_k |(y_k - x_k) / noise_k|^2
+            + sum_k |(flow(x_k; z) - x_(k+1)) / (model error * noise_k)|^2
+
+With a large model error the states are nearly free; as it falls they become an exact trajectory of
+the model, and S its chi-squared. Assumed are noise that is independent, normal and of known size,
+and nothing about the first states. Under process noise of known size its variances stand in place
+of those of the second sum, and S is -2 log of the joint density of samples and states.
+
+A fit takes Gauss-Newton steps. The normal equations of a step couple each state to the next and to
+the coefficients; a filter marginalises the states, and leaves those of the coefficients.
+Source: de Jong 1991, doi:10.1214/aos/1176348139; Schweppe 1965, doi:10.1109/TIT.1965.1053737.
 
 A sample is either a value or a pair of limits, if the sensor clipped or rounded it. A value
 contributes its squared distance in units of the noise. A pair of limits contributes -2 log of the
@@ -28,7 +38,8 @@ from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 FREE_START = 100.0  # prior variance of the first state: ten times its RMS, squared
 HELD_START = 1e-24  # the same of one that starts at zero
 MAX_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of a step tried
-STEERED = 1.0  # parting of paths, in nats per sample; chaotic systems that are resolved reach 0.3
+# Rate at which paths diverge, in nats per sample; chaotic systems that are resolved reach 0.3.
+MAX_DIVERGENCE = 1.0
 SETTLED = 1e-2  # a fall of the squares that ends the fit; a term's price is about ten
 # Give up on a fit with mean square above FAR that falls by less than this share per step.
 FAR, CRAWLS = 10.0, 0.02
@@ -45,18 +56,20 @@ LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
 class Level:
     """How closely states must follow the samples and the flow.
 
-    noise: (samples, d), standard deviations of the samples of all records, scaled. rho: the flow's
-    error as a share of the noise. push: (d,), the flow's error itself, if it is known.
+    noise: (samples, d), standard deviations of the samples of all records, scaled. model_error: of
+    the flow, as a share of the noise. process_noise: (d,), the flow's error itself, if it is known.
     """
 
     noise: Float[np.ndarray, "samples d"]
-    rho: float
+    model_error: float
     n_substeps: int = 1
-    push: Float[np.ndarray, " d"] | None = None
+    process_noise: Float[np.ndarray, " d"] | None = None
 
-    def with_errors(self, noise: Float[np.ndarray, " d"], push: Float[np.ndarray, " d"]) -> Level:
+    def with_errors(
+        self, noise: Float[np.ndarray, " d"], process_noise: Float[np.ndarray, " d"]
+    ) -> Level:
         """The same samples with other errors, alike at all of them."""
-        return Level(np.tile(noise, (len(self.noise), 1)), 1.0, push=push)
+        return Level(np.tile(noise, (len(self.noise), 1)), 1.0, process_noise=process_noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +95,7 @@ class TrajectoryFit:
     @cached_property
     def squares(self) -> Float[np.ndarray, " d"]:
         """The objective (see the module), by state; infinite if the flow is not finite."""
-        self.problem.watch.look()
+        self.problem.monitor.look()
         record, level = self.problem.all_records, self.level
         with np.errstate(over="ignore", invalid="ignore"):
             defects = self.problem.ends(record, self.path[:-1], self.free, level.n_substeps)
@@ -105,7 +118,8 @@ class TrajectoryFit:
         and defects are zero there begins each record anew.
         """
         level = self.level
-        error = level.rho * level.noise[:-1] if level.push is None else level.push
+        error = level.process_noise
+        error = level.model_error * level.noise[:-1] if error is None else error
         found = np.square(np.broadcast_to(error, level.noise[:-1].shape))
         found[self.problem.all_records.breaks] = FREE_START
         return found
@@ -134,13 +148,15 @@ def fit_paths(fit: TrajectoryFit) -> TrajectoryFit:
     The result is the nearest local minimum. A coefficient that must be positive and would not be
     leaves the support, and a state that is nonnegative and would start below zero starts there.
     """
+    # The minimum without bounds, then an active set: what a bound holds leaves the unknowns, and
+    # the normal equations of the rest are solved again.
     problem, fit = fit.problem, _descend(replace(fit, at_zero=None))
     while np.isfinite(fit.total):
         below = problem.nonnegative & [path[0] < 0.0 for path in fit.paths]
         below &= True if fit.at_zero is None else ~fit.at_zero
-        if (fit.free[problem.positive] < 0.0).any():
+        if (fit.free[problem.positive] < 0.0).any():  # z >= 0: its row and column leave H c = g
             fit = _without_negative(fit)
-        elif below.any():
+        elif below.any():  # x_0 >= 0: the variance of its prior falls to nothing
             fit = _from_zero(fit, below)
         else:
             break
@@ -174,7 +190,7 @@ def _descend(fit: TrajectoryFit) -> TrajectoryFit:
     if not np.isfinite(fit.total):
         return fit  # no gradient to follow
     for _ in range(MAX_STEPS):
-        fit.problem.watch.step()
+        fit.problem.monitor.step()
         change, move = _step(fit)
         if not np.isfinite(change).all():
             return fit  # derivatives overflow before the flow itself does
@@ -225,7 +241,7 @@ def _move(
     return departures(*about.of_states._replace(defects=defects))
 
 
-def parting(fit: TrajectoryFit) -> float:
+def divergence_rate(fit: TrajectoryFit) -> float:
     """How fast paths beside a fit part: nats per sample that are new, beyond a first state's.
 
     In a long record it is twice the sum of the positive Lyapunov exponents, per mean step. Where it
@@ -274,7 +290,7 @@ def enough_substeps(fit: TrajectoryFit, *, share: float = 0.1) -> int:
     most = min(MAX_SUBSTEPS, max(MIN_ALLOWED, MAX_IN_ALL // problem.n_samples))
     record, starts = problem.all_records, fit.path[:-1]
     while 2 * n <= most:
-        problem.watch.look()
+        problem.monitor.look()
         with np.errstate(over="ignore", invalid="ignore"):
             change = problem.ends(record, starts, fit.free, n)
             change -= problem.ends(record, starts, fit.free, 2 * n)
@@ -290,7 +306,8 @@ class Linearised(NamedTuple):
 
     slopes: derivatives of the flow by the state, then by the parameters; zero between records, as
     are the defects, what the flow from each sample misses of the next state of the path. residuals,
-    variance: see `Seen`. process: variances of the flow's error. start: of the first state.
+    variance: see `LinearisedObservation`. process: variances of the flow's error. start: of the
+    first state.
     """
 
     slopes: Float[np.ndarray, "steps d columns"]
@@ -311,7 +328,7 @@ class Linearised(NamedTuple):
 def linearise(fit: TrajectoryFit, flow: Flow | None = None) -> Linearised:
     """The objective about a fit. flow: along its path; None for one with slopes by the state."""
     problem, record = fit.problem, fit.problem.all_records
-    problem.watch.look()
+    problem.monitor.look()
     flow = flow or flow_by(fit, np.zeros_like(fit.support))
     # Rows of the steps: what the flow from each state misses of the next one.
     defects = flow.ends - fit.path[1:]
@@ -367,7 +384,7 @@ def unit_sizes(hessian: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
     return np.sqrt(zero_to_one(np.maximum(np.diag(hessian), 0.0)))
 
 
-class Seen(NamedTuple):
+class LinearisedObservation(NamedTuple):
     """Comparison of a record with a path; all arrays (samples, d).
 
     residuals: NaN where a sample carries no information. variance: of the noise of these residuals.
@@ -383,7 +400,7 @@ def observe(
     record: ScaledRecord,
     path: Float[np.ndarray, "samples d"],
     variance: Float[np.ndarray, "samples d"],
-) -> Seen:
+) -> LinearisedObservation:
     """Compare the samples of a record with a path, given the variance of the noise."""
     residuals = record.samples - path
     squares = np.square(residuals) / variance
@@ -391,7 +408,7 @@ def observe(
         residuals = np.where(record.missing, np.nan, residuals)
         squares = np.where(record.missing, 0.0, squares)
     if record.limits is None:
-        return Seen(residuals, variance, squares)
+        return LinearisedObservation(residuals, variance, squares)
     residuals, variance = residuals.copy(), variance.copy()
     at = record.limits.at & record.at_hand
     noise = np.sqrt(variance[at])
@@ -400,7 +417,7 @@ def observe(
     pull, weight, squares[at] = between(lower, upper)
     residuals[at] = np.where(weight > TELLS, noise * pull / np.maximum(weight, TELLS), np.nan)
     variance[at] = np.square(noise) / np.maximum(weight, TELLS)
-    return Seen(residuals, variance, squares)
+    return LinearisedObservation(residuals, variance, squares)
 
 
 # Far out, limits may be one number to rounding: the probability is zero, and the squares infinite.

@@ -30,7 +30,7 @@ SHARES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 0.9999)  # of growing vari
 GROWTH_SHOWS = 12.0  # least gain in 2 log likelihood for noise that grows
 OUTLYING = 5.0  # standard deviations
 ORDER = 3  # of differences, which remove most of a signal that the samples resolve
-LEVELS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # rho: errors of the flow that are tried
+MODEL_ERRORS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # of the flow, as shares of the noise
 # Prior, worth this many samples: the noise is alike in all states. Without it, for few samples,
 # the likeliest model follows one state exactly and ignores another.
 ALIKE_SAMPLES = 5.0
@@ -103,7 +103,7 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     if limited.any():
         likely, between = _likeliest_std(fit, std)
         std = np.where(limited, freedom * likely, std)
-        left = _pulls(fit, std)
+        left = _expected_residuals(fit, std)
     unit = problem.split(left / shape)
     memory = _memory(unit)
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
@@ -182,7 +182,9 @@ def _likeliest_std(
     return found, best
 
 
-def _pulls(fit: TrajectoryFit, std: Float[np.ndarray, " d"]) -> Float[np.ndarray, "samples d"]:
+def _expected_residuals(
+    fit: TrajectoryFit, std: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, "samples d"]:
     """Residuals of values; for limits, the expected noise."""
     variance = np.broadcast_to(np.square(std), fit.path.shape)
     seen = observe(fit.problem.all_records, fit.path, variance)
@@ -249,7 +251,7 @@ def _tails(
 
 
 def flow_error(fit: TrajectoryFit, noise: Noise) -> float:
-    """The rho under which the fit's support is most likely; 0 if an exact flow is.
+    """The model error under which the fit's support is most likely; 0 if an exact flow is.
 
     The exact flow is weighed with correlated noise if the noise is correlated; a flow with error is
     weighed with white noise.
@@ -258,11 +260,11 @@ def flow_error(fit: TrajectoryFit, noise: Noise) -> float:
     fit = replace(fit, level=replace(fit.level, noise=noise.white))
     by_memory = float((fit.problem.n_measured * np.log1p(-np.square(noise.memory))).sum())
     best, found = _deviance(fit) + by_memory - ERROR_SHOWS, 0.0
-    for rho in LEVELS:
-        fit = fit_paths(replace(fit, level=replace(fit.level, rho=rho)))
+    for model_error in MODEL_ERRORS:
+        fit = fit_paths(replace(fit, level=replace(fit.level, model_error=model_error)))
         deviance = _deviance(fit)
         if deviance < best:
-            best, found = deviance, rho
+            best, found = deviance, model_error
     return found
 
 

@@ -1,8 +1,12 @@
-"""States that leave their model: coefficients under random pushes of every state at every step.
+"""Process noise: coefficients of states that leave their model at random at every step.
 
-Ecology, drifting phases and all that a model leaves out push its states at random. The sizes of the
-pushes and of the samples' noise are estimated together with the coefficients, and terms are priced
-against this stochastic model.
+Ecology, drifting phases and all that a model leaves out move its states at random. The variances of
+this process noise and of the samples' noise are estimated together with the coefficients, and terms
+are priced against this stochastic model:
+
+    x_(k+1) = flow(x_k) + process * w_k,    y_k = x_k + noise * v_k,    w, v white and normal
+
+The likelihood is that of the innovations (Schweppe 1965, doi:10.1109/TIT.1965.1053737).
 """
 
 from __future__ import annotations
@@ -33,21 +37,22 @@ from ep2sindy.estimation.solver import (
 )
 from ep2sindy.estimation.supports import term_prices
 
-# Bounds on noise and pushes, in RMS of the states.
-LEAST_NOISE, LEAST_PUSH, MOST = 1e-5, 1e-7, 3.0
+# Bounds on noise and process noise, in RMS of the states.
+LEAST_NOISE, LEAST_PROCESS, MOST = 1e-5, 1e-7, 3.0
 MAX_TRIALS = 120  # likelihoods per size of an error
 SHARES = (0.3, 1.0, 1.0, 1.0, 1.0)  # of the terms' prices, in every round
 LAGS = range(1, 9)  # at which innovations are correlated with themselves
-# Standard errors that random innovations may show: see `_left_over`.
+# Standard errors that random innovations may show: see `_test_innovations`.
 MOST_SHOWN = (5.0, 4.0, 6.0)
 COLLINEAR = 1e-3  # share of a product that is left beside an equation's terms, if it is another
 RUNAWAY = 1e6  # innovations, in RMS of the states, of a model that follows no samples
-MOST_MISSED = 3.0  # RMS miss of a step, in pushes: the likeliest pushes are smaller than true ones
+# RMS defect of a step, in process noise: the likeliest is smaller than the true one.
+MAX_DEFECT = 3.0
 SETTLING = 5  # samples from whose start on innovations count
 
 
 def likely_errors(fit: TrajectoryFit) -> tuple[Level, float]:
-    """The likeliest noise and pushes about the path of a fit, and their -2 log likelihood.
+    """The likeliest noise and process noise about the path of a fit, and their -2 log likelihood.
 
     The search for them starts from those of the fit's level.
     """
@@ -55,7 +60,7 @@ def likely_errors(fit: TrajectoryFit) -> tuple[Level, float]:
 
     measured, level, about = fit.problem.measured, fit.level, linearise(fit)
     n, d = int(measured.sum()), len(measured)
-    low = np.log(np.repeat([LEAST_NOISE, LEAST_PUSH], [n, d]))
+    low = np.log(np.repeat([LEAST_NOISE, LEAST_PROCESS], [n, d]))
 
     def level_of(logs: np.ndarray) -> Level:
         held = np.exp(np.clip(logs, low, np.log(MOST)))
@@ -69,8 +74,8 @@ def likely_errors(fit: TrajectoryFit) -> tuple[Level, float]:
         case = about._replace(variance=variance, process=tried.process)
         return float(np.square(logs - bounded).sum() + sum(eliminate(*case)[2:]))
 
-    assert level.push is not None
-    start = np.log(np.append(level.noise[0, measured], level.push))
+    assert level.process_noise is not None
+    start = np.log(np.append(level.noise[0, measured], level.process_noise))
     found = minimize(
         unlikely,
         start,
@@ -93,7 +98,7 @@ def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> S
     for share in SHARES:
         fit = exchange_terms(at_level(fit, level), share * prices, max_terms)
         level, deviance = likely_errors(fit)
-    process = level.push
+    process = level.process_noise
     fit = at_level(fit, level)
     noise, none = noise_beside(fit), np.zeros(len(problem.states))
     explained = replace(
@@ -109,19 +114,20 @@ def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> S
         observation=Observation(explained, none, process),
         prices=prices,
         deviance=deviance,
-        tests=(_defects_of_steps(fit), *_left_over(fit)),
+        tests=(_test_defects(fit), *_test_innovations(fit)),
     )
 
 
-def _defects_of_steps(fit: TrajectoryFit) -> LackOfFit:
-    """RMS of the steps that a path misses, in what process noise and noise allow.
+def _test_defects(fit: TrajectoryFit) -> LackOfFit:
+    """RMS of the defects of a path, in what process noise and noise allow.
 
     Infinite for a state without a law: one whose equation has no term, which noise alone moves.
     """
-    missed = squares_of_steps(fit)[0] / len(fit.path)
-    allowed = np.square(MOST_MISSED * fit.level.push) + np.square(EXACT * fit.level.noise[0])
+    defects = squares_of_steps(fit)[0] / len(fit.path)
+    noise, process = fit.level.noise[0], fit.level.process_noise
+    allowed = np.square(MAX_DEFECT * process) + np.square(EXACT * noise)
     moves = fit.problem.coef(fit.free).any(axis=0)
-    return LackOfFit(np.where(moves, np.sqrt(missed / allowed), np.inf), 1.0)
+    return LackOfFit(np.where(moves, np.sqrt(defects / allowed), np.inf), 1.0)
 
 
 def process_noise_words(solution: Solution) -> str:
@@ -130,12 +136,12 @@ def process_noise_words(solution: Solution) -> str:
     sizes = zip(problem.states, (process * problem.scale).tolist(), strict=True)
     words = ", ".join(f"{name} by {size:.2g}" for name, size in sizes)
     return (
-        f"no exact trajectory explains these samples: states are pushed at random, {words} from "
-        "one sample to the next; the intervals allow for it"
+        f"no exact trajectory explains these samples: process noise moves the states, {words} "
+        "from one sample to the next; the intervals allow for it"
     )
 
 
-def _left_over(fit: TrajectoryFit) -> list[LackOfFit]:
+def _test_innovations(fit: TrajectoryFit) -> list[LackOfFit]:
     """What innovations show that random ones would not, in standard errors.
 
     Their largest autocorrelation over a few lags, the largest share that one product of states

@@ -1,7 +1,8 @@
-"""The joint estimator of states and coefficients: annealing from free states to exact trajectories.
+"""The joint estimator of states and coefficients: continuation from free states to exact ones.
 
-It starts from smoothed states, and from all coefficients regressed on their derivatives. Supports
-are chosen at every level on the way (`anneal`), and compared again at its end (`polish`).
+It starts from smoothed states, and from all coefficients regressed on their derivatives. The model
+error falls in steps. Supports are chosen at every step on the way (`fit_by_continuation`), and
+compared again at its end (`polish`).
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from ep2sindy.data.numbers import least_squares
 from ep2sindy.estimation.delay import DelayedGram, delayed_gram
 from ep2sindy.estimation.likelihood import (
     FAR,
-    STEERED,
+    MAX_DIVERGENCE,
     Level,
     TrajectoryFit,
+    divergence_rate,
     enough_substeps,
     fit_paths,
     gram,
-    parting,
 )
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
@@ -38,20 +39,21 @@ ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts 
 OTHER_STARTS = (-2.0, 0.0, 2.0)
 SAMPLES_PER_COEFFICIENT = 10  # of an equation, if samples are few: more terms would fit noise
 MAX_PASSES = 4  # until noise and support agree; usually two
-# rho, and the share of a term's price charged at that level. Free states hide part of what a term
+# Model errors, and the share of a term's price charged there. Free states hide part of what a term
 # explains, and a term dropped too early would have to be found again.
-COOLING = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
-COLD = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
-ASTRAY = 0.1  # RMS miss of the flow, as a share of the steps of a hidden state, if it follows none
-# RMS miss of a step, in noise, from which the path is no trajectory: right models miss by 1e-5.
+CONTINUATION = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
+NEARLY_EXACT = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
+# RMS defect of the flow of a hidden state, as a share of its steps, beyond which it follows none.
+MAX_HIDDEN_DEFECT = 0.1
+# RMS defect of a step, in noise, from which the path is no trajectory: right models have 1e-5.
 EXACT = 1e-3
 MAX_EXCHANGES = 3  # exchanges of supports at one level
-# rho at which supports are compared again. At lower rho the linearised flow says too little about
-# other supports; at higher rho free states hide their differences.
-WEIGHED_AT = 0.003
-# rho, and the share of the prices, at which another support may show that the solution is a wrong
-# optimum; and by how much it must explain more of the squares.
-REHEATED, EXPLAINS_MORE = (1.0, 0.5), 4.0
+# Model error at which supports are compared again. At a lower one the linearised flow says too
+# little about other supports; at a higher one free states hide their differences.
+COMPARED_AT = 0.003
+# Model error, and the share of the prices, at which another support may show that the solution is a
+# wrong optimum; and by how much it must explain more of the squares.
+RELAXED, EXPLAINS_MORE = (1.0, 0.5), 4.0
 WITHIN, MAX_TRIED, MAX_ROUNDS = 12.0, 6, 6  # score above the chosen one; supports per round; rounds
 UNSURE = 0.05  # share of the RMS: least noise at a start where the smoother's is not trusted
 CUTOFF = 1e-8  # of singular values of unit columns: smaller ones fit noise
@@ -72,38 +74,38 @@ def enough_samples(problem: EstimationProblem) -> bool:
 def from_smooth(
     problem: EstimationProblem, log10_ratio: float | None, *, max_terms: int
 ) -> Solution:
-    """Anneal with the smoother's noise, then with the residuals'.
+    """The exact solution from smoothed states, first with their noise, then with the residuals'.
 
     log10_ratio: of the smoother, see `start_from_smooth`.
     """
-    return settle(start_from_smooth(problem, log10_ratio), COOLING, max_terms=max_terms)
+    return settle(start_from_smooth(problem, log10_ratio), CONTINUATION, max_terms=max_terms)
 
 
 def settle(
-    start: TrajectoryFit, schedule: Sequence[tuple[float, float]] = COLD, *, max_terms: int
+    start: TrajectoryFit, schedule: Sequence[tuple[float, float]] = NEARLY_EXACT, *, max_terms: int
 ) -> Solution:
     """The exact solution near a fit whose states leave the flow.
 
-    Anneals again until noise and support agree, and compares with what is nearly as likely.
+    Continues again until noise and support agree, and compares with what is nearly as likely.
     """
     prices = term_prices(start.problem, float(start.problem.n_samples))
-    fit = anneal(start, prices, schedule, max_terms=max_terms)
+    fit = fit_by_continuation(start, prices, schedule, max_terms=max_terms)
     for _ in range(MAX_PASSES):
         before, noise = fit.support, noise_beside(fit)
         prices = _prices_beside(fit, noise)
         start = replace(fit, level=replace(fit.level, noise=noise.effective))
-        fit = anneal(start, prices, COLD, max_terms=max_terms)
+        fit = fit_by_continuation(start, prices, NEARLY_EXACT, max_terms=max_terms)
         if np.array_equal(before, fit.support):
             break
     fit, around = polish(fit, prices, max_terms=max_terms)
-    fit, around = reheat(fit, around, prices, max_terms=max_terms)
-    noise, error, steered = noise_beside(fit), 0.0, 0.0
+    fit, around = restart_relaxed(fit, around, prices, max_terms=max_terms)
+    noise, error, divergence = noise_beside(fit), 0.0, 0.0
     if np.isfinite(fit.total) and (noise.std > FLOOR).any():
         error = flow_error(fit, noise)
         defect = np.sqrt((squares_of_steps(fit)[0] / np.square(noise.std)).max() / len(fit.path))
         error = error if defect < EXACT else max(error, float(defect))  # it lives on the slack
-        steered = parting(replace(fit, level=replace(fit.level, noise=noise.white)))
-    return replace(_exact_solution(fit, noise, prices, error, steered), around=around)
+        divergence = divergence_rate(replace(fit, level=replace(fit.level, noise=noise.white)))
+    return replace(_exact_solution(fit, noise, prices, error, divergence), around=around)
 
 
 def _prices_beside(fit: TrajectoryFit, noise: Noise) -> Float[np.ndarray, " free"]:
@@ -114,15 +116,15 @@ def _prices_beside(fit: TrajectoryFit, noise: Noise) -> Float[np.ndarray, " free
 def unfinished_solution(fit: TrajectoryFit) -> Solution:
     """What a search that was ended on its way has, whose states still leave the flow."""
     noise = noise_beside(fit)
-    return _exact_solution(fit, noise, _prices_beside(fit, noise), fit.level.rho, 0.0)
+    return _exact_solution(fit, noise, _prices_beside(fit, noise), fit.level.model_error, 0.0)
 
 
 def _exact_solution(
-    fit: TrajectoryFit, noise: Noise, prices: np.ndarray, error: float, steered: float
+    fit: TrajectoryFit, noise: Noise, prices: np.ndarray, error: float, divergence: float
 ) -> Solution:
     """The solution of a trajectory without process noise, and its tests."""
     none = np.zeros(len(noise.std))
-    apart = np.exp(min(steered, 100.0) / 2.0)
+    apart = np.exp(min(divergence, 100.0) / 2.0)
     tests = (
         LackOfFit(
             none + fit.total,
@@ -134,7 +136,7 @@ def _exact_solution(
         ),
         LackOfFit(
             none + apart,
-            float(np.exp(STEERED / 2.0)),
+            float(np.exp(MAX_DIVERGENCE / 2.0)),
             "paths beside the fit part by a factor of {value:.2g} per sample, so it could follow "
             "any samples",
         ),
@@ -145,7 +147,9 @@ def _exact_solution(
         LackOfFit(
             noise.patterned, 0.0, "what is left of {state} holds a line or follows the states"
         ),
-        LackOfFit(astray(fit), ASTRAY, "{state} does not follow its own equation"),
+        LackOfFit(
+            hidden_defects(fit), MAX_HIDDEN_DEFECT, "{state} does not follow its own equation"
+        ),
     )  # fmt: skip
     return Solution(
         fit=fit,
@@ -157,8 +161,8 @@ def _exact_solution(
     )
 
 
-def astray(fit: TrajectoryFit) -> Float[np.ndarray, " d"]:
-    """RMS miss of the flow of hidden states, as a share of their steps; zero for measured ones.
+def hidden_defects(fit: TrajectoryFit) -> Float[np.ndarray, " d"]:
+    """RMS defect of the flow of hidden states, as a share of their steps; zero for measured ones.
 
     One that has become very small leaves the flow freely, and large coefficients make it count.
     """
@@ -175,9 +179,9 @@ def squares_of_steps(
     """Sums of squares, by state: of what the flow from each sample misses, and of the steps."""
     record, path, n = fit.problem.all_records, fit.path, fit.level.n_substeps
     steps = np.diff(path, axis=0)
-    missed = fit.problem.ends(record, path[:-1], fit.free, n) - path[1:]
-    missed[record.breaks] = steps[record.breaks] = 0.0
-    return np.square(missed).sum(axis=0), np.square(steps).sum(axis=0)
+    defects = fit.problem.ends(record, path[:-1], fit.free, n) - path[1:]
+    defects[record.breaks] = steps[record.breaks] = 0.0
+    return np.square(defects).sum(axis=0), np.square(steps).sum(axis=0)
 
 
 def _penalised(fit: TrajectoryFit, prices: Float[np.ndarray, " free"]) -> float:
@@ -185,7 +189,7 @@ def _penalised(fit: TrajectoryFit, prices: Float[np.ndarray, " free"]) -> float:
     return float(fit.total + prices[fit.support].sum())
 
 
-def anneal(
+def fit_by_continuation(
     fit: TrajectoryFit,
     prices: Float[np.ndarray, " free"],
     schedule: Sequence[tuple[float, float]],
@@ -196,13 +200,13 @@ def anneal(
 
     The noise is that of the fit's level.
     """
-    watch, level = fit.problem.watch, replace(fit.level, n_substeps=1, push=None)
-    for rho, share in schedule:
-        fit = at_level(fit, replace(level, rho=rho))
+    monitor, level = fit.problem.monitor, replace(fit.level, n_substeps=1, process_noise=None)
+    for model_error, share in schedule:
+        fit = at_level(fit, replace(level, model_error=model_error))
         level = fit.level
         fit = exchange_terms(fit, share * prices, max_terms)
-        if not isinstance(watch.best, Solution):
-            watch.best = fit
+        if not isinstance(monitor.best, Solution):
+            monitor.best = fit
     return fit
 
 
@@ -220,7 +224,7 @@ def polish(
     fit = at_level(fit, fit.level)
     tried = {fit.support.tobytes()}
     for _ in range(MAX_ROUNDS):
-        warm = at_level(fit, replace(fit.level, rho=WEIGHED_AT))
+        warm = at_level(fit, replace(fit.level, model_error=COMPARED_AT))
         around = delayed_gram(warm)
         if not (around.at_rest.finite and np.isfinite(fit.total)):
             break
@@ -231,7 +235,7 @@ def polish(
         for each in others[:MAX_TRIED]:
             tried.add(each.support.tobytes())
             other = at_level(replace(warm, support=each.support, free=each.free), warm.level)
-            other = at_level(other, replace(other.level, rho=fit.level.rho))
+            other = at_level(other, replace(other.level, model_error=fit.level.model_error))
             if _is_likelier(other, fit, prices):
                 fit = other
                 break
@@ -244,17 +248,19 @@ def _is_likelier(
     fit: TrajectoryFit, than: TrajectoryFit, prices: Float[np.ndarray, " free"]
 ) -> bool:
     """True if a fit is likelier, prices included, and does not live on steering its path."""
-    return _penalised(fit, prices) < _penalised(than, prices) and parting(fit) < STEERED
+    return (
+        _penalised(fit, prices) < _penalised(than, prices) and divergence_rate(fit) < MAX_DIVERGENCE
+    )
 
 
-def reheat(
+def restart_relaxed(
     fit: TrajectoryFit,
     around: DelayedGram | None,
     prices: Float[np.ndarray, " free"],
     *,
     max_terms: int,
 ) -> tuple[TrajectoryFit, DelayedGram | None]:
-    """Anneal again if states that are let go show a better support; the likelier of both.
+    """Continue again if states that are let go show a better support; the likelier of both.
 
     Exchanges between nearly exact flows cannot leave a wrong optimum of many terms. Free states
     hide part of what a term explains, so a support counts as better there only if it explains more
@@ -262,19 +268,21 @@ def reheat(
     """
     if not fit.total < FAR * fit.problem.n_squares:
         return fit, around
-    rho, share = REHEATED
-    warm = at_level(fit, replace(fit.level, rho=rho))
-    pair, cheap = gram(warm), share * prices
+    model_error, share = RELAXED
+    relaxed = at_level(fit, replace(fit.level, model_error=model_error))
+    pair, cheap = gram(relaxed), share * prices
     if not pair.finite:
         return fit, around
-    here = penalise(pair, warm.support, cheap)
-    other = best_support(fit.problem, pair, cheap, warm.support, max_terms=max_terms)
+    here = penalise(pair, relaxed.support, cheap)
+    other = best_support(fit.problem, pair, cheap, relaxed.support, max_terms=max_terms)
     n_more = int(other.support.sum()) - int(here.support.sum())
     gain = here.score - other.score - float(cheap[here.support].sum() - cheap[other.support].sum())
     if n_more > 0 or gain < EXPLAINS_MORE:
         return fit, around
-    start = replace(warm, support=other.support, free=other.free)
-    again = anneal(start, prices, (*COOLING, COLD[-1]), max_terms=max_terms)
+    start = replace(relaxed, support=other.support, free=other.free)
+    again = fit_by_continuation(
+        start, prices, (*CONTINUATION, NEARLY_EXACT[-1]), max_terms=max_terms
+    )
     again, beside = polish(again, prices, max_terms=max_terms)
     return (again, beside) if _is_likelier(again, fit, prices) else (fit, around)
 
@@ -315,14 +323,14 @@ def start_from_smooth(problem: EstimationProblem, log10_ratio: float | None) -> 
     each record and state. Below about twenty samples a period this ratio may take signal for noise.
     The noise of its level is that of the residuals.
     """
-    start = smoothed(problem, log10_ratio)
+    start = smooth_states(problem, log10_ratio)
     values = np.concatenate([start.path, problem.all_records.inputs], axis=1)
     free = _regress(problem, problem.library.evaluate(values), start.rates)
     support = np.ones(problem.n_free, dtype=np.bool_)
     return TrajectoryFit(problem, Level(start.noise, 1.0), start.path, free, support)
 
 
-def _estimated(
+def _smooth_record(
     problem: EstimationProblem, record: ScaledRecord, log10_ratio: float | None
 ) -> KalmanEstimate:
     """Smooth every state over the samples that it has; between these it follows a cubic."""
@@ -345,7 +353,7 @@ def _estimated(
     return replace(found, smoothed=smooth, derivative=rates, noise_std=std)
 
 
-class Smoothed(NamedTuple):
+class SmoothedStates(NamedTuple):
     """Smoothed states, in the domains of the library's functions, their rates, and the noise.
 
     noise: standard deviations at all samples.
@@ -356,12 +364,12 @@ class Smoothed(NamedTuple):
     noise: Float[np.ndarray, "samples d"]
 
 
-def smoothed(problem: EstimationProblem, log10_ratio: float | None) -> Smoothed:
+def smooth_states(problem: EstimationProblem, log10_ratio: float | None) -> SmoothedStates:
     """Smooth the samples; log10_ratio as in `start_from_smooth`."""
     estimates, paths = [], []
     for record in problem.records:
-        problem.watch.look()
-        each = _estimated(problem, record, log10_ratio)
+        problem.monitor.look()
+        each = _smooth_record(problem, record, log10_ratio)
         samples, values = (
             np.concatenate([states, record.inputs], axis=1)
             for states in (record.samples, each.smoothed)
@@ -373,7 +381,7 @@ def smoothed(problem: EstimationProblem, log10_ratio: float | None) -> Smoothed:
     std = np.maximum(np.sqrt(variance), FLOOR if log10_ratio is None else UNSURE)
     std[~problem.measured] = std[problem.measured].mean()
     rates = np.concatenate([each.derivative for each in estimates])
-    return Smoothed(np.concatenate(paths), rates, np.tile(std, (len(rates), 1)))
+    return SmoothedStates(np.concatenate(paths), rates, np.tile(std, (len(rates), 1)))
 
 
 def _regress(

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.estimation.problem import EstimationProblem
-from ep2sindy.estimation.solver import smoothed
+from ep2sindy.estimation.solver import smooth_states
 
 CLEAR = 4.0  # steps between the points of a path, in standard deviations of the noise
 MOST_POINTS = 3000  # of a path that is looked at, the first ones
@@ -24,7 +24,7 @@ def unobserved_state(problem: EstimationProblem) -> str:
     d = len(problem.states)
     if problem.driven or d > 2 or not problem.measured.all():
         return ""
-    start = smoothed(problem, None)
+    start = smooth_states(problem, None)
     paths = [_clear_steps(path) for path in problem.split(start.path / start.noise)]
     name = problem.states[0]
     if d == 1 and sum(_turns(path[:, 0]) for path in paths) >= LEAST_CROSSINGS:

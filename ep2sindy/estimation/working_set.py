@@ -1,9 +1,15 @@
 """The working set: the few terms of each equation that a search weighs, out of a large library.
 
 The first set comes from each equation by itself: its own state is let go, the others are taken from
-their smoothed samples. After the search every term outside is tested on what the solution leaves,
-and terms that would pay for themselves enter. So the cost grows with the terms of the set, and only
-slowly with those of the library.
+their smoothed samples. After the search every term j outside is tested on what the solution leaves,
+and enters if its score test promises more than its price:
+
+    (dS/dz_j)^2 / (4 variance of dS/(2 dz_j)) > price_j
+
+where S is the objective of `likelihood`, and the variance is that under noise alone, the states and
+the chosen coefficients fitted to it. Assumed is that S is quadratic as far as the best z_j. The
+cost grows with the terms of the set, and only slowly with those of the library.
+Source: Rao 1948, doi:10.1017/S0305004100023987.
 """
 
 from __future__ import annotations
@@ -27,20 +33,21 @@ from ep2sindy.estimation.likelihood import (
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.solution import Solution
 from ep2sindy.estimation.solver import (
+    COMPARED_AT,
     OTHER_STARTS,
     SAMPLES_PER_COEFFICIENT,
-    WEIGHED_AT,
     at_level,
     from_smooth,
     settle,
-    smoothed,
+    smooth_states,
 )
 from ep2sindy.estimation.supports import N_BEST, inverse_of, term_prices
 from ep2sindy.regression.exchanges import exchanged_supports
 
-# rho of the first set: the state nearly free, or quite. One alone leaves out more true terms.
-WARM = (0.3, 3.0)
-MOST_ENTER, MAX_ENTRANCES = 3, 4  # terms of one equation that enter at once; times that some do
+# Model errors of the first set: the state nearly free, or quite. One alone leaves out more true
+# terms.
+FIRST_MODEL_ERRORS = (0.3, 3.0)
+MOST_ADMITTED, MAX_ADMISSIONS = 3, 4  # terms of one equation that enter at once; times that some do
 DEPENDENT = 1e-6  # share of a score's scatter that the chosen terms leave, if they span the term
 N_PROBES = 40  # draws of noise that tell how far a score scatters: to 22 % of its square
 
@@ -57,17 +64,17 @@ def search_within(problem: EstimationProblem, *, max_terms: int) -> Solution:
     few = problem.n_samples < SAMPLES_PER_COEFFICIENT * len(problem.library)
     if few and linear.n_free < problem.n_free > part.n_free:
         found = _linear_solution(linear, max_terms)
-        if found.fits and with_entrances(found, max_terms=max_terms) is found:
+        if found.fits and admit_terms(found, max_terms=max_terms) is found:
             return found
-    with problem.watch.stage(_weighed(part)):
+    with problem.monitor.stage(_weighed(part)):
         found = from_smooth(part, None, max_terms=max_terms)
     # About a solution that does not fit first order tells little, and other starts cost less.
-    return with_entrances(found, max_terms=max_terms) if found.fits else found
+    return admit_terms(found, max_terms=max_terms) if found.fits else found
 
 
 def _linear_solution(linear: EstimationProblem, max_terms: int) -> Solution:
     """The likeliest solution of the linear terms alone that fits, from any start."""
-    with linear.watch.stage(_weighed(linear)):
+    with linear.monitor.stage(_weighed(linear)):
         tried = [
             from_smooth(linear, log10_ratio, max_terms=max_terms)
             for log10_ratio in (None, *OTHER_STARTS)
@@ -75,11 +82,11 @@ def _linear_solution(linear: EstimationProblem, max_terms: int) -> Solution:
     return min(tried, key=lambda each: each.rank)
 
 
-def with_entrances(found: Solution, *, max_terms: int) -> Solution:
+def admit_terms(found: Solution, *, max_terms: int) -> Solution:
     """Let terms into the working set as long as they make the solution likelier."""
     problem = found.problem.candidates
-    problem.watch.best = found
-    for _ in range(MAX_ENTRANCES):
+    problem.monitor.best = found
+    for _ in range(MAX_ADMISSIONS):
         kept = found.problem.taken
         entering = ~kept & _would_pay(problem, kept, found)
         if not entering.any():
@@ -93,11 +100,11 @@ def with_entrances(found: Solution, *, max_terms: int) -> Solution:
             free=_spread(fit.free, kept)[larger],
             support=_spread(fit.support, kept)[larger] | entering[larger],
         )
-        with problem.watch.stage(_weighed(whole)):
+        with problem.monitor.stage(_weighed(whole)):
             tried = settle(widened, max_terms=max_terms)
         if tried.rank >= found.rank:
             break
-        found = problem.watch.best = tried
+        found = problem.monitor.best = tried
     return found
 
 
@@ -116,15 +123,15 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
     sizes = np.bincount(problem.block[~kept], minlength=len(problem.states))
     if problem.C is not None or not problem.measured.all() or (sizes <= SMALL).all():
         return np.ones_like(kept)
-    start = smoothed(problem, None)
+    start = smooth_states(problem, None)
     steps = _integrals(problem, start.path)
     for block in np.flatnonzero(sizes).tolist():
         own = np.flatnonzero((problem.block == block) & ~problem.required)
         if len(own) <= SMALL:
             kept[own] = True
             continue
-        for rho in WARM:
-            level = Level(start.noise, rho)
+        for model_error in FIRST_MODEL_ERRORS:
+            level = Level(start.noise, model_error)
             fit = TrajectoryFit(problem, level, start.path, np.zeros(problem.n_free), kept)
             quadratic, linear, offset = _own_squares(fit, steps, block, own)
             size = np.sqrt(zero_to_one(np.diag(quadratic)))
@@ -185,10 +192,10 @@ def _own_squares(
     columns = steps[:, fit.problem.column[own]]
     flow = np.concatenate([np.ones((len(columns), 1)), columns], axis=1)[:, None]
     residuals, apparent, _ = observe(record, path, np.square(fit.level.noise))
-    misses = -np.diff(path[:, one], axis=0)
-    flow[record.breaks] = misses[record.breaks] = 0.0
+    defects = -np.diff(path[:, one], axis=0)
+    flow[record.breaks] = defects[record.breaks] = 0.0
     quadratic, linear, offset, _ = eliminate(
-        np.ascontiguousarray(flow), misses, np.ascontiguousarray(residuals[:, one]),
+        np.ascontiguousarray(flow), defects, np.ascontiguousarray(residuals[:, one]),
         np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(fit.process[:, one]),
         FREE_START,
     )  # fmt: skip
@@ -212,12 +219,12 @@ def _would_pay(
     enters = np.zeros_like(kept)
     if kept.all() or not np.isfinite(found.score):
         return enters
-    fit = at_level(found.fit, replace(found.fit.level, rho=WEIGHED_AT))
+    fit = at_level(found.fit, replace(found.fit.level, model_error=COMPARED_AT))
     gains = _gains(problem, fit) - term_prices(problem, float(problem.n_samples))
     gains[kept] = -np.inf
     for block in range(len(problem.states)):
         own = np.flatnonzero((problem.block == block) & (gains > 0.0))
-        enters[own[np.argsort(-gains[own])[:MOST_ENTER]]] = True
+        enters[own[np.argsort(-gains[own])[:MOST_ADMITTED]]] = True
     return enters
 
 
@@ -233,9 +240,9 @@ def _gains(problem: EstimationProblem, fit: TrajectoryFit) -> Float[np.ndarray, 
     rng, inverse = np.random.default_rng(0), inverse_of(quadratic)
     for _ in range(N_PROBES):
         noise = std * rng.standard_normal(std.shape)
-        without = _weighted_misses(about, noise, np.zeros(len(inverse)))
+        without = _weighted_defects(about, noise, np.zeros(len(inverse)))
         gradient = np.einsum("kd,kds->s", without, about.slopes[:, :, fit.path.shape[1] :])
-        fitted = _weighted_misses(about, noise, -inverse @ gradient)
+        fitted = _weighted_defects(about, noise, -inverse @ gradient)
         with_states += np.square(terms.T @ without) / N_PROBES
         with_all += np.square(terms.T @ fitted) / N_PROBES
     # A term that the chosen ones span leaves only rounding: it is not available.
@@ -244,7 +251,7 @@ def _gains(problem: EstimationProblem, fit: TrajectoryFit) -> Float[np.ndarray, 
     return gains[problem.column, problem.equation]
 
 
-def _weighted_misses(
+def _weighted_defects(
     about: Linearised,
     noise: Float[np.ndarray, "samples d"],
     change: Float[np.ndarray, " support"],

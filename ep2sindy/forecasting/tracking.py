@@ -1,6 +1,6 @@
 """States of a model along a record: its start and the noise, fitted to the past alone.
 
-A model follows a record apart from two errors: the noise of the samples, and a random push of every
+A model follows a record apart from two errors: the noise of the samples, and a random move of every
 state at every step (process noise), which stands for all that the model does not describe. Their
 sizes are the most likely ones for the record that the model was fitted to. States are then fitted
 to the samples of a window before any moment, by the model and under these errors.
@@ -48,7 +48,7 @@ class ModelNoise:
     """Standard deviations of the errors with which a model follows a record, in SI.
 
     samples: (n_states,), of the samples' noise; NaN for a state that is not measured.
-    process: (n_states,), of the push of every state in a mean step.
+    process: (n_states,), of the process noise of every state over a mean step.
     """
 
     samples: Float[np.ndarray, " n_states"]
@@ -265,7 +265,7 @@ def _with_likely_noise(
     n = tracker.n_substeps
     fit = _as_fit(tracker.problem, paths, tracker.free, samples, process, n_substeps=n)
     level, _ = likely_errors(fit)
-    noise = _noise_of(tracker.problem, level.noise[0], level.push)
+    noise = _noise_of(tracker.problem, level.noise[0], level.process_noise)
     return replace(tracker, noise=noise), paths
 
 
