@@ -125,7 +125,7 @@ def misfits(systems: Sequence[str], n: int) -> None:
                     found = ep.discover(run, library.take(kept), method)
                     if k == 0 and found.estimate is not None and found.misfit:
                         for state, lacks in zip(run.state_names, true[left_out], strict=True):
-                            holding[int(lacks)] += state in found.estimate.holds, 1
+                            holding[int(lacks)] += state in found.estimate.explained_states, 1
                     if k == 0 or ((found.model.coef != 0.0) == true).all():
                         counts[k, r] += bool(found.misfit), 1
         totals += counts
@@ -165,7 +165,7 @@ def short(n: int) -> None:
             found = ep.estimate(runs, LORENZ.model.library)
             cpu_s += time.process_time() - start
             right = bool(((found.model.coef != 0.0) == (LORENZ.model.coef != 0.0)).all())
-            said = "misfit" if found.misfit else "open" if found.few else "silent"
+            said = "misfit" if found.misfit else "open" if found.too_few_samples else "silent"
             rows[f"right {said}" if right else said] += 1
             misses += [] if found.misfit else [_largest_miss(found)]
         right = sum(count for word, count in rows.items() if word.startswith("right"))

@@ -1,7 +1,7 @@
 """Measured records, by the settings that a user meets: `python -m benchmarks.measured`.
 
     EP2SINDY_DATA=folder python -m benchmarks.measured laser electrochemical hallthruster
-    python -m benchmarks.measured pendulum populations current bands pushes hidden offset
+    python -m benchmarks.measured pendulum populations current bands process_noise hidden offset
 
 `+exp=trace` as it comes is run on every record; what differs is written with its row. Errors are
 root mean squares over starts, in standard deviations of the held-out samples, beside persistence
@@ -32,8 +32,8 @@ from ep2sindy.runtime.progress import SILENT
 from ep2sindy.signals.spectrum import crossing_frequency
 
 FOLDER = Path(os.environ.get("EP2SINDY_DATA", "."))
-N_DRAWS, N_PUSHED, N_SIMULATED = 10, 20, 3
-DRIFT_A, GAP, N_LONG, PUSH = 0.4, 0.05, 1_000_000, 0.05
+N_DRAWS, N_MOVED, N_SIMULATED = 10, 20, 3
+DRIFT_A, GAP, N_LONG, PROCESS = 0.4, 0.05, 1_000_000, 0.05
 SHOWN = ("verdict", "f_error", "amplitude_ratio", "waveform_error", "n_terms_searched")
 N_CYCLES = 2
 POINTS = ((300.0, 5.0), (300.0, 4.0), (300.0, 6.0), (400.0, 5.0))  # V and mg/s
@@ -222,12 +222,12 @@ def bands() -> None:
             )
 
 
-def pushes() -> None:
-    """Laws whose states are pushed at random: supports that are right, intervals that hold."""
+def process_noise() -> None:
+    """Laws whose states have process noise: supports that are right, intervals that hold."""
     for system in (ep.systems.van_der_pol(), ep.lorenz()):
         right = held = n = 0
-        for seed in range(N_PUSHED):
-            found = ep.discover(pushed(system, PUSH, seed), library_of(system))
+        for seed in range(N_MOVED):
+            found = ep.discover(moved(system, PROCESS, seed), library_of(system))
             own, truth = found.model, system.model
             if found.misfit or any(set(own.terms(s)) != set(truth.terms(s)) for s in truth.states):
                 continue
@@ -239,14 +239,14 @@ def pushes() -> None:
                 ]
                 held, n = held + sum(inside), n + len(inside)
         print(
-            f"{system.name}, pushed by {100 * PUSH:.0f} % of RMS in a period: {right} of "
-            f"{N_PUSHED} right, {held} of {n} intervals hold",
+            f"{system.name}, process noise of {100 * PROCESS:.0f} % of RMS in a period: {right} of "
+            f"{N_MOVED} right, {held} of {n} intervals hold",
             flush=True,
         )
 
 
-def pushed(system: ep.systems.System, share: float, seed: int) -> ep.Trajectory:
-    """A record with pushes that add up to a share of every state's RMS in a period; 1 % noise."""
+def moved(system: ep.systems.System, share: float, seed: int) -> ep.Trajectory:
+    """A record at 1 % noise with process noise of a share of every state's RMS in a period."""
     rng, clean, n_substeps = np.random.default_rng(seed), system.trajectory(), 10
     rms = np.sqrt(np.square(clean.states).mean(axis=0))
     turns_Hz = max(crossing_frequency(clean.t, x) for x in clean.states.T)
@@ -371,8 +371,8 @@ def neutrals(voltage: float, flow: float) -> None:
 
 
 TABLES = {each.__name__: each for each in (
-    laser, electrochemical, hallthruster, pendulum, populations, current, bands, pushes, hidden,
-    offset,
+    laser, electrochemical, hallthruster, pendulum, populations, current, bands, process_noise,
+    hidden, offset,
 )}  # fmt: skip
 
 

@@ -23,15 +23,15 @@ from ep2sindy.estimation.likelihood import (
     Gram,
     Level,
     TrajectoryFit,
+    divergence_rate,
     fit_paths,
     gram,
     innovations,
-    parting,
-    squares,
 )
 from ep2sindy.estimation.noise import _shown_by_samples
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import EXACT, Solution, from_smooth, smoothed, squares_of_steps
+from ep2sindy.estimation.solution import LackOfFit, Solution
+from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states, squares_of_steps
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
@@ -56,7 +56,7 @@ def linear_case(
 
 def dense_rows(
     flow: np.ndarray,
-    misses: np.ndarray,
+    defects: np.ndarray,
     residuals: np.ndarray,
     variance: np.ndarray,
     process: np.ndarray,
@@ -70,12 +70,12 @@ def dense_rows(
     rows = [
         states[0] / np.sqrt(free_start),
         (states / np.sqrt(variance)[..., None])[seen],
-        (steps / np.sqrt(process)[..., None]).reshape(misses.size, -1),
+        (steps / np.sqrt(process)[..., None]).reshape(defects.size, -1),
     ]
     targets = [
         np.zeros(d),
         (residuals / np.sqrt(variance))[seen],
-        (misses / np.sqrt(process)).ravel(),
+        (defects / np.sqrt(process)).ravel(),
     ]
     return np.concatenate(rows), np.concatenate(targets)
 
@@ -97,9 +97,9 @@ def test_the_spread_of_innovations_is_the_determinant_of_the_samples(
     rng: np.random.Generator, n: int, size: float
 ) -> None:
     """Products of many small variances would leave the range of numbers."""
-    flow, misses, residuals, variance, process = linear_case(rng, n=n, p=0)
+    flow, defects, residuals, variance, process = linear_case(rng, n=n, p=0)
     flow, variance, process = flow / 3.0, size * variance, size * process
-    _, _, _, log_spread = eliminate(flow, misses, residuals, variance, process, 10.0)
+    _, _, _, log_spread = eliminate(flow, defects, residuals, variance, process, 10.0)
     n, d = residuals.shape
     # Covariance of all states, from the first one's and the steps'.
     to = np.zeros((n * d, n * d))
@@ -140,10 +140,10 @@ def test_the_last_state_of_the_filter_is_that_of_the_dense_problem(
 
 
 def test_departures_are_those_of_the_dense_problem(rng: np.random.Generator) -> None:
-    flow, misses, residuals, variance, process = linear_case(rng, p=0)
-    rows, targets = dense_rows(flow, misses, residuals, variance, process, 10.0)
+    flow, defects, residuals, variance, process = linear_case(rng, p=0)
+    rows, targets = dense_rows(flow, defects, residuals, variance, process, 10.0)
     expected = np.linalg.lstsq(rows, targets, rcond=None)[0].reshape(residuals.shape)
-    found = departures(flow, misses, residuals, variance, process, 10.0)
+    found = departures(flow, defects, residuals, variance, process, 10.0)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
@@ -206,28 +206,26 @@ def test_sensitivities_are_derivatives_of_the_flow(relations: Sequence[str]) -> 
         np.testing.assert_allclose(flow.slopes[:, :, i], (up - down) / (2 * h), atol=1e-7)
 
 
-def fit_of_truth(problem: EstimationProblem, model: ep.SparseModel) -> TrajectoryFit:
-    free = truth(problem, model)
+def fit_of_truth(
+    problem: EstimationProblem, model: ep.SparseModel, process: float
+) -> TrajectoryFit:
+    free, path = truth(problem, model), problem.all_records.samples.copy()
     return TrajectoryFit(
-        tuple(r.samples.copy() for r in problem.records),
-        free,
-        free != 0.0,
-        np.full(len(problem.states), np.inf),
+        problem, Level(np.full(path.shape, 0.05), process), path, free, free != 0.0
     )
 
 
-def fitted_lorenz(process: float) -> tuple[EstimationProblem, Level, TrajectoryFit]:
+def fitted_lorenz(process: float) -> tuple[EstimationProblem, TrajectoryFit]:
     problem, _ = lorenz_problem()
-    level = Level((np.full((200, 3), 0.05),), process)
-    return problem, level, fit_paths(problem, fit_of_truth(problem, ep.lorenz().model), level)
+    return problem, fit_paths(fit_of_truth(problem, ep.lorenz().model, process))
 
 
 def test_a_fit_is_where_the_squares_have_no_slope() -> None:
-    problem, level, fit = fitted_lorenz(0.01)
+    _, fit = fitted_lorenz(0.01)
     step = np.where(fit.support, 1e-4 * np.abs(fit.free), 0.0)
     for j in np.flatnonzero(fit.support):
         change = step * (np.arange(len(step)) == j)
-        tried = [squares(problem, fit.paths, fit.free + s * change, level).sum() for s in (1, -1)]
+        tried = [replace(fit, free=fit.free + s * change).total for s in (1, -1)]
         curvature = (tried[0] + tried[1] - 2 * fit.total) / 2.0
         assert abs(tried[0] - tried[1]) < 0.05 * np.sqrt(max(curvature, 0.0))
 
@@ -237,29 +235,28 @@ def test_paths_of_the_same_record_twice_part_as_fast_as_of_one() -> None:
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 200)
     for runs in ([run], [run, run]):
         problem = scale_problem(runs, ep.lorenz().model.library)
-        level = Level(tuple(np.full((200, 3), 0.05) for _ in runs), 0.01)
-        found.append(parting(problem, fit_of_truth(problem, ep.lorenz().model), level))
+        found.append(divergence_rate(fit_of_truth(problem, ep.lorenz().model, 0.01)))
     assert found[0] > 0.001
     assert found[1] == pytest.approx(found[0], rel=1e-9)
 
 
 def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
-    problem, level, fit = fitted_lorenz(0.1)
-    pair = gram(problem, fit, level)
+    _, fit = fitted_lorenz(0.1)
+    pair = gram(fit)
     nothing = np.zeros(len(fit.free))
     assert penalise(pair, fit.support, nothing).score == pytest.approx(fit.total, abs=0.01)
     for j in np.flatnonzero(fit.support):
         support = fit.support & (np.arange(len(nothing)) != j)
         foretold = penalise(pair, support, nothing)
-        start = TrajectoryFit(fit.paths, foretold.free, support, fit.squares)
+        start = replace(fit, free=foretold.free, support=support)
         if foretold.score < fit.total + 30.0:  # within the reach of a line
-            refit = fit_paths(problem, start, level)
+            refit = fit_paths(start)
             assert refit.total == pytest.approx(foretold.score, rel=0.05)
 
 
 def test_block_by_block_finds_the_best_support_of_all() -> None:
-    problem, level, fit = fitted_lorenz(0.1)
-    pair, prices = gram(problem, fit, level), term_prices(problem, 200.0)
+    problem, fit = fitted_lorenz(0.1)
+    pair, prices = gram(fit), term_prices(problem, 200.0)
     full = best_support(problem, pair, prices, np.ones_like(fit.support), max_terms=10)
     empty = best_support(problem, pair, prices, np.zeros_like(fit.support), max_terms=10)
     assert full.score == pytest.approx(empty.score)
@@ -288,7 +285,7 @@ def test_alternatives_hold_an_exchange_between_equations_that_neither_wants_alon
 
 
 def test_a_near_miss_of_the_search_is_polished() -> None:
-    system, run = noisy("van_der_pol", 0.4, 45)  # annealed only, y^3 and x^2*y stand for x
+    system, run = noisy("van_der_pol", 0.4, 45)  # by continuation alone, y^3 and x^2*y stand for x
     assert is_right(ep.estimate([run], system.model.library).model, system)
 
 
@@ -385,8 +382,8 @@ def test_what_fits_comes_before_what_scores_lower(monkeypatch: pytest.MonkeyPatc
 
     def leaves(*given: object, max_terms: int) -> Solution:
         found = from_smooth(*given, max_terms=max_terms)
-        noise = replace(found.noise, deviance=found.noise.deviance - 1e4)
-        return replace(found, noise=noise, flow_error=0.1)
+        error = LackOfFit(np.full(2, 0.1), 0.0, "the states leave the model")
+        return replace(found, deviance=found.deviance - 1e4, tests=(error,), flow_error=0.1)
 
     monkeypatch.setattr(explanation, "from_smooth", leaves)
     system = ep.lotka_volterra()
@@ -563,7 +560,7 @@ def many_states(n_states: int) -> ep.Trajectory:
     return ep.Trajectory(t, states, [f"x{k}" for k in range(n_states)])
 
 
-def three_runs(rng: np.random.Generator) -> tuple[EstimationProblem, TrajectoryFit, Level]:
+def three_runs(rng: np.random.Generator) -> TrajectoryFit:
     """Runs with an input, of which one lacks samples and one has limits, about some paths."""
     runs = []
     for k, n in enumerate((30, 12, 21)):
@@ -580,36 +577,37 @@ def three_runs(rng: np.random.Generator) -> tuple[EstimationProblem, TrajectoryF
     upper = np.where(rng.random(last.samples.shape) < 0.3, np.inf, last.samples)
     last = replace(last, limits=Bounds(last.samples, upper, ()))
     problem = replace(problem, records=(first, second, last))
-    paths = tuple(r.samples + 0.1 * rng.normal(size=r.samples.shape) for r in problem.records)
-    free = 0.1 * rng.normal(size=problem.n_free)
-    noise = tuple(rng.uniform(0.2, 0.5, path.shape) for path in paths)
-    fit = TrajectoryFit(paths, free, np.ones(len(free), dtype=bool), np.zeros(2))
-    return problem, fit, Level(noise, 0.3, n_substeps=2)
+    samples = problem.all_records.samples
+    path, noise = samples + 0.1 * rng.normal(size=samples.shape), rng.uniform(0.2, 0.5, (63, 2))
+    free, level = 0.1 * rng.normal(size=problem.n_free), Level(noise, 0.3, n_substeps=2)
+    return TrajectoryFit(problem, level, path, free, np.ones(len(free), dtype=bool))
 
 
-@pytest.mark.parametrize("push", [None, np.array([0.1, 0.2])])
+@pytest.mark.parametrize("process_noise", [None, np.array([0.1, 0.2])])
 def test_runs_are_joined_without_a_way_from_one_to_the_next(
-    rng: np.random.Generator, push: np.ndarray | None
+    rng: np.random.Generator, process_noise: np.ndarray | None
 ) -> None:
-    problem, fit, level = three_runs(rng)
-    level, change = replace(level, push=push), 0.1 * rng.normal(size=problem.n_free)
-    moves = likelihood._moves(
-        problem, fit, level, likelihood._flow(problem, fit, fit.support, level), change
-    )
+    fit = three_runs(rng)
+    problem, level = fit.problem, replace(fit.level, process_noise=process_noise)
+    fit, change = replace(fit, level=level), 0.1 * rng.normal(size=problem.n_free)
+
+    def parts_of(fit: TrajectoryFit) -> tuple:
+        pair, (_, least, logs) = gram(fit), innovations(fit)
+        return pair.quadratic, pair.linear, least, logs, fit.squares
+
+    def move_of(fit: TrajectoryFit) -> np.ndarray:
+        return likelihood._move(likelihood.hessian_on(fit, fit.support)[3], change)
+
     totals = [0.0] * 5
     for record, path, noise, move in zip(
-        problem.records, fit.paths, level.noise, moves, strict=True
-    ):
-        alone, own = replace(problem, records=(record,)), replace(fit, paths=(path,))
-        its = replace(level, noise=(noise,))
-        flow = likelihood._flow(alone, own, fit.support, its)
-        (expected,) = likelihood._moves(alone, own, its, flow, change)
-        np.testing.assert_allclose(move, expected, rtol=1e-9, atol=1e-12)
-        pair, (_, least, logs) = gram(alone, own, its), innovations(alone, own, its)
-        parts = pair.quadratic, pair.linear, least, logs, squares(alone, (path,), fit.free, its)
-        totals = [total + part for total, part in zip(totals, parts, strict=True)]
-    pair, (_, least, logs) = gram(problem, fit, level), innovations(problem, fit, level)
-    joined = pair.quadratic, pair.linear, least, logs, squares(problem, fit.paths, fit.free, level)
+        problem.records, fit.paths, problem.split(level.noise), problem.split(move_of(fit)),
+        strict=True,
+    ):  # fmt: skip
+        alone, its = replace(problem, records=(record,)), replace(level, noise=noise)
+        own = replace(fit, problem=alone, level=its, path=path)
+        np.testing.assert_allclose(move, move_of(own), rtol=1e-9, atol=1e-12)
+        totals = [total + part for total, part in zip(totals, parts_of(own), strict=True)]
+    joined = parts_of(fit)
     for one, other in zip(joined, totals, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
 
@@ -617,7 +615,7 @@ def test_runs_are_joined_without_a_way_from_one_to_the_next(
 def test_a_pass_over_many_runs_is_a_single_call(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem, fit, level = three_runs(rng)
+    fit = three_runs(rng)
     calls: list[int] = []
 
     def tell(flow: np.ndarray, *rest: np.ndarray) -> tuple:
@@ -625,8 +623,8 @@ def test_a_pass_over_many_runs_is_a_single_call(
         return eliminate(flow, *rest)
 
     monkeypatch.setattr(likelihood, "eliminate", tell)
-    gram(problem, fit, level)
-    assert calls == [problem.n_samples - 1]
+    gram(fit)
+    assert calls == [len(fit.path) - 1]
 
 
 def test_more_coefficients_than_memory_holds_are_refused_first(
@@ -703,22 +701,22 @@ def test_the_time_is_looked_at_within_a_step_of_a_fit() -> None:
         steps += n_more
 
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 100)
-    watch = cost.Watch(limit_s=1.0, clock=clock, advance=advance)
-    problem = scale_problem([run], ep.polynomial(run.state_names, degree=2), watch=watch)
-    noise = (np.full(run.states.shape, 0.1),)
+    monitor = cost.SearchMonitor(limit_s=1.0, clock=clock, advance=advance)
+    problem = scale_problem([run], ep.polynomial(run.state_names, degree=2), monitor=monitor)
+    level = Level(np.full(run.states.shape, 0.1), 0.1)
     free, support = np.zeros(problem.n_free), np.ones(problem.n_free, dtype=bool)
-    fit = TrajectoryFit((problem.records[0].samples,), free, support, np.zeros(3))
-    now, watch.best = 2, (problem, fit)
+    fit = TrajectoryFit(problem, level, problem.records[0].samples, free, support)
+    now, monitor.best = 2, fit
     for one_pass in (
-        lambda: squares(problem, fit.paths, free, Level(noise, 0.1)),
-        lambda: gram(problem, fit, Level(noise, 0.1)),
-        lambda: smoothed(problem, None),
+        lambda: fit.squares,
+        lambda: gram(fit),
+        lambda: smooth_states(problem, None),
     ):
         with pytest.raises(cost.OutOfTimeError, match="must end within limit_s=1 s"):
             one_pass()
     assert steps == 0
-    watch.best = None  # a first model is waited for
-    assert np.isfinite(squares(problem, fit.paths, free, Level(noise, 0.1))).all()
+    monitor.best = None  # a first model is waited for
+    assert np.isfinite(fit.squares).all()
 
 
 @pytest.mark.parametrize(
@@ -730,13 +728,13 @@ def test_a_search_with_a_limit_takes_parts_of_a_long_record_first(
     """Each is as much larger as the time allows, at the pace of the one before."""
     t, now, found = np.arange(1_000_000.0), 0.0, []
     run = ep.Trajectory(t, np.sin(0.01 * t)[:, None], ["x"])
-    watch = cost.Watch(limit_s=limit_s, clock=lambda: now)
-    for part in cost.growing_parts([run], 1.0, watch):
+    monitor = cost.SearchMonitor(limit_s=limit_s, clock=lambda: now)
+    for part in cost.growing_parts([run], 1.0, monitor):
         found.append(sum(each.n_samples for each in part))
         now += 2e-4 * found[-1]
         assert part[-1].t[-1] == t[-1]  # all of the record is seen
     np.testing.assert_allclose(found, sizes, rtol=0.02)  # whole blocks
-    (whole,) = cost.growing_parts([run], 1.0, cost.Watch())
+    (whole,) = cost.growing_parts([run], 1.0, cost.SearchMonitor())
     assert whole == [run]
 
 
@@ -789,15 +787,16 @@ def test_an_interruption_within_a_kernel_is_one() -> None:
 
 
 def test_squares_whose_sum_overflows_are_infinite_and_warn_of_nothing() -> None:
-    nothing = np.zeros(0)
-    fit = TrajectoryFit((), nothing, nothing.astype(np.bool_), np.full(2, 1.5e308))
+    _, fit = fitted_lorenz(0.1)
+    fit = replace(fit, path=np.full(fit.path.shape, 3.9e151), free=np.zeros_like(fit.free))
+    assert np.isfinite(fit.squares).all()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert fit.total == np.inf
 
 
 def test_a_path_that_misses_the_steps_of_its_model_is_no_trajectory() -> None:
-    """What annealing lets pass can hold a model up: y' = a x - b x z with b of 5e3, and z' = 0."""
+    """What the continuation lets pass may hold up a model: y' = a x - b x z, b = 5e3, z' = 0."""
     rng = np.random.default_rng([5, 300, 3])
     start = rng.uniform([-10.0, -10.0, 15.0], [10.0, 10.0, 30.0])
     run = LORENZ.trajectory(noise=0.2, rng=503, initial=start).window(0, 300)
@@ -813,13 +812,13 @@ def test_right_models_meet_their_steps() -> None:
     run = LORENZ.trajectory(noise=0.2, rng=0)
     problem = scale_problem([run], LORENZ.model.library)
     found = from_smooth(problem, None, max_terms=7)
-    missed = squares_of_steps(problem, found.annealed.fit, found.annealed.level)[0]
+    missed = squares_of_steps(found.fit)[0]
     assert found.flow_error == 0.0
     assert (np.sqrt(missed / problem.n_samples) < 1e-2 * EXACT * found.noise.std).all()
 
 
 @pytest.mark.slow
-def test_pushes_alone_are_no_law() -> None:
+def test_process_noise_alone_is_no_law() -> None:
     found = ep.estimate(SHORT["60 samples, 20 %"](3), LORENZ.model.library)
     assert found.misfit or found.model.coef.any(axis=0).all()
 
@@ -827,6 +826,7 @@ def test_pushes_alone_are_no_law() -> None:
 def test_samples_that_leave_the_terms_open_are_said_to_tell_nothing() -> None:
     found = ep.estimate(SHORT["60 samples, 20 %"](0), LORENZ.model.library)
     assert re.match(
-        r"60 samples do not tell these equations from others: the chance .* is \d+%", found.few
+        r"60 samples do not tell these equations from others: the chance .* is \d+%",
+        found.too_few_samples,
     )
-    assert found.note.startswith(found.few)
+    assert found.note.startswith(found.too_few_samples)

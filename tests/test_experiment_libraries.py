@@ -178,7 +178,7 @@ def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
     # Of 91 samples, some of which the parameters take: 10 % is a standard error and a half.
     noise = [found["noise_std"][name] / s for name, s in zip(("hare", "lynx"), spread, strict=True)]
     assert noise == pytest.approx([0.02, 0.02], rel=0.25)
-    assert (found["flow_error"], found["misfit"], found["few"]) == (0.0, None, None)
+    assert (found["flow_error"], found["misfit"], found["too_few_samples"]) == (0.0, None, None)
     said = " ".join(years.log.split())
     assert "The model explains the samples as far as their noise" in said
     assert "95 % from" in years.page

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.estimation.explanation import _misfit
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit, parting
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit, divergence_rate
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.model.flow import Steps, _in_arrays, ends, flow
@@ -71,9 +70,9 @@ def test_paths_part_by_twice_the_positive_exponents(rate: float, expected: float
     run = ep.Trajectory(np.arange(400.0), np.exp(np.arange(400.0)[:, None] / 400.0), ["x"])
     problem = scale_problem([run], ep.polynomial(["x"], degree=1))
     free = np.array([0.0, rate])
-    fit = TrajectoryFit((np.zeros((400, 1)),), free, free != 0.0, np.array([np.inf]))
-    level = Level((np.full((400, 1), 0.1),), 1e-4, n_substeps=4)
-    assert parting(problem, fit, level) == pytest.approx(expected, abs=0.05)
+    level = Level(np.full((400, 1), 0.1), 1e-4, n_substeps=4)
+    fit = TrajectoryFit(problem, level, np.zeros((400, 1)), free, free != 0.0)
+    assert divergence_rate(fit) == pytest.approx(expected, abs=0.05)
 
 
 def test_a_model_that_could_follow_any_samples_is_a_misfit() -> None:
@@ -81,12 +80,12 @@ def test_a_model_that_could_follow_any_samples_is_a_misfit() -> None:
     problem = scale_problem([run], ep.polynomial(run.state_names, degree=2))
     found = from_smooth(problem, None, max_terms=7)
     assert found.fits
-    assert found.parting < 0.05
-    steered = replace(found, parting=4.0)
-    assert not steered.fits
-    assert "part by a factor of 7.4 per sample, so it could follow any samples" in _misfit(
-        problem, steered
-    )
+    (apart,) = [test for test in found.tests if "paths beside" in test.words]
+    assert (apart.statistic < np.exp(0.05 / 2.0)).all()
+    diverging = replace(found, tests=(replace(apart, statistic=np.full(2, np.exp(4.0 / 2.0))),))
+    assert not diverging.fits
+    (sign,) = diverging.signs
+    assert "part by a factor of 7.4 per sample, so it could follow any samples" in sign
 
 
 # The first is a long curved way off, where ten straight steps end far from the minimum. The second

@@ -9,10 +9,10 @@ import ep2sindy as ep
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_guess_by, with_guesses
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit, hessian, observe
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit, hessian_on, observe
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import scale_problem
-from ep2sindy.estimation.solver import AnnealedFit, astray
+from ep2sindy.estimation.solver import MAX_HIDDEN_DEFECT, hidden_defects
 from ep2sindy.library.relations import relations_of
 from tests.programs import composed, computed
 
@@ -107,9 +107,10 @@ def test_a_hidden_state_that_shrinks_gains_no_freedom() -> None:
     for factor in (1.0, 1e-6):
         path = problem.records[0].samples * [1.0, factor]
         free = np.zeros(problem.n_free)
-        fit = TrajectoryFit((path + np.array([0.05, 0.0]),), free, free != 0.0, np.zeros(2))
-        noise = noise_beside(problem, fit)
-        sizes.append(noise.white[0][0])
+        level = Level(np.ones(path.shape), 1.0)
+        fit = TrajectoryFit(problem, level, path + np.array([0.05, 0.0]), free, free != 0.0)
+        noise = noise_beside(fit)
+        sizes.append(noise.white[0])
         assert noise.kurtosis[1] != noise.kurtosis[1]  # NaN: there is no noise of it
     assert sizes[1][0] == sizes[0][0]
     assert sizes[1][1] == pytest.approx(1e-6 * sizes[0][1])
@@ -176,15 +177,15 @@ def test_a_hidden_state_that_follows_nothing_is_astray() -> None:
     run = PLANE.trajectory(noise=0.05, rng=0).window(0, 40)
     problem = scale_problem([run], ep.polynomial(["x", "y"], degree=1), measured=["x"])
     free, still = np.zeros(problem.n_free), np.ones(40)  # nothing moves
-    everything, cold = np.ones(len(free), dtype=bool), Level((np.ones((40, 2)),), 1e-4)
+    everything, cold = np.ones(len(free), dtype=bool), Level(np.ones((40, 2)), 1e-4)
     for hidden, is_astray in (
         (np.sin(np.arange(40.0)), True),
         (1e-9 * np.sin(np.arange(40.0)), True),
         (still, False),
     ):
         path = np.column_stack([np.sin(np.arange(40.0)), hidden])
-        fit = TrajectoryFit((path,), free, everything, np.zeros(2))
-        assert astray(problem, AnnealedFit(fit, cold, 0.0)).tolist() == [False, is_astray]
+        share = hidden_defects(TrajectoryFit(problem, cold, path, free, everything))
+        assert (share > MAX_HIDDEN_DEFECT).tolist() == [False, is_astray]
 
 
 def test_what_was_not_measured_counts_nothing() -> None:
@@ -199,16 +200,12 @@ def test_what_was_not_measured_counts_nothing() -> None:
     assert not seen.squares[:, 1].any()
     assert problem.n_squares == 40
     free = np.zeros(problem.n_free)
-    fit = TrajectoryFit((path,), free, np.ones(len(free), dtype=bool), np.zeros(2))
-    level = Level((0.1 * ones,), 1.0)
-
-    def flow(record, path):
-        return problem.flow(record, path[:-1], free, fit.support, 1)
-
-    least = hessian(problem, fit, level, flow)[2]
+    level = Level(0.1 * ones, 1.0)
+    fit = TrajectoryFit(problem, level, path, free, np.ones(len(free), dtype=bool))
+    least = hessian_on(fit, fit.support)[2]
     far = replace(record, samples=record.samples + np.array([0.0, 5.0]))  # a guess is no sample
     moved = replace(problem, records=(far,))
-    assert hessian(moved, fit, level, flow)[2] == pytest.approx(least)
+    assert hessian_on(replace(fit, problem=moved), fit.support)[2] == pytest.approx(least)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from benchmarks.known_systems import KINDS, noisy
 from benchmarks.spoilt import spoilt
 from ep2sindy.data.gaps import between_gaps
 from ep2sindy.estimation import explanation
-from ep2sindy.estimation.likelihood import TrajectoryFit
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit
 from ep2sindy.estimation.noise import ALIKE_SAMPLES, Noise, noise_beside
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
@@ -26,10 +26,10 @@ def noise_of(
 ) -> Noise:
     """The noise beside given paths, in SI, of a model of no terms."""
     problem = scale_problem(runs, library or ep.polynomial(runs[0].state_names, degree=2))
-    n, d = problem.n_free, len(problem.states)
-    scaled = tuple(path / problem.scale for path in paths)
-    none = np.zeros(n, dtype=np.bool_)
-    return noise_beside(problem, TrajectoryFit(scaled, np.zeros(n), none, np.zeros(d)))
+    path, none = np.concatenate(paths) / problem.scale, np.zeros(problem.n_free)
+    return noise_beside(
+        TrajectoryFit(problem, Level(np.ones(path.shape), 1.0), path, none, none > 0.0)
+    )
 
 
 def at_rest(run: ep.Trajectory) -> np.ndarray:
@@ -127,11 +127,11 @@ def test_a_delay_competes_with_products_of_one_degree_more(draw: str, lacks: boo
     )
     problem = replace(problem, widen=lambda: wider)
     found = from_smooth(problem, None, max_terms=7)
-    late = explanation._align(problem, found, 7)
+    late = explanation._align(found, 7)
     if lacks:  # whatever delay its false equations may have
-        late = explanation.Aligned(problem, found, np.array([0.5, 0.0]), found.score)
+        late = found
     assert late is not None
-    assert ("up to degree 3" in explanation._lacks_terms(problem, late, 7)) == lacks
+    assert ("up to degree 3" in explanation._lacks_terms(late, 7)) == lacks
 
 
 def test_a_delay_at_three_standard_errors_is_none() -> None:

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.estimation.explanation import missing_state
 from ep2sindy.estimation.problem import scale_problem
+from ep2sindy.estimation.unobserved import unobserved_state
 from ep2sindy.systems.systems import System, van_der_pol
 from tests.models import model_of
 
@@ -113,10 +113,10 @@ def test_an_equation_that_is_closed_holds_beside_one_that_is_not() -> None:
     run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 1500)
     two = ep.Trajectory(run.t, run.states[:, :2], ["x", "y"])
     found = ep.estimate(two, ep.polynomial(["x", "y"], degree=2))
-    assert found.holds == ("x",)
+    assert found.explained_states == ("x",)
     assert found.misfit.startswith("no law of this library explains y: a term or a state is missi")
     assert found.model.terms("x") == pytest.approx({"x": -10.0, "y": 10.0}, rel=0.02)
-    assert found.push_std[1] > 5.0 * found.push_std[0]
+    assert found.process_noise_std[1] > 5.0 * found.process_noise_std[0]
     assert found.model.covariance is None
 
 
@@ -127,7 +127,7 @@ def problem_of(run: ep.Trajectory, degree: int = 2):
 def test_a_single_state_that_swings_lacks_another() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     one = ep.Trajectory(run.t[::3], run.states[::3, :1], ["x"])
-    assert missing_state(problem_of(one)).startswith("x passes the same values up and down")
+    assert unobserved_state(problem_of(one)).startswith("x passes the same values up and down")
     found = ep.estimate(one, ep.polynomial(["x"], degree=2))
     assert "A state is missing for certain: x passes the same" in found.misfit
     assert "Name a hidden state (hidden=[...])" in found.misfit
@@ -144,8 +144,8 @@ def test_a_path_that_crosses_itself_lacks_a_state() -> None:
     )
     system = System("rossler", model, np.array([1.0, -4.0, 0.1]), 80.0, 20.0)
     run = system.trajectory(noise=0.005, rng=0)
-    whole = missing_state(problem_of(run))
-    plane = missing_state(problem_of(ep.Trajectory(run.t, run.states[:, [0, 2]], ["x", "z"])))
+    whole = unobserved_state(problem_of(run))
+    plane = unobserved_state(problem_of(ep.Trajectory(run.t, run.states[:, [0, 2]], ["x", "z"])))
     assert whole == ""
     assert plane == "the path of x and z crosses itself, which no law of x and z alone does"
 
@@ -153,11 +153,11 @@ def test_a_path_that_crosses_itself_lacks_a_state() -> None:
 @pytest.mark.parametrize("system", [ep.lotka_volterra(), van_der_pol()], ids=lambda s: s.name)
 @pytest.mark.parametrize("noise", [0.0, 0.02, 0.1])
 def test_two_states_with_a_law_never_show_that_one_is_missing(system: System, noise: float) -> None:
-    assert missing_state(problem_of(system.trajectory(noise=noise, rng=1))) == ""
+    assert unobserved_state(problem_of(system.trajectory(noise=noise, rng=1))) == ""
 
 
 def test_inputs_may_move_a_state_up_and_down() -> None:
     t = np.linspace(0.0, 20.0, 400)
     drive = np.sin(t)[:, None]
     run = ep.Trajectory(t, np.cos(t)[:, None], ["x"], inputs=drive, input_names=["u"])
-    assert missing_state(scale_problem([run], ep.polynomial(["x", "u"], degree=1))) == ""
+    assert unobserved_state(scale_problem([run], ep.polynomial(["x", "u"], degree=1))) == ""

@@ -4,6 +4,7 @@ as assumed, states and samples that come twice."""
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ import ep2sindy as ep
 from benchmarks.spoilt import spoilt
 from ep2sindy.data.coerce import check_repeats
 from ep2sindy.data.sensor import bounds_of
-from ep2sindy.estimation.lateness import delayed_gram, move_channels
+from ep2sindy.estimation.delay import delayed_gram, shift_channels
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, between, gram, observe
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.systems.systems import System
@@ -169,7 +170,10 @@ def late_record(delays: tuple[float, ...]) -> tuple[EstimationProblem, System]:
 
 def fit_of_samples(problem: EstimationProblem, system: System) -> TrajectoryFit:
     free = system.model.coef[problem.column, problem.equation] / problem.to_SI
-    return TrajectoryFit(tuple(r.samples for r in problem.records), free, free != 0.0, np.zeros(3))
+    path = problem.all_records.samples
+    return TrajectoryFit(
+        problem, Level(np.full(path.shape, 1e-2), 1e-2, 2), path, free, free != 0.0
+    )
 
 
 def test_delays_are_found_to_second_order_beside_the_true_equations() -> None:
@@ -178,9 +182,9 @@ def test_delays_are_found_to_second_order_beside_the_true_equations() -> None:
         delays = (0.0, size, -0.5 * size)
         problem, system = late_record(delays)
         fit = fit_of_samples(problem, system)
-        level = Level((np.full(fit.paths[0].shape, 1e-2),), 1e-2, 4)
+        fit = replace(fit, level=replace(fit.level, n_substeps=4))
         late = np.array([False, True, True])
-        found, std = delayed_gram(problem, fit, level).of(late).delays(fit.support)
+        found, std = delayed_gram(fit).of(late).delays(fit.support)
         errors.append(np.abs(found - delays[1:]).max())
         assert (std > 0.0).all()
     assert errors[0] < 0.01
@@ -190,8 +194,7 @@ def test_delays_are_found_to_second_order_beside_the_true_equations() -> None:
 def test_without_delays_the_gram_pair_is_the_plain_one() -> None:
     problem, system = late_record((0.0, 0.3, 0.0))
     fit = fit_of_samples(problem, system)
-    level = Level((np.full(fit.paths[0].shape, 1e-2),), 1e-2, 2)
-    plain, delayed = gram(problem, fit, level), delayed_gram(problem, fit, level).at_rest
+    plain, delayed = gram(fit), delayed_gram(fit).at_rest
     np.testing.assert_allclose(delayed.quadratic, plain.quadratic, rtol=1e-9)
     np.testing.assert_allclose(delayed.linear, plain.linear, rtol=1e-9, atol=1e-9)
     assert delayed.offset == pytest.approx(plain.offset)
@@ -200,7 +203,7 @@ def test_without_delays_the_gram_pair_is_the_plain_one() -> None:
 def test_moved_samples_are_those_of_the_time_they_belong_to() -> None:
     late, _ = late_record((0.0, 1.5, -2.25))
     right, _ = late_record((0.0, 0.0, 0.0))
-    (found,) = move_channels(
+    (found,) = shift_channels(
         late, [r.samples for r in late.records], np.array([0.0, 1.5, -2.25])
     ).records
     assert len(found.samples) == 300 - 3 - 2  # 2.25 steps at the start, 1.5 at the end

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +15,7 @@ from ep2sindy.estimation import working_set
 from ep2sindy.estimation.explanation import explain
 from ep2sindy.estimation.likelihood import Gram, gram
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import WEIGHED_AT, Solution, at_level, from_smooth
+from ep2sindy.estimation.solver import COMPARED_AT, Solution, at_level, from_smooth
 from ep2sindy.estimation.supports import inverse_of, term_prices
 from ep2sindy.estimation.working_set import first_set
 from ep2sindy.regression import searches
@@ -195,12 +196,12 @@ def test_scores_tell_what_a_term_would_bring() -> None:
     true = mask_of(problem, system)
     part = problem.restricted(true)
     found = from_smooth(part, None, max_terms=7)
-    fit, level = at_level(part, found.annealed.fit, found.annealed.level)
-    fit, level = at_level(part, fit, type(level)(level.noise, WEIGHED_AT, level.n_substeps))
+    fit = at_level(found.fit, found.fit.level)
+    fit = at_level(fit, replace(fit.level, model_error=COMPARED_AT))
     every = working_set._spread(fit.free, true)
-    gains = working_set._gains(problem, part, fit, level)
-    whole = type(fit)(fit.paths, every, true, fit.squares)
-    exact = exact_gains(gram(problem, whole, level), true)
+    gains = working_set._gains(problem, fit)
+    whole = replace(fit, problem=problem, free=every, support=true)
+    exact = exact_gains(gram(whole), true)
     large = ~true & (exact > 1.0)
     assert large.sum() > 20
     ratio = gains[large] / exact[large]
@@ -217,12 +218,13 @@ def test_a_true_term_outside_the_set_enters(monkeypatch: pytest.MonkeyPatch) -> 
     kept[np.flatnonzero(true)[[1, 6]]] = False
     monkeypatch.setattr(working_set, "first_set", lambda problem, max_terms: kept)
     found = explain(problem, max_terms=7, align=False)
-    assert chosen(problem, found.problem, found.solution) == true.tolist()
+    assert chosen(problem, found.solution) == true.tolist()
 
 
-def chosen(problem: EstimationProblem, part: EstimationProblem, found: Solution) -> list[bool]:
+def chosen(problem: EstimationProblem, found: Solution) -> list[bool]:
+    part = found.problem
     coef = np.zeros((len(problem.library), len(problem.states)))
-    values = part.coef_SI(found.annealed.fit.free)
+    values = part.coef_SI(found.fit.free)
     coef[part.places[part.column], part.equation] = values
     return (coef[problem.column, problem.equation] != 0.0).tolist()
 
@@ -282,4 +284,4 @@ def test_products_do_not_stand_in_for_linear_terms_of_a_transient(noise: float, 
     assert not found.model.coef[library.degrees > 1].any()
     right = ((found.model.coef[1:7].T != 0.0) == (matrix != 0.0)).all()
     # Six decaying states of one transient look alike: where terms are wrong, it is said.
-    assert right or "samples do not tell these equations from others" in found.few
+    assert right or "samples do not tell these equations from others" in found.too_few_samples

@@ -37,19 +37,19 @@ class OutOfTimeError(Exception):
 
 
 @dataclass(eq=False)
-class Watch:
+class SearchMonitor:
     """Shows how a search goes, keeps the best that it has found, and ends it at its limit.
 
     limit_s: wall time after which the search ends, once there is a first model; None for no limit.
-    clock: tells the time, in s. best: a problem and its best solution so far, or its latest fit;
-    None before there is one. ended: true once the search was ended early.
+    clock: tells the time, in s. best: the best solution so far, or the latest fit before there is
+    one; None before that. ended: true once the search was ended early.
     """
 
     progress: Progress = SILENT
     limit_s: float | None = None
     clock: Callable[[], float] = field(default_factory=lambda: time.monotonic)
     advance: Advance = nothing
-    best: tuple[Any, Any] | None = None
+    best: Any = None
     ended: bool = False
 
     def __post_init__(self) -> None:
@@ -85,7 +85,7 @@ class Watch:
 
 
 def growing_parts(
-    runs: Sequence[Trajectory], bytes_each: float, watch: Watch
+    runs: Sequence[Trajectory], bytes_each: float, monitor: SearchMonitor
 ) -> Iterator[Sequence[Trajectory]]:
     """The runs; if the search has a limit, parts of long ones first, so that there is a model soon.
 
@@ -93,12 +93,12 @@ def growing_parts(
     many bytes a sample.
     """
     n = sum(run.n_samples for run in runs)
-    sizes = [] if watch.limit_s is None else [size for size in PARTS if 2 * size < n]
+    sizes = [] if monitor.limit_s is None else [size for size in PARTS if 2 * size < n]
     for size, following in pairwise([*sizes, n]):
-        began = watch.elapsed_s
+        began = monitor.elapsed_s
         yield spread_blocks(runs, most=size, block=size // BLOCKS)
-        ends = watch.elapsed_s + (watch.elapsed_s - began) * following / size
-        if watch.ended or ends > watch.limit_s or bytes_each * following > free_bytes():
+        ends = monitor.elapsed_s + (monitor.elapsed_s - began) * following / size
+        if monitor.ended or ends > monitor.limit_s or bytes_each * following > free_bytes():
             return
     yield runs
 

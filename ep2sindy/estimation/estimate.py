@@ -1,6 +1,6 @@
 """Joint estimation of states and sparse coefficients, and the report of its result.
 
-Besides the model, the result holds remarks: sentences about the samples and their noise.
+Besides the model, the result explained_states remarks: sentences about the samples and their noise.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -15,31 +16,24 @@ from jaxtyping import Float
 from ep2sindy.data.coerce import Task, check_domain
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.estimation.cost import Watch, check_limit_s, check_size, growing_parts
+from ep2sindy.estimation.cost import SearchMonitor, check_limit_s, check_size, growing_parts
 from ep2sindy.estimation.explanation import Explanation, explain
 from ep2sindy.estimation.hidden import Entrance, with_guesses
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
-from ep2sindy.estimation.noise import FLOOR, Noise
 from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem, by_run, scale_problem
-from ep2sindy.estimation.solver import (
-    SAMPLES_PER_TERM,
-    Solution,
-    enough_samples,
-)
+from ep2sindy.estimation.remarks import remark
+from ep2sindy.estimation.solution import Solution
+from ep2sindy.estimation.solver import SAMPLES_PER_TERM, enough_samples
 from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Constraint, Relation, relations_of
 from ep2sindy.library.roles import Roles, constraint_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
-from ep2sindy.runtime.screen import joined
 from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
 MIN_ODDS = 1e-3  # rivals with lower odds are not reported
-HEAVY, STANDARD_ERRORS = 4.0, 5.0  # least kurtosis reported; least excess over 3
-COLLINEAR = 5.0  # standard errors by which a variance may exceed that of noise
-PART = 0.05  # share of the largest part: states with less are left out of a relation
 TOLD = 0.5  # least probability of all supports; with less, the samples do not tell which it is
 EVEN = 0.2  # above these odds of a rival, the choice is reported as undecided
 
@@ -77,11 +71,11 @@ class Estimate:
     noise_std: (d,), standard deviation of the samples' noise, in SI; NaN for hidden states. memory:
     (d,), correlation of this noise from one sample to the next, 0 for white noise.
     flow_error: size of the deviation of the states from the model over one sampling step, as a
-    share of the noise; 0 if the residuals are nothing but noise. push_std: (d,), of the random push
-    that every state receives over a mean step, in SI; 0 if an exact trajectory explains the
-    samples. misfit: the reason why these equations do not explain the data; empty if they do. few:
-    a remark if there are too few samples to decide; otherwise empty. holds: of a misfit, the states
-    whose equations explain their samples all the same.
+    share of the noise; 0 if the residuals are nothing but noise. process_noise_std: (d,), of what
+    moves every state at random over a mean step, in SI; 0 if an exact trajectory explains the
+    samples. misfit: the reason why these equations do not explain the data; empty if they do.
+    too_few_samples: a remark if they are too few to decide; otherwise empty. explained_states: of a
+    misfit, the states whose equations explain their samples all the same.
     supports: for each state, the best supports of every size. rivals: other plausible supports, the
     most likely first.
     remarks: sentences on where the samples deviate from the assumptions: limits of sensors, noise
@@ -99,15 +93,15 @@ class Estimate:
     memory: Float[np.ndarray, " d"]
     flow_error: float
     misfit: str
-    few: str
+    too_few_samples: str
     supports: Mapping[str, Sequence[ScoredSupport]] = field(repr=False)
     rivals: Sequence[Rival]
     remarks: tuple[str, ...]
     kurtosis: Float[np.ndarray, " d"]
     growth: Float[np.ndarray, " d"]
     delays_s: Float[np.ndarray, " d"]
-    push_std: Float[np.ndarray, " d"]
-    holds: tuple[str, ...]
+    process_noise_std: Float[np.ndarray, " d"]
+    explained_states: tuple[str, ...]
     constraint: Constraint | None = field(default=None, repr=False)
 
     @property
@@ -116,11 +110,11 @@ class Estimate:
         if self.misfit:
             return self.misfit
         if not self.rivals:
-            return self.few or "no other support of an equation has odds above 1:1000"
+            return self.too_few_samples or "no other support of an equation has odds above 1:1000"
         first = self.rivals[0]
         odds = f"{first.state}' of {', '.join(first.terms)} at odds of 1:{1.0 / first.odds:.3g}"
-        if self.few:
-            return f"{self.few}; next is {odds}"
+        if self.too_few_samples:
+            return f"{self.too_few_samples}; next is {odds}"
         return f"{'not decided' if first.odds > EVEN else 'the next best'}: {odds}"
 
 
@@ -157,6 +151,12 @@ def estimate(
     is taken. limit_s: wall time after which the search ends with the best that it has, and says so;
     of long records it takes parts first. progress: True shows bars, see `Progress`; an interruption
     (Ctrl-C) then ends the search in the same way.
+
+    >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
+    >>> found = ep.estimate(run, ep.polynomial(["x", "y"], degree=2))
+    >>> sorted(found.model.terms("x"))
+    ['x', 'x*y']
+
     Raises ValueError for fewer than one term, a limit that is not positive, a library that needs
     more samples than there are or more memory, an unknown input or course, or whatever a `Task`
     refuses.
@@ -192,48 +192,54 @@ def estimate_task(
     check_limit_s(limit_s)
     tied = bool(task.relations or task.hidden or task.roles)
     bytes_each = check_size(task.runs, task.library, task.terms, tied=tied, limit_s=limit_s)
-    watch, found, part = Watch(progress, limit_s), None, task.runs
-    for larger in growing_parts(task.runs, bytes_each, watch):
-        latest = _answer(replace(task, runs=larger), max_terms, align, courses, watch)
-        if found is None or not watch.ended:  # a larger part tells more, once it is done with
+    monitor, found, part = SearchMonitor(progress, limit_s), None, task.runs
+    settings = _Settings(max_terms, align, courses, monitor)
+    for larger in growing_parts(task.runs, bytes_each, monitor):
+        latest = _answer(replace(task, runs=larger), settings)
+        if found is None or not monitor.ended:  # a larger part tells more, once it is done with
             found, part = latest, larger
     assert found is not None
     answer, runs = found
     if part is not task.runs:
-        answer = replace(answer, said=(_part_words(part, task.runs, limit_s), *answer.said))
+        answer = replace(answer, remarks=(_part_words(part, task.runs, limit_s), *answer.remarks))
     library = task.library
     if task.roles is not None:
         library = task.roles.with_known_terms(library, task.states)
     model = _model(answer, library, units or runs[0].units, provenance or {})
-    return replace(_report(answer, model, runs, progress), constraint=_held(answer, task, library))
+    return replace(
+        _report(answer, model, runs, progress), constraint=_role_constraint(answer, task, library)
+    )
 
 
-def _held(answer: Explanation, task: Task, library: Library) -> Constraint | None:
+def _role_constraint(answer: Explanation, task: Task, library: Library) -> Constraint | None:
     """What the roles that are played make of the model's coefficients; None without roles."""
     if task.roles is None:
         return None
-    used = answer.solution.annealed.fit.free != 0.0
+    used = answer.solution.fit.free != 0.0
     played = list(compress(answer.problem.processes, used))
     return constraint_of(library, task.states, played, task.roles.told)
 
 
-def _answer(
-    task: Task,
-    max_terms: int | None,
-    align: bool,
-    courses: Mapping[str, str] | None,
-    watch: Watch,
-) -> tuple[Explanation, Sequence[Trajectory]]:
+class _Settings(NamedTuple):
+    """Of a search, see `estimate`; monitor: shows and limits it."""
+
+    max_terms: int | None
+    align: bool
+    courses: Mapping[str, str] | None
+    monitor: SearchMonitor
+
+
+def _answer(task: Task, settings: _Settings) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task from all of its runs."""
-    best = []
+    best, monitor = [], settings.monitor
     for group in with_guesses(task) if task.hidden else [[(task, ())]]:
         tried = []
         for known, ways in group:
-            tried.append(_try(task, known, ways, max_terms, align, courses, watch))
-            if watch.ended:
+            tried.append(_try(task, known, ways, settings))
+            if monitor.ended:
                 break
         best.append(min(tried, key=lambda each: each[0].rank))
-        if watch.ended or not best[-1][0].misfit:
+        if monitor.ended or not best[-1][0].misfit:
             break
     answer, runs = min(best, key=lambda each: bool(each[0].misfit))
     return answer, runs
@@ -250,13 +256,7 @@ def _part_words(
 
 
 def _try(
-    task: Task,
-    known: Task,
-    ways: Sequence[Entrance],
-    max_terms: int | None,
-    align: bool,
-    courses: Mapping[str, str] | None,
-    watch: Watch,
+    task: Task, known: Task, ways: Sequence[Entrance], settings: _Settings
 ) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task by one way in which its hidden states may enter."""
     check_runs(known)
@@ -265,15 +265,17 @@ def _try(
     def problem_of(library: Library) -> EstimationProblem:
         return scale_problem(
             known.runs, library, known.relations, known.terms, measured=measured,
-            exclude=known.exclude, courses=courses, roles=known.roles, watch=watch,
+            exclude=known.exclude, courses=settings.courses, roles=known.roles,
+            monitor=settings.monitor,
         )  # fmt: skip
 
     problem = replace(
         problem_of(known.library), widen=lambda: problem_of(_with_degree_more(known.library))
     )
-    found = explain(problem, max_terms=max_terms, align=align)
-    said = (*_lonely_words(known.runs, problem), *(way.words for way in ways), *found.said)
-    return replace(found, said=said), known.runs
+    found = explain(problem, max_terms=settings.max_terms, align=settings.align)
+    ways_in = (way.words for way in ways)
+    words = (*_lonely_words(known.runs, problem), *ways_in, *found.remarks)
+    return replace(found, remarks=words), known.runs
 
 
 def _with_degree_more(library: Library) -> Library:
@@ -294,16 +296,16 @@ def _report(
     answer: Explanation,
     model: SparseModel,
     runs: Sequence[Trajectory],
-    watch: Progress,
+    progress: Progress,
 ) -> Estimate:
     """Convert the solution to SI, and add its rivals."""
     problem, found = answer.problem, answer.solution
-    fit, few_terms = found.annealed.fit, answer.max_terms
-    pair = gram(problem, fit, found.annealed.level)
+    fit, few_terms = found.fit, answer.max_terms
+    pair = gram(fit)
     supports = {
         state: _score_supports(problem, pair, found, block, few_terms)
         for block, state in count_pieces(
-            watch, list(enumerate(problem.states)), "equation", "rivals"
+            progress, list(enumerate(problem.states)), "equation", "rivals"
         )
     }
     # A fit follows the flow but for a little, which must not take a nonnegative state below zero.
@@ -317,15 +319,15 @@ def _report(
         memory=found.noise.memory,
         flow_error=found.flow_error,
         misfit=answer.misfit,
-        few=_few(problem, few_terms) or _open_choice(problem, supports),
+        too_few_samples=_say_too_few(problem, few_terms) or _open_choice(problem, supports),
         supports=supports,
         rivals=_rivals(problem, found, supports),
-        remarks=(*answer.said, *remarks(problem, found.noise)),
+        remarks=(*answer.remarks, *remark(problem, found.noise)),
         kurtosis=found.noise.kurtosis,
         growth=found.noise.growth,
         delays_s=answer.delays * problem.step_s,
-        push_std=answer.pushes * problem.scale,
-        holds=answer.holds,
+        process_noise_std=found.observation.process * problem.scale,
+        explained_states=answer.explained_states,
     )
 
 
@@ -360,7 +362,7 @@ def _model(
     answer: Explanation, library: Library, units: Mapping[str, str], provenance: Mapping[str, str]
 ) -> SparseModel:
     problem, found = answer.problem, answer.solution
-    fit = found.annealed.fit
+    fit = found.fit
     values = problem.coef_SI(fit.free)
     coef = np.zeros((len(library), len(problem.states)))
     column = problem.places[problem.column]
@@ -371,7 +373,7 @@ def _model(
     rows = (C[used][:, fit.support] * problem.to_SI[used, None])[order]
     # If the residuals exceed the noise, intervals would not cover the truth.
     known = found.fits and not answer.misfit
-    free_cov = covariance(problem, fit, found.annealed.level) if known else None
+    free_cov = covariance(fit) if known else None
     cov = None if free_cov is None else rows @ free_cov @ rows.T
     courses = dict(zip(problem.inputs, problem.courses, strict=True))
     return SparseModel(library, problem.states, coef, units, provenance, cov, courses=courses)
@@ -381,7 +383,7 @@ def _score_supports(
     problem: EstimationProblem, pair: Gram, found: Solution, block: int, max_terms: int
 ) -> list[ScoredSupport]:
     """Supports of one equation, by size and then by deviance."""
-    fit = found.annealed.fit
+    fit = found.fit
     if not pair.finite:
         return [ScoredSupport(_named_coef(problem, fit.free, block), 0.0)]
     chosen = penalise(pair, fit.support, found.prices).score
@@ -399,7 +401,7 @@ def _score_supports(
 def _rivals(
     problem: EstimationProblem, found: Solution, supports: Mapping[str, Sequence[ScoredSupport]]
 ) -> tuple[Rival, ...]:
-    fit = found.annealed.fit
+    fit = found.fit
     rivals = []
     for block, state in enumerate(problem.states):
         chosen = set(_named_coef(problem, fit.free, block))
@@ -410,7 +412,7 @@ def _rivals(
     return tuple(sorted(rivals, key=lambda r: -r.odds)[:MAX_RIVALS])
 
 
-def _few(problem: EstimationProblem, max_terms: int) -> str:
+def _say_too_few(problem: EstimationProblem, max_terms: int) -> str:
     if enough_samples(problem) or problem.candidates.required.all():  # or all terms are given
         return ""
     n_terms = len(problem.candidates.library)
@@ -439,60 +441,3 @@ def _open_choice(
         f"terms are right is {share:.0%}; name the terms that you know (terms=...), take a smaller "
         "library, or a longer record"
     )
-
-
-def remarks(problem: EstimationProblem, noise: Noise) -> tuple[str, ...]:
-    """Remarks on sensor limits, on noise that is not white and normal, and on collinear states."""
-    limits = [w for r in problem.records if r.limits is not None for w in r.limits.words]
-    return (
-        *(f"{words}: read as limits, not as values" for words in dict.fromkeys(limits)),
-        *(
-            f"{state} was measured at {count} of {problem.n_samples} samples"
-            for state, count in zip(problem.states, problem.n_measured.tolist(), strict=True)
-            if 0 < count < problem.n_samples
-        ),
-        *_of_noise(problem, noise),
-        *_of_collinear_states(problem, noise),
-    )
-
-
-def _of_noise(problem: EstimationProblem, noise: Noise) -> list[str]:
-    words = []
-    error = np.sqrt(24.0 / problem.n_samples)
-    for k, state in enumerate(problem.states):
-        if noise.std[k] <= FLOOR or noise.is_error[k] or not problem.measured[k]:
-            continue  # rounding, integration or model error, not noise
-        if noise.memory[k]:
-            words.append(f"noise of {state} lasts: {noise.memory[k]:.2f} from sample to sample")
-        if noise.kurtosis[k] > max(HEAVY, 3.0 + STANDARD_ERRORS * error):
-            words.append(
-                f"noise of {state} has {noise.outliers[k]} outliers beyond five standard "
-                f"deviations, kurtosis {noise.kurtosis[k]:.3g} (normal: 3)"
-            )
-        elif noise.growth[k]:
-            words.append(f"noise of {state} grows with {state}")
-    return words
-
-
-def _of_collinear_states(problem: EstimationProblem, noise: Noise) -> list[str]:
-    """Remark on measured states of which a linear combination varies no more than their noise."""
-    own, n = np.flatnonzero(problem.measured), problem.n_samples
-    if len(own) < 2 or noise.is_error.any():
-        return []  # the residuals then hold model error, perhaps as large as the states
-    samples = np.concatenate([record.samples for record in problem.records])[:, own]
-    std, scale = noise.std[own], problem.scale[own]
-    variance, directions = np.linalg.eigh(np.cov(samples / std, rowvar=False))
-    if variance[0] > 1.0 + COLLINEAR * np.sqrt(2.0 / n):
-        return []
-    # Weights in SI, and each state's part in the sum by its spread.
-    weights = directions[:, 0] / std / scale
-    parts = np.abs(weights) * samples.std(axis=0) * scale
-    held = [k for k in range(len(own)) if parts[k] > PART * parts.max()]
-    if len(held) < 2:
-        return []
-    states = {k: problem.states[own[k]] for k in held}
-    total = " ".join(f"{weights[k] / weights[held[0]]:+.3g} {name}" for k, name in states.items())
-    return [
-        f"{joined(list(states.values()))} hang together: {total.removeprefix('+')} varies no "
-        "more than their noise, so terms in one may stand for terms in the others"
-    ]

@@ -3,7 +3,11 @@
 A hidden state shows only in the rates of others, so its scale is free to choose. It is fixed by its
 entrance: a term with which it enters the equation of another state, and that term's coefficient.
 `x' = v` makes v the derivative of x, `x' = x*g` makes g its growth rate. Entrances lead to
-different equations, so all that a library allows are tried.
+different equations, so all that a library allows are tried, and the one of least -2 log likelihood
+plus prices is taken: the samples of a hidden state are missing ones (`likelihood`), and only its
+guess, from the rates of the states before it, differs between entrances. Assumed is that it moves
+measured states within the record.
+Source: Takens 1981, doi:10.1007/BFb0091924, for why one state can show the others.
 """
 
 from __future__ import annotations
@@ -114,10 +118,10 @@ def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]
     elif all(is_positive(run.t, run.states[:, 0]) for run in task.runs):
         groups = sorted(groups, key=lambda ways: ways[0][0].term == task.hidden[0])
     for group in groups:
-        yield [(_guessed(task, ways), ways) for ways in group]
+        yield [(_insert_guesses(task, ways), ways) for ways in group]
 
 
-def _guessed(task: Task, ways: Sequence[Entrance]) -> Task:
+def _insert_guesses(task: Task, ways: Sequence[Entrance]) -> Task:
     """The task with guesses of its hidden states, whose scales are fixed by relations.
 
     The equation of a single measured state has one term, unless others of it are known.
@@ -150,8 +154,8 @@ def with_guess(run: Trajectory, library: Library, ways: Sequence[Entrance]) -> T
         one = known | {way.hidden: np.ones(run.n_samples)}
         row = np.arange(len(library)) == library.index(way.term)
         factor = way.coefficient * _evaluate(library, row, one)[:, 0]
-        known, rates = _grown(run, known, rates, way.hidden, _quotient(rate, factor))
-    return _filled(run, known, units)
+        known, rates = _add_state(run, known, rates, way.hidden, _quotient(rate, factor))
+    return _insert_states(run, known, units)
 
 
 def with_guess_by(model: SparseModel, run: Trajectory) -> Trajectory:
@@ -163,7 +167,7 @@ def with_guess_by(model: SparseModel, run: Trajectory) -> Trajectory:
     lacking = [name for name in model.states if name not in run.state_names]
     units = dict(run.units) | {name: model.units.get(name, "1") for name in lacking}
     while lacking:
-        told = {name: _told(model, name, known, rates) for name in lacking}
+        told = {name: _infer_state(model, name, known, rates) for name in lacking}
         shown = [(name, values) for name, values in told.items() if values is not None]
         if not shown:
             raise ValueError(
@@ -171,12 +175,12 @@ def with_guess_by(model: SparseModel, run: Trajectory) -> Trajectory:
                 f"at a time: none of {lacking} does in those of {list(rates)}; measure one of them"
             )
         name, values = shown[0]
-        known, rates = _grown(run, known, rates, name, values)
+        known, rates = _add_state(run, known, rates, name, values)
         lacking.remove(name)
-    return _filled(run, known, units)
+    return _insert_states(run, known, units)
 
 
-def _told(
+def _infer_state(
     model: SparseModel, name: str, known: Columns, rates: Columns
 ) -> Float[np.ndarray, " samples"] | None:
     """A state by the first equation of a known state that it enters; None if it enters none.
@@ -202,7 +206,7 @@ def _smooth(run: Trajectory) -> tuple[dict[str, np.ndarray], dict[str, np.ndarra
     return known | inputs, dict(zip(run.state_names, found.derivative.T, strict=True))
 
 
-def _grown(
+def _add_state(
     run: Trajectory, known: Columns, rates: Columns, name: str, values: np.ndarray
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """The known states and rates, and one state more."""
@@ -219,7 +223,7 @@ def _quotient(
     return (rate * factor + least * mean) / (square + least)
 
 
-def _filled(run: Trajectory, known: Columns, units: Mapping[str, str]) -> Trajectory:
+def _insert_states(run: Trajectory, known: Columns, units: Mapping[str, str]) -> Trajectory:
     """The run with more states; those that were measured as they were."""
     more = [name for name in known if name not in run.names]
     return replace(

@@ -1,8 +1,18 @@
 """The likelihood of whole trajectories: states at every sample and coefficients, fitted together.
 
-The objective is the sum over all samples of ((sample - state) / noise)^2, plus the sum over all
-steps of ((flow of the state - next state) / (rho noise))^2. With rho large the states are nearly
-free; as rho falls they become an exact trajectory of the model, and the objective its chi-squared.
+The objective is, over the states x at all samples and the free coefficients z,
+
+    S(x, z) = sum_k |(y_k - x_k) / noise_k|^2
+            + sum_k |(flow(x_k; z) - x_(k+1)) / (model error * noise_k)|^2
+
+With a large model error the states are nearly free; as it falls they become an exact trajectory of
+the model, and S its chi-squared. Assumed are noise that is independent, normal and of known size,
+and nothing about the first states. Under process noise of known size its variances stand in place
+of those of the second sum, and S is -2 log of the joint density of samples and states.
+
+A fit takes Gauss-Newton steps. The normal equations of a step couple each state to the next and to
+the coefficients; a filter marginalises the states, and leaves those of the coefficients.
+Source: de Jong 1991, doi:10.1214/aos/1176348139; Schweppe 1965, doi:10.1109/TIT.1965.1053737.
 
 A sample is either a value or a pair of limits, if the sensor clipped or rounded it. A value
 contributes its squared distance in units of the noise. A pair of limits contributes -2 log of the
@@ -12,8 +22,8 @@ an apparent noise, so that the same filter serves both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import log, pi
 from typing import NamedTuple
 
@@ -28,7 +38,8 @@ from ep2sindy.model.flow import Flow
 FREE_START = 100.0  # prior variance of the first state: ten times its RMS, squared
 HELD_START = 1e-24  # the same of one that starts at zero
 MAX_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of a step tried
-STEERED = 1.0  # parting of paths, in nats per sample; chaotic systems that are resolved reach 0.3
+# Rate at which paths diverge, in nats per sample; chaotic systems that are resolved reach 0.3.
+MAX_DIVERGENCE = 1.0
 SETTLED = 1e-2  # a fall of the squares that ends the fit; a term's price is about ten
 # Give up on a fit with mean square above FAR that falls by less than this share per step.
 FAR, CRAWLS = 10.0, 0.02
@@ -45,54 +56,73 @@ LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
 class Level:
     """How closely states must follow the samples and the flow.
 
-    noise: for each record, (samples, d), standard deviations of the samples, scaled. rho: the
-    flow's error as a share of the noise. push: (d,), the flow's error itself, if it is known.
+    noise: (samples, d), standard deviations of the samples of all records, scaled. model_error: of
+    the flow, as a share of the noise. process_noise: (d,), the flow's error itself, if it is known.
     """
 
-    noise: tuple[np.ndarray, ...]
-    rho: float
+    noise: Float[np.ndarray, "samples d"]
+    model_error: float
     n_substeps: int = 1
-    push: Float[np.ndarray, " d"] | None = None
+    process_noise: Float[np.ndarray, " d"] | None = None
+
+    def with_errors(
+        self, noise: Float[np.ndarray, " d"], process_noise: Float[np.ndarray, " d"]
+    ) -> Level:
+        """The same samples with other errors, alike at all of them."""
+        return Level(np.tile(noise, (len(self.noise), 1)), 1.0, process_noise=process_noise)
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryFit:
+    """States and coefficients of a problem, fitted at a level of errors.
+
+    path: states at the samples of all records, one after the other, scaled. free: zero outside the
+    support. at_zero: states that start at zero, and would start below it; None for none.
+    """
+
+    problem: EstimationProblem
+    level: Level
+    path: Float[np.ndarray, "samples d"]
+    free: Float[np.ndarray, " free"]
+    support: Bool[np.ndarray, " free"]
+    at_zero: Bool[np.ndarray, "records d"] | None = None
 
     @property
-    def variance(self) -> Float[np.ndarray, "samples d"]:
-        """Variances of the samples of all records, one after the other."""
-        return np.square(joined(self.noise))
+    def paths(self) -> list[Float[np.ndarray, "samples d"]]:
+        """The path of each record."""
+        return self.problem.split(self.path)
+
+    @cached_property
+    def squares(self) -> Float[np.ndarray, " d"]:
+        """The objective (see the module), by state; infinite if the flow is not finite."""
+        self.problem.monitor.look()
+        record, level = self.problem.all_records, self.level
+        with np.errstate(over="ignore", invalid="ignore"):
+            defects = self.problem.ends(record, self.path[:-1], self.free, level.n_substeps)
+            defects -= self.path[1:]
+            defects[record.breaks] = 0.0
+            total = observe(record, self.path, np.square(level.noise)).squares.sum(axis=0)
+            total = total + (np.square(defects) / self.process).sum(axis=0)
+        return np.where(np.isfinite(total), total, np.inf)
+
+    @property
+    def total(self) -> float:
+        with np.errstate(over="ignore"):  # the sum is infinite then, as if one of them were
+            return float(self.squares.sum())
 
     @property
     def process(self) -> Float[np.ndarray, "steps d"]:
         """Variances of the flow's error over all steps.
 
         Those between records are of states of which nothing is known, so that a filter whose slopes
-        and misses are zero there begins each record anew.
+        and defects are zero there begins each record anew.
         """
-        if self.push is not None:
-            found = np.tile(np.square(self.push), (sum(map(len, self.noise)) - 1, 1))
-        else:
-            found = np.square(self.rho * joined(self.noise)[:-1])
-        found[np.cumsum([len(noise) for noise in self.noise])[:-1] - 1] = FREE_START
+        level = self.level
+        error = level.process_noise
+        error = level.model_error * level.noise[:-1] if error is None else error
+        found = np.square(np.broadcast_to(error, level.noise[:-1].shape))
+        found[self.problem.all_records.breaks] = FREE_START
         return found
-
-
-@dataclass(frozen=True, eq=False)
-class TrajectoryFit:
-    """Fitted states and coefficients.
-
-    paths: for each record, (samples, d), scaled. free: (free,), zero outside the support.
-    squares: (d,), the objective by state; infinite if the flow is not finite. at_zero: (records,
-    d), states that start at zero, and would start below it; None for none.
-    """
-
-    paths: tuple[np.ndarray, ...]
-    free: Float[np.ndarray, " free"]
-    support: Bool[np.ndarray, " free"]
-    squares: Float[np.ndarray, " d"]
-    at_zero: Bool[np.ndarray, "records d"] | None = None
-
-    @property
-    def total(self) -> float:
-        with np.errstate(over="ignore"):  # the sum is infinite then, as if one of them were
-            return float(self.squares.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,263 +142,223 @@ class Gram:
         return bool(np.isfinite(self.quadratic).all() and np.isfinite(self.linear).all())
 
 
-def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """The parts of all records as one array; that of a single record is not copied."""
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
-def squares(
-    problem: EstimationProblem, paths: Sequence[np.ndarray], free: np.ndarray, level: Level
-) -> Float[np.ndarray, " d"]:
-    """The objective (see the module), by state."""
-    problem.watch.look()
-    record, path = problem.all_records, joined(paths)
-    with np.errstate(over="ignore", invalid="ignore"):
-        misses = problem.ends(record, path[:-1], free, level.n_substeps) - path[1:]
-        misses[record.breaks] = 0.0
-        total = observe(record, path, level.variance).squares.sum(axis=0)
-        total = total + (np.square(misses) / level.process).sum(axis=0)
-    return np.where(np.isfinite(total), total, np.inf)
-
-
-def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> TrajectoryFit:
+def fit_paths(fit: TrajectoryFit) -> TrajectoryFit:
     """Minimise the squares over states and coefficients, which keep their signs.
 
     The result is the nearest local minimum. A coefficient that must be positive and would not be
     leaves the support, and a state that is nonnegative and would start below zero starts there.
     """
-    fit = _descend(problem, replace(fit, at_zero=None), level)
+    # The minimum without bounds, then an active set: what a bound holds leaves the unknowns, and
+    # the normal equations of the rest are solved again.
+    problem, fit = fit.problem, _descend(replace(fit, at_zero=None))
     while np.isfinite(fit.total):
         below = problem.nonnegative & [path[0] < 0.0 for path in fit.paths]
         below &= True if fit.at_zero is None else ~fit.at_zero
-        if (fit.free[problem.positive] < 0.0).any():
-            fit = _without_negative(problem, fit, level)
-        elif below.any():
+        if (fit.free[problem.positive] < 0.0).any():  # z >= 0: its row and column leave H c = g
+            fit = _without_negative(fit)
+        elif below.any():  # x_0 >= 0: the variance of its prior falls to nothing
             fit = _from_zero(fit, below)
         else:
             break
-        fit = _descend(problem, fit, level)
+        fit = _descend(fit)
     return fit
 
 
-def _without_negative(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> TrajectoryFit:
+def _without_negative(fit: TrajectoryFit) -> TrajectoryFit:
     """The fit without what least squares with bounds puts to zero, or all that is negative."""
-    negative = problem.positive & (fit.free < 0.0)
+    positive = fit.problem.positive
+    negative = positive & (fit.free < 0.0)
     kept, own = fit.support & ~negative, np.flatnonzero(fit.support)
-    quadratic, gradient = hessian_on(problem, fit, fit.support, level)[:2]
+    quadratic, gradient = hessian_on(fit, fit.support)[:2]
     if np.isfinite(quadratic).all() and np.isfinite(gradient).all():
         linear = quadratic @ fit.free[own] + gradient
-        bounded = within_bounds(quadratic, linear, problem.positive[own])
+        bounded = within_bounds(quadratic, linear, positive[own])
         kept[own] = kept[own] if bounded.all() else bounded
     return replace(fit, support=kept, free=np.where(kept & ~negative, fit.free, 0.0))
 
 
 def _from_zero(fit: TrajectoryFit, below: Bool[np.ndarray, "records d"]) -> TrajectoryFit:
     """The fit with states that start below zero at zero, where they are held."""
-    paths = tuple(path.copy() for path in fit.paths)
-    for path, own in zip(paths, below, strict=True):
-        path[0, own] = 0.0
+    path, starts = fit.path.copy(), np.append(0, fit.problem.all_records.breaks + 1)
+    path[starts] = np.where(below, 0.0, path[starts])
     held = below if fit.at_zero is None else below | fit.at_zero
-    return replace(fit, paths=paths, at_zero=held)
+    return replace(fit, path=path, at_zero=held)
 
 
-def _descend(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> TrajectoryFit:
+def _descend(fit: TrajectoryFit) -> TrajectoryFit:
     """Gauss-Newton with step halving, whatever the signs."""
-    fit = replace(fit, squares=squares(problem, fit.paths, fit.free, level))
     if not np.isfinite(fit.total):
         return fit  # no gradient to follow
     for _ in range(MAX_STEPS):
-        problem.watch.step()
-        change, moves = _step(problem, fit, level)
+        fit.problem.monitor.step()
+        change, move = _step(fit)
         if not np.isfinite(change).all():
             return fit  # derivatives overflow before the flow itself does
         share = 1.0
         while share > SHORTEST:
-            paths = tuple(p + share * m for p, m in zip(fit.paths, moves, strict=True))
-            tried = _at(problem, replace(fit, free=fit.free + share * change), paths, level)
+            tried = replace(fit, path=fit.path + share * move, free=fit.free + share * change)
             if tried.total < fit.total:
                 break
             share /= 2.0
         else:
             return fit
         gain, fit = fit.total - tried.total, tried
-        crawls = fit.total > FAR * problem.n_squares and gain < CRAWLS * fit.total
+        crawls = fit.total > FAR * fit.problem.n_squares and gain < CRAWLS * fit.total
         if crawls or (share == 1.0 and gain < SETTLED):
             return fit
     return fit
 
 
-def _at(
-    problem: EstimationProblem, fit: TrajectoryFit, paths: tuple[np.ndarray, ...], level: Level
-) -> TrajectoryFit:
-    return replace(fit, paths=paths, squares=squares(problem, paths, fit.free, level))
+def _step(
+    fit: TrajectoryFit,
+) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "samples d"]]:
+    """One Gauss-Newton step: changes of the free coefficients and of the path.
+
+    The states are marginalised, so that the normal equations of the coefficients alone remain; the
+    change of the states follows from theirs by the smoother.
+    """
+    change = np.full_like(fit.free, np.nan)
+    # Reduced normal equations, H c = g: the Schur complement of the states' block.
+    hessian, gradient, _, about = hessian_on(fit, fit.support)
+    if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
+        return change, fit.path
+    # In units of H's diagonal, with a ridge for directions that the samples do not tell.
+    size = unit_sizes(hessian)
+    scaled = hessian / np.outer(size, size) + RIDGE * np.eye(len(size))
+    step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
+    change[:] = 0.0
+    change[fit.support] = step
+    # Back-substitution into the states' block, which is block tridiagonal.
+    return change, _move(about, step)
 
 
-def parting(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> float:
+def _move(
+    about: Linearised, change: Float[np.ndarray, " support"]
+) -> Float[np.ndarray, "samples d"]:
+    """Change of the path, for a change of the coefficients."""
+    d = about.defects.shape[1]
+    defects = about.defects + about.slopes[:, :, d:] @ change
+    return departures(*about.of_states._replace(defects=defects))
+
+
+def divergence_rate(fit: TrajectoryFit) -> float:
     """How fast paths beside a fit part: nats per sample that are new, beyond a first state's.
 
     In a long record it is twice the sum of the positive Lyapunov exponents, per mean step. Where it
     is large, the least error of the flow steers the path to any sample, and the squares are no
     likelihood.
     """
-    seen, _, logs = innovations(problem, fit, level)
-    precision = np.where(np.isfinite(seen.residuals), 1.0 / seen.variance, 0.0)
-    by_record = np.add.reduceat(precision, np.append(0, problem.all_records.breaks + 1))
+    about, _, logs = innovations(fit)
+    precision = np.where(np.isfinite(about.residuals), 1.0 / about.variance, 0.0)
+    by_record = np.add.reduceat(precision, np.append(0, fit.problem.all_records.breaks + 1))
     told = logs + np.log(precision[precision > 0.0]).sum() - np.log1p(FREE_START * by_record).sum()
-    return max(float(told), 0.0) / problem.n_samples
+    return max(float(told), 0.0) / fit.problem.n_samples
 
 
-def innovations(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[Seen, float, float]:
-    """What a fit leaves of all samples, and what these add to what came before.
+def innovations(fit: TrajectoryFit) -> tuple[Linearised, float, float]:
+    """The linearisation about a fit, and what all samples add to what came before.
 
     The latter are the sum of the squares of the innovations, in their standard deviations, and the
     sum of the logarithms of their variances.
     """
-    problem.watch.look()
-    seen = observe(problem.all_records, joined(fit.paths), level.variance)
-    flow = _flow(problem, fit, np.zeros_like(fit.support), level)
-    misses = _misses(problem, fit, flow)
-    case = misses, seen.residuals, seen.variance, *_errors(problem, fit, level)
-    _, _, least, logs = eliminate(flow.slopes, *case)
-    return seen, least, logs
+    about = linearise(fit)
+    _, _, least, logs = eliminate(*about)
+    return about, least, logs
 
 
 @np.errstate(over="ignore", invalid="ignore")  # `Gram.finite` says whether the result counts
-def gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> Gram:
+def gram(fit: TrajectoryFit) -> Gram:
     """Linearise about a fit: all free coefficients of all equations, the states eliminated."""
-    everything = np.ones_like(fit.support)
-    quadratic, gradient, least = hessian_on(problem, fit, everything, level)[:3]
+    quadratic, gradient, least, _ = hessian_on(fit, np.ones_like(fit.support))
     linear = quadratic @ fit.free + gradient
     offset = least + fit.free @ quadratic @ fit.free + 2.0 * fit.free @ gradient
     return Gram(quadratic, linear, float(offset))
 
 
-def covariance(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> Float[np.ndarray, "support support"] | None:
+def covariance(fit: TrajectoryFit) -> Float[np.ndarray, "support support"] | None:
     """Covariance of the support's free coefficients, scaled; None if the fit is not finite."""
-    hessian = hessian_on(problem, fit, fit.support, level)[0]
+    hessian = hessian_on(fit, fit.support)[0]
     if not np.isfinite(hessian).all():
         return None
     size = unit_sizes(hessian)
     return np.linalg.pinv(hessian / np.outer(size, size), hermitian=True) / np.outer(size, size)
 
 
-def enough_substeps(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, share: float = 0.1
-) -> int:
+def enough_substeps(fit: TrajectoryFit, *, share: float = 0.1) -> int:
     """Number of Runge-Kutta steps between samples for an error below a share of the flow's."""
-    n = level.n_substeps
+    problem, n = fit.problem, fit.level.n_substeps
     most = min(MAX_SUBSTEPS, max(MIN_ALLOWED, MAX_IN_ALL // problem.n_samples))
-    record, starts = problem.all_records, joined(fit.paths)[:-1]
+    record, starts = problem.all_records, fit.path[:-1]
     while 2 * n <= most:
-        problem.watch.look()
+        problem.monitor.look()
         with np.errstate(over="ignore", invalid="ignore"):
             change = problem.ends(record, starts, fit.free, n)
             change -= problem.ends(record, starts, fit.free, 2 * n)
-            errors = np.delete(np.square(change) / level.process, record.breaks, axis=0)
+            errors = np.delete(np.square(change) / fit.process, record.breaks, axis=0)
         if (errors.mean(axis=0) <= share**2).all():
             break
         n *= 2
     return n
 
 
-def _step(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[Float[np.ndarray, " free"], list[np.ndarray]]:
-    """One Gauss-Newton step: changes of the free coefficients and of every path."""
-    hessian, gradient, _, flow = hessian_on(problem, fit, fit.support, level)
-    if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
-        return np.full_like(fit.free, np.nan), []
-    size = unit_sizes(hessian)
-    scaled = hessian / np.outer(size, size) + RIDGE * np.eye(len(size))
-    step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
-    change = np.zeros_like(fit.free)
-    change[fit.support] = step
-    return change, _moves(problem, fit, level, flow, step)
+class Linearised(NamedTuple):
+    """The objective about a fit, as the kernels take it: `eliminate`, `filtered`, `departures`.
+
+    slopes: derivatives of the flow by the state, then by the parameters; zero between records, as
+    are the defects, what the flow from each sample misses of the next state of the path. residuals,
+    variance: see `LinearisedObservation`. process: variances of the flow's error. start: of the
+    first state.
+    """
+
+    slopes: Float[np.ndarray, "steps d columns"]
+    defects: Float[np.ndarray, "steps d"]
+    residuals: Float[np.ndarray, "samples d"]
+    variance: Float[np.ndarray, "samples d"]
+    process: Float[np.ndarray, "steps d"]
+    start: Float[np.ndarray, " d"]
+
+    @property
+    def of_states(self) -> Linearised:
+        """The same with the derivatives by the state alone."""
+        by_state = self.slopes[:, :, : self.defects.shape[1]]
+        return self._replace(slopes=np.ascontiguousarray(by_state))
 
 
-def _moves(
-    problem: EstimationProblem,
-    fit: TrajectoryFit,
-    level: Level,
-    flow: Flow,
-    change: Float[np.ndarray, " support"],
-) -> list[np.ndarray]:
-    """Changes of every path, for a change of the support's coefficients."""
-    d = len(problem.states)
-    misses = _misses(problem, fit, flow) + flow.slopes[:, :, d:] @ change
-    by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
-    residuals, variance, _ = observe(problem.all_records, joined(fit.paths), level.variance)
-    case = misses, residuals, variance, *_errors(problem, fit, level)
-    moves = departures(by_state, *case)
-    return np.split(moves, problem.all_records.breaks + 1)
+@np.errstate(over="ignore", invalid="ignore")  # callers look whether the result is finite
+def linearise(fit: TrajectoryFit, flow: Flow | None = None) -> Linearised:
+    """The objective about a fit. flow: along its path; None for one with slopes by the state."""
+    problem, record = fit.problem, fit.problem.all_records
+    problem.monitor.look()
+    flow = flow or flow_by(fit, np.zeros_like(fit.support))
+    # Rows of the steps: what the flow from each state misses of the next one.
+    defects = flow.ends - fit.path[1:]
+    defects[record.breaks] = flow.slopes[record.breaks] = 0.0
+    # Rows of the samples: residuals, and the variances of their noise.
+    residuals, variance, _ = observe(record, fit.path, np.square(fit.level.noise))
+    # Weights of the steps, and of the first states, of which nothing is known unless held at zero.
+    process, start = fit.process, np.full(len(problem.states), FREE_START)
+    if fit.at_zero is not None:
+        first, *others = np.where(fit.at_zero, HELD_START, FREE_START)
+        process[record.breaks], start = np.reshape(others, (-1, len(start))), first
+    return Linearised(flow.slopes, defects, residuals, variance, process, start)
 
 
-def _flow(
-    problem: EstimationProblem, fit: TrajectoryFit, support: Bool[np.ndarray, " free"], level: Level
-) -> Flow:
-    """The flow along the paths of all records, which ends with each of them."""
-    record, path = problem.all_records, joined(fit.paths)
-    flow = problem.flow(record, path[:-1], fit.free, support, level.n_substeps)
-    flow.slopes[record.breaks] = 0.0
-    return flow
-
-
-def _misses(
-    problem: EstimationProblem, fit: TrajectoryFit, flow: Flow
-) -> Float[np.ndarray, "steps d"]:
-    misses = flow.ends - joined(fit.paths)[1:]
-    misses[problem.all_records.breaks] = 0.0
-    return misses
+def flow_by(fit: TrajectoryFit, support: Bool[np.ndarray, " free"], *, n_more: int = 0) -> Flow:
+    """The flow along the path of a fit, with derivatives by the coefficients of a support."""
+    problem, n = fit.problem, fit.level.n_substeps
+    return problem.flow(problem.all_records, fit.path[:-1], fit.free, support, n, n_more=n_more)
 
 
 def hessian_on(
-    problem: EstimationProblem, fit: TrajectoryFit, support: Bool[np.ndarray, " free"], level: Level
-) -> tuple[np.ndarray, np.ndarray, float, Flow]:
-    """`hessian` with respect to the coefficients of a support."""
-    return hessian(
-        problem,
-        fit,
-        level,
-        lambda record, path: problem.flow(record, path[:-1], fit.free, support, level.n_substeps),
-    )
+    fit: TrajectoryFit, support: Bool[np.ndarray, " free"]
+) -> tuple[np.ndarray, np.ndarray, float, Linearised]:
+    """Derivatives of the squares by the coefficients of a support, the states eliminated.
 
-
-def hessian(
-    problem: EstimationProblem,
-    fit: TrajectoryFit,
-    level: Level,
-    flow_of: Callable[[ScaledRecord, np.ndarray], Flow],
-) -> tuple[np.ndarray, np.ndarray, float, Flow]:
-    """Derivatives of the squares by the parameters that the flow has slopes of, states eliminated.
-
-    flow_of: the flow along the paths of all records, joined. Returns half the second derivatives,
-    minus half the first, the least squares with these parameters unchanged, and the flow.
+    Returns half the second derivatives, minus half the first, the least squares with these
+    coefficients unchanged, and the linearisation.
     """
-    problem.watch.look()
-    record, path = problem.all_records, joined(fit.paths)
-    flow = flow_of(record, path)
-    flow.slopes[record.breaks] = 0.0
-    misses = _misses(problem, fit, flow)
-    residuals, apparent, _ = observe(record, path, level.variance)
-    case = misses, residuals, apparent, *_errors(problem, fit, level)
-    return *eliminate(flow.slopes, *case)[:3], flow
-
-
-def _errors(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[Float[np.ndarray, "steps d"], Float[np.ndarray, " d"]]:
-    """Variances of the flow's error over all steps, and of the first state."""
-    process, start = level.process, np.full(len(problem.states), FREE_START)
-    if fit.at_zero is not None:
-        first, *others = np.where(fit.at_zero, HELD_START, FREE_START)
-        process[problem.all_records.breaks], start = np.reshape(others, (-1, len(start))), first
-    return process, start
+    about = linearise(fit, flow_by(fit, support))
+    return *eliminate(*about)[:3], about
 
 
 def within_bounds(
@@ -394,7 +384,7 @@ def unit_sizes(hessian: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
     return np.sqrt(zero_to_one(np.maximum(np.diag(hessian), 0.0)))
 
 
-class Seen(NamedTuple):
+class LinearisedObservation(NamedTuple):
     """Comparison of a record with a path; all arrays (samples, d).
 
     residuals: NaN where a sample carries no information. variance: of the noise of these residuals.
@@ -410,7 +400,7 @@ def observe(
     record: ScaledRecord,
     path: Float[np.ndarray, "samples d"],
     variance: Float[np.ndarray, "samples d"],
-) -> Seen:
+) -> LinearisedObservation:
     """Compare the samples of a record with a path, given the variance of the noise."""
     residuals = record.samples - path
     squares = np.square(residuals) / variance
@@ -418,7 +408,7 @@ def observe(
         residuals = np.where(record.missing, np.nan, residuals)
         squares = np.where(record.missing, 0.0, squares)
     if record.limits is None:
-        return Seen(residuals, variance, squares)
+        return LinearisedObservation(residuals, variance, squares)
     residuals, variance = residuals.copy(), variance.copy()
     at = record.limits.at & record.at_hand
     noise = np.sqrt(variance[at])
@@ -427,7 +417,7 @@ def observe(
     pull, weight, squares[at] = between(lower, upper)
     residuals[at] = np.where(weight > TELLS, noise * pull / np.maximum(weight, TELLS), np.nan)
     variance[at] = np.square(noise) / np.maximum(weight, TELLS)
-    return Seen(residuals, variance, squares)
+    return LinearisedObservation(residuals, variance, squares)
 
 
 # Far out, limits may be one number to rounding: the probability is zero, and the squares infinite.

@@ -10,15 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.estimation.likelihood import (
-    Level,
-    TrajectoryFit,
-    fit_paths,
-    innovations,
-    joined,
-    observe,
-)
-from ep2sindy.estimation.likelihood import squares as squares_of
+from ep2sindy.estimation.likelihood import TrajectoryFit, fit_paths, innovations, observe
 from ep2sindy.estimation.problem import EstimationProblem
 
 FLOOR = 1e-3  # least noise, as a share of the RMS: no model and no integration is exact
@@ -38,7 +30,7 @@ SHARES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 0.9999)  # of growing vari
 GROWTH_SHOWS = 12.0  # least gain in 2 log likelihood for noise that grows
 OUTLYING = 5.0  # standard deviations
 ORDER = 3  # of differences, which remove most of a signal that the samples resolve
-LEVELS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # rho: errors of the flow that are tried
+MODEL_ERRORS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # of the flow, as shares of the noise
 # Prior, worth this many samples: the noise is alike in all states. Without it, for few samples,
 # the likeliest model follows one state exactly and ignores another.
 ALIKE_SAMPLES = 5.0
@@ -49,19 +41,19 @@ ERROR_SHOWS = 2.0  # least gain in 2 log likelihood for a flow with error
 class Noise:
     """Statistics of the residuals of a fit.
 
-    std: (d,), RMS over all samples, scaled, no lower than the floor. shape: for each record,
-    (samples, d), relative size of the noise at each sample in units of std: one, or growing with
-    the state. memory: (d,), correlation from one sample to the next if the noise is correlated in
-    time, else 0. unexplained: (d,), the same correlation if the samples themselves do not show such
-    noise: then it is the model's error. patterned: (d,), True if the residuals hold a clean line or
-    are a function of the states, which is the model's error too. growth: (d,), share of the
+    std: (d,), RMS over all samples, scaled, no lower than the floor. shape: (samples, d), relative
+    size of the noise at each sample in units of std: one, or growing with the state. memory: (d,),
+    correlation from one sample to the next if the noise is correlated in time, else 0. unexplained:
+    (d,), the same correlation if the samples themselves do not show such noise: then it is the
+    model's error. patterned: (d,), True if the residuals hold a clean line or are a function of the
+    states, which is the model's error too. growth: (d,), share of the
     variance that grows with the state. kurtosis: (d,), 3 for normal noise, NaN if all samples are
     limits. outliers: (d,), number of samples off by more than five standard deviations, estimated
     from the median. deviance: -2 log likelihood of the residuals.
     """
 
     std: Float[np.ndarray, " d"]
-    shape: tuple[np.ndarray, ...]
+    shape: Float[np.ndarray, "samples d"]
     memory: Float[np.ndarray, " d"]
     unexplained: Float[np.ndarray, " d"]
     patterned: Bool[np.ndarray, " d"]
@@ -76,15 +68,15 @@ class Noise:
         return (self.unexplained > 0.0) | self.patterned
 
     @property
-    def white(self) -> tuple[np.ndarray, ...]:
-        """Standard deviations, for each record (samples, d)."""
+    def white(self) -> Float[np.ndarray, "samples d"]:
+        """Standard deviations at all samples."""
         least = np.minimum(self.std, FLOOR)  # a hidden state may be smaller
-        return tuple(np.maximum(self.std * shape, least) for shape in self.shape)
+        return np.maximum(self.std * self.shape, least)
 
     @property
-    def effective(self) -> tuple[np.ndarray, ...]:
+    def effective(self) -> Float[np.ndarray, "samples d"]:
         """Standard deviations of white noise that tells equally little about slow signals."""
-        return tuple(noise / np.sqrt(self.independent) for noise in self.white)
+        return self.white / np.sqrt(self.independent)
 
     @property
     def independent(self) -> Float[np.ndarray, " d"]:
@@ -92,39 +84,36 @@ class Noise:
         return (1.0 - self.memory) / (1.0 + self.memory)
 
 
-def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
+def noise_beside(fit: TrajectoryFit) -> Noise:
     """Size, shape and memory of the residuals of a fit; the memory is that of an AR(1) process."""
-    hidden = ~problem.measured
-    left = [r.samples - p for r, p in zip(problem.records, fit.paths, strict=True)]
-    left = [np.where(r.at_hand, each, 0.0) for r, each in zip(problem.records, left, strict=True)]
+    problem, record = fit.problem, fit.problem.all_records
+    hidden, limited = ~problem.measured, problem.limited
+    left = np.where(record.at_hand, record.samples - fit.path, 0.0)
     n = np.where(hidden, problem.n_samples, problem.n_measured)
-    per_state = fit.support.sum() / len(problem.states) + len(left)
+    per_state = fit.support.sum() / len(problem.states) + len(problem.records)
     freedom = np.sqrt(n / np.maximum(n - per_state, 1.0))
-    std = freedom * np.sqrt(sum(np.square(e).sum(axis=0) for e in left) / n)
+    std = freedom * np.sqrt(np.square(left).sum(axis=0) / n)
     # How freely hidden states may leave the flow: as others do, however small they have become.
     sizes = np.sqrt(np.mean([np.square(path).mean(axis=0) for path in fit.paths], axis=0))
     std[hidden] = std[~hidden].mean() * sizes[hidden]
-    shape, growth = _shapes(fit.paths, left)
-    limited = problem.limited
+    shape, growth = _shape(problem, fit.path, left)
     # The shape is told by values at all samples.
     untold = limited | hidden | (n < problem.n_samples)
-    if untold.any():
-        shape = tuple(np.where(untold, 1.0, each) for each in shape)
-        growth = np.where(untold, 0.0, growth)
+    shape, growth = np.where(untold, 1.0, shape), np.where(untold, 0.0, growth)
     if limited.any():
-        likely, between = _likeliest_std(problem, fit, std)
+        likely, between = _likeliest_std(fit, std)
         std = np.where(limited, freedom * likely, std)
-        left = _pulls(problem, fit, std)
-    unit = [e / s for e, s in zip(left, shape, strict=True)]
+        left = _expected_residuals(fit, std)
+    unit = problem.split(left / shape)
     memory = _memory(unit)
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
     new = [np.concatenate([e[:1], e[1:] - memory * e[:-1]]) for e in unit]
-    patterned = (_hold_line(problem, new) | _follow_states(problem, fit, new)) & (std > FLOOR)
-    believed = shows & _last_as_noise(problem, fit, unit, std, memory) & ~patterned
+    patterned = (_hold_line(problem, new) | _follow_states(fit, new)) & (std > FLOOR)
+    believed = shows & _last_as_noise(fit, unit, std, memory) & ~patterned
     std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std[~hidden]).mean()
-    logs = n * np.log(alike) + sum(np.log(np.square(s)).sum(axis=0) for s in shape)
+    logs = n * np.log(alike) + np.log(np.square(shape)).sum(axis=0)
     if limited.any():
         logs = np.where(limited, between, logs)
     kurtosis, outliers = _tails(problem, new)
@@ -142,18 +131,16 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
 
 
 def _last_as_noise(
-    problem: EstimationProblem,
     fit: TrajectoryFit,
     unit: Sequence[Float[np.ndarray, "samples d"]],
     std: Float[np.ndarray, " d"],
     memory: Float[np.ndarray, " d"],
 ) -> Bool[np.ndarray, " d"]:
     """True where residuals are correlated as noise of this size and memory would be."""
-    samples = [record.values for record in problem.records]
-    off = [values - path for values, path in zip(samples, fit.paths, strict=True)]
+    problem, record = fit.problem, fit.problem.all_records
+    samples, off = (problem.split(each) for each in (record.values, record.values - fit.path))
     # Slow residuals of a signal's size tell that the model ignores the signal.
-    spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
-    ignored = (memory > SLOW) & (std > LARGE * spread)
+    ignored = (memory > SLOW) & (std > LARGE * record.samples.std(axis=0))
     n = float(problem.n_samples)
     shown = _shown_by_samples(samples, off, std, memory, n)
     return _forgets(unit, memory, n) & shown & ~ignored
@@ -176,14 +163,14 @@ def are_noise(
 
 
 def _likeliest_std(
-    problem: EstimationProblem, fit: TrajectoryFit, std: Float[np.ndarray, " d"]
+    fit: TrajectoryFit, std: Float[np.ndarray, " d"]
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
     """For sensors with limits: the likeliest noise, and -2 log of the likelihood under it.
 
     The second value replaces that of `noise_beside` for states with limits.
     """
     best, found = np.full(len(std), np.inf), std
-    record, path = problem.all_records, joined(fit.paths)
+    record, path = fit.problem.all_records, fit.path
     n_values = np.isfinite(record.values).sum(axis=0)
     for share in NOISE_SHARES:
         tried = np.maximum(share * std, FLOOR)
@@ -195,37 +182,44 @@ def _likeliest_std(
     return found, best
 
 
-def _pulls(
-    problem: EstimationProblem, fit: TrajectoryFit, std: Float[np.ndarray, " d"]
-) -> list[Float[np.ndarray, "samples d"]]:
+def _expected_residuals(
+    fit: TrajectoryFit, std: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, "samples d"]:
     """Residuals of values; for limits, the expected noise."""
-    pulls = []
-    for record, path in zip(problem.records, fit.paths, strict=True):
-        by_sample = observe(record, path, np.broadcast_to(np.square(std), path.shape))
-        pull = by_sample.residuals / by_sample.variance * np.square(std)
-        pulls.append(np.where(np.isfinite(pull), pull, 0.0))
-    return pulls
+    variance = np.broadcast_to(np.square(std), fit.path.shape)
+    seen = observe(fit.problem.all_records, fit.path, variance)
+    pull = seen.residuals / seen.variance * np.square(std)
+    return np.where(np.isfinite(pull), pull, 0.0)
 
 
 def _memory(left: Sequence[Float[np.ndarray, "samples d"]]) -> Float[np.ndarray, " d"]:
     """Correlation of residuals from one sample to the next."""
-    squares = sum(np.square(e).sum(axis=0) for e in left)
-    lagged = sum((e[1:] * e[:-1]).sum(axis=0) for e in left)
-    return np.clip(lagged / np.maximum(squares, TINY), 0.0, MAX_LASTING)
+    return np.clip(autocorrelations(left, [1])[0], 0.0, MAX_LASTING)
 
 
-def _shapes(
-    paths: Sequence[Float[np.ndarray, "samples d"]], left: Sequence[Float[np.ndarray, "samples d"]]
-) -> tuple[tuple[np.ndarray, ...], Float[np.ndarray, " d"]]:
+def autocorrelations(
+    pieces: Sequence[Float[np.ndarray, "samples d"]], lags: Sequence[int]
+) -> Float[np.ndarray, "lags d"]:
+    """Correlations of pieces of a record with themselves some samples later."""
+    squares = sum(np.square(e).sum(axis=0) for e in pieces)
+    products = [sum((e[lag:] * e[:-lag]).sum(axis=0) for e in pieces) for lag in lags]
+    return np.array(products) / np.maximum(squares, TINY)
+
+
+def _shape(
+    problem: EstimationProblem,
+    path: Float[np.ndarray, "samples d"],
+    left: Float[np.ndarray, "samples d"],
+) -> tuple[Float[np.ndarray, "samples d"], Float[np.ndarray, " d"]]:
     """Growth of the noise with the state: variance 1 - w + w x^2 / mean of x^2, w by likelihood.
 
-    Returns the root of this variance, by record, and w.
+    Returns the root of this variance, and w.
     """
-    x2, e2 = (np.square(np.concatenate(list(parts))) for parts in (paths, left))
+    x2, e2 = np.square(path), np.square(left)
     relative = x2 / np.maximum(x2.mean(axis=0), TINY)
     variance, growth = np.ones_like(x2), np.zeros(x2.shape[1])
     # Squares of correlated noise are correlated too: fewer of them are independent.
-    square = np.square(_memory(left))
+    square = np.square(_memory(problem.split(left)))
     shows = GROWTH_SHOWS * (1.0 + square) / (1.0 - square)
     best = len(x2) * np.log(np.maximum(e2.mean(axis=0), TINY)) - shows
     for share in SHARES:
@@ -236,8 +230,7 @@ def _shapes(
         best = np.where(better, deviance, best)
         variance = np.where(better, tried, variance)
         growth = np.where(better, share, growth)
-    ends = np.cumsum([len(path) for path in paths])[:-1]
-    return tuple(np.split(np.sqrt(variance), ends)), growth
+    return np.sqrt(variance), growth
 
 
 def _tails(
@@ -257,37 +250,35 @@ def _tails(
     return kurtosis, outliers
 
 
-def flow_error(problem: EstimationProblem, fit: TrajectoryFit, noise: Noise, exact: Level) -> float:
-    """The rho under which the fit's support is most likely; 0 if an exact flow is.
+def flow_error(fit: TrajectoryFit, noise: Noise) -> float:
+    """The model error under which the fit's support is most likely; 0 if an exact flow is.
 
     The exact flow is weighed with correlated noise if the noise is correlated; a flow with error is
     weighed with white noise.
     Source of the likelihood by innovations: Schweppe 1965, doi:10.1109/TIT.1965.1053737.
     """
-    white = replace(exact, noise=noise.white)
-    by_memory = float((problem.n_measured * np.log1p(-np.square(noise.memory))).sum())
-    best, found = _deviance(problem, fit, white) + by_memory - ERROR_SHOWS, 0.0
-    for rho in LEVELS:
-        level = replace(white, rho=rho)
-        fit = fit_paths(problem, fit, level)
-        deviance = _deviance(problem, fit, level)
+    fit = replace(fit, level=replace(fit.level, noise=noise.white))
+    by_memory = float((fit.problem.n_measured * np.log1p(-np.square(noise.memory))).sum())
+    best, found = _deviance(fit) + by_memory - ERROR_SHOWS, 0.0
+    for model_error in MODEL_ERRORS:
+        fit = fit_paths(replace(fit, level=replace(fit.level, model_error=model_error)))
+        deviance = _deviance(fit)
         if deviance < best:
-            best, found = deviance, rho
+            best, found = deviance, model_error
     return found
 
 
-def _deviance(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> float:
+def _deviance(fit: TrajectoryFit) -> float:
     """-2 log likelihood of the samples by their innovations, all noise scaled to its best size.
 
     With limits it uses Laplace's approximation and does not rescale the noise, which is then no
     mere scale factor.
     """
-    seen, least, spread = innovations(problem, fit, level)
+    (about, least, spread), problem = innovations(fit), fit.problem
     if problem.limited.any():
         assert problem.all_records.limits is not None
-        known = problem.all_records.limits.at & np.isfinite(seen.residuals)
-        by_limits = -np.log(seen.variance[known]).sum()
-        return spread + by_limits + float(squares_of(problem, fit.paths, fit.free, level).sum())
+        known = problem.all_records.limits.at & np.isfinite(about.residuals)
+        return spread - float(np.log(about.variance[known]).sum() - fit.squares.sum())
     n = problem.n_squares
     return spread + n * np.log(max(least, TINY) / n)
 
@@ -299,12 +290,8 @@ def _forgets(
 
     The error of a model on a signal with white noise stays correlated over longer lags.
     """
-    squares = sum(np.square(e).sum(axis=0) for e in left)
-    faster = np.ones(len(memory), dtype=np.bool_)
-    for lag in LAGS:
-        products = sum((e[lag:] * e[:-lag]).sum(axis=0) for e in left)
-        faster &= products / np.maximum(squares, TINY) - memory**lag < LONGER / np.sqrt(n)
-    return faster
+    excess = autocorrelations(left, LAGS) - memory ** np.array(LAGS)[:, None]
+    return np.all(excess < LONGER / np.sqrt(n), axis=0)
 
 
 def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray]) -> Bool[np.ndarray, " d"]:
@@ -327,21 +314,29 @@ def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray]) -> Bool[np
 
 
 def _follow_states(
-    problem: EstimationProblem, fit: TrajectoryFit, new: Sequence[Float[np.ndarray, "samples d"]]
+    fit: TrajectoryFit, new: Sequence[Float[np.ndarray, "samples d"]]
 ) -> Bool[np.ndarray, " d"]:
     """True if products of the states explain more of the residuals than they would of noise.
 
-    What a library lacks is a function of the states, also where it lasts as noise does. The squares
-    that random residuals share with the products are expected from the squares of each sample
-    alone, so neither outliers nor noise that grows with the state pass for such a function.
+    What a library lacks is a function of the states, also where it lasts as noise does.
     """
-    inputs = np.concatenate([record.inputs for record in problem.records])
-    degree = int(problem.candidates.library.degrees.max()) + MORE_DEGREES
-    powers = powers_of(np.column_stack([np.concatenate(fit.paths), inputs]), degree)
-    basis, joined = np.linalg.qr(powers)[0], np.concatenate(new)
-    shared = np.square(basis.T @ joined).sum(axis=0)
-    expected = np.square(basis).sum(axis=1) @ np.square(joined)
-    return shared - expected > FOLLOWS * np.sqrt(2.0 / basis.shape[1]) * expected
+    degree = int(fit.problem.candidates.library.degrees.max()) + MORE_DEGREES
+    powers = powers_of(np.column_stack([fit.path, fit.problem.all_records.inputs]), degree)
+    return excess_explained(powers, np.concatenate(new)) > FOLLOWS
+
+
+def excess_explained(
+    columns: Float[np.ndarray, "samples columns"], residuals: Float[np.ndarray, "samples d"]
+) -> Float[np.ndarray, " d"]:
+    """How much more columns explain of residuals than of random ones, in standard errors.
+
+    The squares that random residuals share with the columns are expected from the squares of each
+    sample alone, so neither outliers nor noise that grows with the state pass for a function.
+    """
+    basis = np.linalg.qr(columns)[0]
+    shared = np.square(basis.T @ residuals).sum(axis=0)
+    expected = np.maximum(np.square(basis).sum(axis=1) @ np.square(residuals), TINY)
+    return (shared / expected - 1.0) * np.sqrt(basis.shape[1] / 2.0)
 
 
 def powers_of(states: Float[np.ndarray, "samples d"], degree: int) -> np.ndarray:

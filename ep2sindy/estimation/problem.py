@@ -15,7 +15,7 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.coefficients import coefficients_of
-from ep2sindy.estimation.cost import Watch
+from ep2sindy.estimation.cost import SearchMonitor
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Process, Relation
 from ep2sindy.library.roles import Roles
@@ -48,7 +48,7 @@ class ScaledRecord:
     parts: tuple[ScaledRecord, ...] = ()
 
     @staticmethod
-    def joined(records: Sequence[ScaledRecord]) -> ScaledRecord:
+    def join(records: Sequence[ScaledRecord]) -> ScaledRecord:
         """All records as one, so that each pass over the samples is a single call."""
         if len(records) == 1:
             return records[0]
@@ -150,8 +150,16 @@ class ScaledRecord:
 class EstimationProblem:
     """Records, the library of their variables, and the coefficients: coef = C free + fixed.
 
-    Without relations and roles all are free: C is None, and fixed is zero. Under roles each process
-    is one free coefficient.
+    The problem is to find the free coefficients z, most of them zero, and the states x that make
+
+        -2 log likelihood of the samples (`likelihood`) + sum of prices of the terms (`supports`)
+
+    least, in variables of unit size: states over their RMS, time over the mean step. Assumed is
+    that the library holds the law. The prices are those of the Bayesian information criterion.
+    Source: Schwarz 1978, doi:10.1214/aos/1176344136; Chen & Chen 2008, doi:10.1093/biomet/asn034.
+
+    Without relations and roles all coefficients are free: C is None, and fixed is zero. Under roles
+    each process is one free coefficient.
 
     library: of scaled variables, states first. term_names: names of its terms in SI variables.
     equation, column: (coefficients,), the equation and the term of each coefficient.
@@ -159,7 +167,7 @@ class EstimationProblem:
     relation fixes has its value to the last digit.
     required: (free,), coefficients that are never left out. to_SI: (coefficients,), factors from
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
-    measured: (d,), False for hidden states. watch: told of every step of a fit. whole: the
+    measured: (d,), False for hidden states. monitor: told of every step of a fit. whole: the
     problem with all terms, if this one has only those of a working set; places: (terms,), their
     positions in its library. allowed_courses: of each input, the most plausible first. widen: makes
     the problem with all products of one degree more. processes: one for each free coefficient under
@@ -185,7 +193,7 @@ class EstimationProblem:
     processes: tuple[Process, ...] = ()
     inputs: tuple[str, ...] = ()
     allowed_courses: tuple[tuple[str, ...], ...] = ()
-    watch: Watch = field(default_factory=Watch)
+    monitor: SearchMonitor = field(default_factory=SearchMonitor)
     whole: EstimationProblem | None = None
     widen: Callable[[], EstimationProblem] | None = None
 
@@ -250,7 +258,11 @@ class EstimationProblem:
     @cached_property
     def all_records(self) -> ScaledRecord:
         """All records as one."""
-        return ScaledRecord.joined(self.records)
+        return ScaledRecord.join(self.records)
+
+    def split(self, values: Float[np.ndarray, "samples _"]) -> list[np.ndarray]:
+        """The part of each record of what all records have, one after the other."""
+        return np.split(values, self.all_records.breaks + 1)
 
     @property
     def courses(self) -> tuple[str, ...]:
@@ -386,7 +398,7 @@ def scale_problem(
     runs: Sequence[Trajectory], library: Library, relations: Sequence[Relation] = (),
     terms: Mapping[str, Sequence[str]] | None = None, *, measured: Sequence[str] = (),
     exclude: Mapping[str, Sequence[str]] | None = None, courses: Mapping[str, str] | None = None,
-    roles: Roles | None = None, watch: Watch | None = None,
+    roles: Roles | None = None, monitor: SearchMonitor | None = None,
 ) -> EstimationProblem:  # fmt: skip
     """Scale records and library, and collect the coefficients that may be in the model.
 
@@ -429,7 +441,7 @@ def scale_problem(
         processes=tuple(processes),
         inputs=tuple(inputs),
         allowed_courses=tuple(allowed.values()),
-        watch=watch or Watch(),
+        monitor=monitor or SearchMonitor(),
     )
     return problem.of(runs)
 

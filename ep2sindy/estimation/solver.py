@@ -1,38 +1,35 @@
-"""The joint estimator of states and coefficients: annealing from free states to exact trajectories.
+"""The joint estimator of states and coefficients: continuation from free states to exact ones.
 
-It starts from smoothed states, and from all coefficients regressed on their derivatives. Supports
-are chosen at every level on the way (`anneal`), and compared again at its end (`polish`).
+It starts from smoothed states, and from all coefficients regressed on their derivatives. The model
+error falls in steps. Supports are chosen at every step on the way (`fit_by_continuation`), and
+compared again at its end (`polish`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import inf
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ep2sindy.data.coerce import keep_inside, noise_inside
 from ep2sindy.data.numbers import least_squares
-from ep2sindy.estimation.lateness import (
-    DelayedGram,
-    delayed_gram,
-)
+from ep2sindy.estimation.delay import DelayedGram, delayed_gram
 from ep2sindy.estimation.likelihood import (
     FAR,
-    STEERED,
+    MAX_DIVERGENCE,
     Level,
     TrajectoryFit,
+    divergence_rate,
     enough_substeps,
     fit_paths,
     gram,
-    joined,
-    parting,
-    squares,
 )
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
+from ep2sindy.estimation.solution import LackOfFit, Observation, Solution
 from ep2sindy.estimation.supports import alternatives, best_support, excess, penalise, term_prices
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 
@@ -42,20 +39,21 @@ ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts 
 OTHER_STARTS = (-2.0, 0.0, 2.0)
 SAMPLES_PER_COEFFICIENT = 10  # of an equation, if samples are few: more terms would fit noise
 MAX_PASSES = 4  # until noise and support agree; usually two
-# rho, and the share of a term's price charged at that level. Free states hide part of what a term
+# Model errors, and the share of a term's price charged there. Free states hide part of what a term
 # explains, and a term dropped too early would have to be found again.
-COOLING = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
-COLD = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
-ASTRAY = 0.1  # RMS miss of the flow, as a share of the steps of a hidden state, if it follows none
-# RMS miss of a step, in noise, from which the path is no trajectory: right models miss by 1e-5.
+CONTINUATION = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
+NEARLY_EXACT = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
+# RMS defect of the flow of a hidden state, as a share of its steps, beyond which it follows none.
+MAX_HIDDEN_DEFECT = 0.1
+# RMS defect of a step, in noise, from which the path is no trajectory: right models have 1e-5.
 EXACT = 1e-3
 MAX_EXCHANGES = 3  # exchanges of supports at one level
-# rho at which supports are compared again. At lower rho the linearised flow says too little about
-# other supports; at higher rho free states hide their differences.
-WEIGHED_AT = 0.003
-# rho, and the share of the prices, at which another support may show that the solution is a wrong
-# optimum; and by how much it must explain more of the squares.
-REHEATED, EXPLAINS_MORE = (1.0, 0.5), 4.0
+# Model error at which supports are compared again. At a lower one the linearised flow says too
+# little about other supports; at a higher one free states hide their differences.
+COMPARED_AT = 0.003
+# Model error, and the share of the prices, at which another support may show that the solution is a
+# wrong optimum; and by how much it must explain more of the squares.
+RELAXED, EXPLAINS_MORE = (1.0, 0.5), 4.0
 WITHIN, MAX_TRIED, MAX_ROUNDS = 12.0, 6, 6  # score above the chosen one; supports per round; rounds
 UNSURE = 0.05  # share of the RMS: least noise at a start where the smoother's is not trusted
 CUTOFF = 1e-8  # of singular values of unit columns: smaller ones fit noise
@@ -73,264 +71,266 @@ def enough_samples(problem: EstimationProblem) -> bool:
     return problem.n_samples >= SAMPLES_PER_TERM * len(problem.candidates.library)
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Result from one start.
-
-    score: -2 log likelihood plus prices, comparable between starts. astray: (d,), True for hidden
-    states that do not follow their own equations. parting: see `likelihood.parting`.
-    """
-
-    annealed: AnnealedFit
-    noise: Noise
-    prices: Float[np.ndarray, " free"]
-    flow_error: float
-    astray: Bool[np.ndarray, " d"]
-    parting: float = 0.0
-
-    @property
-    def score(self) -> float:
-        if not np.isfinite(self.annealed.score):
-            return inf
-        return self.noise.deviance + float(self.prices[self.annealed.fit.support].sum())
-
-    @property
-    def fits(self) -> bool:
-        """True if the residuals look like noise."""
-        exact = self.flow_error == 0.0 and not self.noise.is_error.any()
-        followed = exact and not self.astray.any() and self.parting < STEERED
-        return followed and bool(np.isfinite(self.score))
-
-
 def from_smooth(
     problem: EstimationProblem, log10_ratio: float | None, *, max_terms: int
 ) -> Solution:
-    """Anneal with the smoother's noise, then with the residuals'.
+    """The exact solution from smoothed states, first with their noise, then with the residuals'.
 
     log10_ratio: of the smoother, see `start_from_smooth`.
     """
-    fit, std = start_from_smooth(problem, log10_ratio)
-    prices = term_prices(problem, float(problem.n_samples))
-    found = anneal(problem, fit, std, prices, COOLING, max_terms=max_terms)
-    return _settle(problem, found, max_terms)
+    return settle(start_from_smooth(problem, log10_ratio), CONTINUATION, max_terms=max_terms)
 
 
 def settle(
-    problem: EstimationProblem,
-    fit: TrajectoryFit,
-    noise: tuple[np.ndarray, ...],
-    *,
-    max_terms: int,
+    start: TrajectoryFit, schedule: Sequence[tuple[float, float]] = NEARLY_EXACT, *, max_terms: int
 ) -> Solution:
-    """The exact solution near a fit whose states leave the flow a little."""
-    prices = term_prices(problem, float(problem.n_samples))
-    found = anneal(problem, fit, noise, prices, COLD, max_terms=max_terms)
-    return _settle(problem, found, max_terms)
+    """The exact solution near a fit whose states leave the flow.
 
-
-def _settle(problem: EstimationProblem, found: AnnealedFit, max_terms: int) -> Solution:
-    """Anneal again until noise and support agree, and compare with what is nearly as likely."""
+    Continues again until noise and support agree, and compares with what is nearly as likely.
+    """
+    prices = term_prices(start.problem, float(start.problem.n_samples))
+    fit = fit_by_continuation(start, prices, schedule, max_terms=max_terms)
     for _ in range(MAX_PASSES):
-        before, noise = found.fit.support, noise_beside(problem, found.fit)
-        prices = term_prices(problem, problem.n_samples * float(noise.independent.mean()))
-        found = anneal(problem, found.fit, noise.effective, prices, COLD, max_terms=max_terms)
-        if np.array_equal(before, found.fit.support):
+        before, noise = fit.support, noise_beside(fit)
+        prices = _prices_beside(fit, noise)
+        start = replace(fit, level=replace(fit.level, noise=noise.effective))
+        fit = fit_by_continuation(start, prices, NEARLY_EXACT, max_terms=max_terms)
+        if np.array_equal(before, fit.support):
             break
-    found = polish(problem, found, prices, max_terms=max_terms)
-    found = reheat(problem, found, prices, max_terms=max_terms)
-    noise = noise_beside(problem, found.fit)
-    error = steered = 0.0
-    defects, _ = squares_of_steps(problem, found.fit, found.level)
-    if np.isfinite(found.score) and (noise.std > FLOOR).any():
-        error = flow_error(problem, found.fit, noise, found.level)
-        defect = np.sqrt((defects / np.square(noise.std)).max() / problem.n_samples)
+    fit, around = polish(fit, prices, max_terms=max_terms)
+    fit, around = restart_relaxed(fit, around, prices, max_terms=max_terms)
+    noise, error, divergence = noise_beside(fit), 0.0, 0.0
+    if np.isfinite(fit.total) and (noise.std > FLOOR).any():
+        error = flow_error(fit, noise)
+        defect = np.sqrt((squares_of_steps(fit)[0] / np.square(noise.std)).max() / len(fit.path))
         error = error if defect < EXACT else max(error, float(defect))  # it lives on the slack
-        steered = parting(problem, found.fit, replace(found.level, noise=noise.white))
-    return Solution(found, noise, prices, error, astray(problem, found), steered)
+        divergence = divergence_rate(replace(fit, level=replace(fit.level, noise=noise.white)))
+    return replace(_exact_solution(fit, noise, prices, error, divergence), around=around)
 
 
-def astray(problem: EstimationProblem, found: AnnealedFit) -> Bool[np.ndarray, " d"]:
-    """Hidden states whose steps are not those of the flow.
+def _prices_beside(fit: TrajectoryFit, noise: Noise) -> Float[np.ndarray, " free"]:
+    """Prices of the terms for samples whose noise is correlated in time."""
+    return term_prices(fit.problem, fit.problem.n_samples * float(noise.independent.mean()))
+
+
+def unfinished_solution(fit: TrajectoryFit) -> Solution:
+    """What a search that was ended on its way has, whose states still leave the flow."""
+    noise = noise_beside(fit)
+    return _exact_solution(fit, noise, _prices_beside(fit, noise), fit.level.model_error, 0.0)
+
+
+def _exact_solution(
+    fit: TrajectoryFit, noise: Noise, prices: np.ndarray, error: float, divergence: float
+) -> Solution:
+    """The solution of a trajectory without process noise, and its tests."""
+    none = np.zeros(len(noise.std))
+    apart = np.exp(min(divergence, 100.0) / 2.0)
+    tests = (
+        LackOfFit(
+            none + fit.total,
+            float(np.finfo(np.float64).max),
+            "whatever was tried runs away between two samples",
+        ),
+        LackOfFit(
+            none + error, 0.0, "the states leave the model by {value:g} of the noise per sample"
+        ),
+        LackOfFit(
+            none + apart,
+            float(np.exp(MAX_DIVERGENCE / 2.0)),
+            "paths beside the fit part by a factor of {value:.2g} per sample, so it could follow "
+            "any samples",
+        ),
+        LackOfFit(
+            noise.unexplained, 0.0, "what is left of {state} lasts ({value:.2f} from sample to "
+            "sample)",
+        ),
+        LackOfFit(
+            noise.patterned, 0.0, "what is left of {state} holds a line or follows the states"
+        ),
+        LackOfFit(
+            hidden_defects(fit), MAX_HIDDEN_DEFECT, "{state} does not follow its own equation"
+        ),
+    )  # fmt: skip
+    return Solution(
+        fit=fit,
+        observation=Observation(noise, none, none),
+        prices=prices,
+        deviance=noise.deviance,
+        tests=tests,
+        flow_error=error,
+    )
+
+
+def hidden_defects(fit: TrajectoryFit) -> Float[np.ndarray, " d"]:
+    """RMS defect of the flow of hidden states, as a share of their steps; zero for measured ones.
 
     One that has become very small leaves the flow freely, and large coefficients make it count.
     """
-    defects, steps = squares_of_steps(problem, found.fit, found.level)
-    return ~problem.measured & ~(defects <= ASTRAY**2 * steps)
+    defects, steps = squares_of_steps(fit)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(defects > 0.0, np.sqrt(defects / steps), defects)
+    return np.where(fit.problem.measured, 0.0, share)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
 def squares_of_steps(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
+    fit: TrajectoryFit,
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
     """Sums of squares, by state: of what the flow from each sample misses, and of the steps."""
-    record, path = problem.all_records, joined(fit.paths)
+    record, path, n = fit.problem.all_records, fit.path, fit.level.n_substeps
     steps = np.diff(path, axis=0)
-    missed = problem.ends(record, path[:-1], fit.free, level.n_substeps) - path[1:]
-    missed[record.breaks] = steps[record.breaks] = 0.0
-    return np.square(missed).sum(axis=0), np.square(steps).sum(axis=0)
+    defects = fit.problem.ends(record, path[:-1], fit.free, n) - path[1:]
+    defects[record.breaks] = steps[record.breaks] = 0.0
+    return np.square(defects).sum(axis=0), np.square(steps).sum(axis=0)
 
 
-@dataclass(frozen=True, eq=False)
-class AnnealedFit:
-    """A fit, the level that it ended at, and its score: the squares plus the prices of its terms.
-
-    around: linearisation about the fit at the level where its support was compared with others.
-    """
-
-    fit: TrajectoryFit
-    level: Level
-    score: float
-    around: DelayedGram | None = None
+def _penalised(fit: TrajectoryFit, prices: Float[np.ndarray, " free"]) -> float:
+    """The squares plus the prices of the terms, which decide between supports at one level."""
+    return float(fit.total + prices[fit.support].sum())
 
 
-def anneal(
-    problem: EstimationProblem,
+def fit_by_continuation(
     fit: TrajectoryFit,
-    noise: tuple[np.ndarray, ...],
     prices: Float[np.ndarray, " free"],
     schedule: Sequence[tuple[float, float]],
     *,
     max_terms: int,
-) -> AnnealedFit:
-    """Fit level by level; at each level, exchange terms as long as squares plus prices fall."""
-    n_substeps, score = 1, np.inf
-    for rho, share in schedule:
-        fit, level = at_level(problem, fit, Level(noise, rho, n_substeps))
-        n_substeps = level.n_substeps
-        fit, score = _exchange_terms(problem, fit, level, share * prices, max_terms)
-        if problem.watch.best is None or isinstance(problem.watch.best[1], AnnealedFit):
-            problem.watch.best = problem, AnnealedFit(fit, level, score)
-    return AnnealedFit(fit, level, score)
+) -> TrajectoryFit:
+    """Fit level by level; at each level, exchange terms as long as squares plus prices fall.
+
+    The noise is that of the fit's level.
+    """
+    monitor, level = fit.problem.monitor, replace(fit.level, n_substeps=1, process_noise=None)
+    for model_error, share in schedule:
+        fit = at_level(fit, replace(level, model_error=model_error))
+        level = fit.level
+        fit = exchange_terms(fit, share * prices, max_terms)
+        if not isinstance(monitor.best, Solution):
+            monitor.best = fit
+    return fit
 
 
 def polish(
-    problem: EstimationProblem,
-    found: AnnealedFit,
-    prices: Float[np.ndarray, " free"],
-    *,
-    max_terms: int,
-) -> AnnealedFit:
+    fit: TrajectoryFit, prices: Float[np.ndarray, " free"], *, max_terms: int
+) -> tuple[TrajectoryFit, DelayedGram | None]:
     """Refit each support that is nearly as likely by the linear model, and keep a likelier one.
 
-    A fit that does not follow its samples is returned unchanged: its linearisation tells nothing.
+    Returns the linearisation in which none is likelier too; None if it tells nothing, as about a
+    fit that does not follow its samples.
     """
-    if not found.fit.total < FAR * problem.n_squares:
-        return found
-    fit, cold = at_level(problem, found.fit, found.level)
-    found = AnnealedFit(fit, cold, float(fit.total + prices[fit.support].sum()))
-    tried = {found.fit.support.tobytes()}
+    problem = fit.problem
+    if not fit.total < FAR * problem.n_squares:
+        return fit, None
+    fit = at_level(fit, fit.level)
+    tried = {fit.support.tobytes()}
     for _ in range(MAX_ROUNDS):
-        warmer, level = at_level(problem, found.fit, replace(found.level, rho=WEIGHED_AT))
-        around = delayed_gram(problem, warmer, level)
-        pair = around.at_rest
-        if not (pair.finite and np.isfinite(found.score)):
-            return found
+        warm = at_level(fit, replace(fit.level, model_error=COMPARED_AT))
+        around = delayed_gram(warm)
+        if not (around.at_rest.finite and np.isfinite(fit.total)):
+            break
         others = alternatives(
-            problem, pair, prices, warmer.support, within=WITHIN, max_terms=max_terms
+            problem, around.at_rest, prices, warm.support, within=WITHIN, max_terms=max_terms
         )
         others = [each for each in others if each.support.tobytes() not in tried]
         for each in others[:MAX_TRIED]:
             tried.add(each.support.tobytes())
-            start = replace(warmer, support=each.support, free=each.free)
-            fit, cold = at_level(problem, start, level)
-            fit, cold = at_level(problem, fit, replace(cold, rho=found.level.rho))
-            score = float(fit.total + prices[fit.support].sum())
-            if score < found.score and parting(problem, fit, cold) < STEERED:
-                found = AnnealedFit(fit, cold, score)
+            other = at_level(replace(warm, support=each.support, free=each.free), warm.level)
+            other = at_level(other, replace(other.level, model_error=fit.level.model_error))
+            if _is_likelier(other, fit, prices):
+                fit = other
                 break
         else:
-            return replace(found, around=around)
-    return found
+            return fit, around
+    return fit, None
 
 
-def reheat(
-    problem: EstimationProblem,
-    found: AnnealedFit,
+def _is_likelier(
+    fit: TrajectoryFit, than: TrajectoryFit, prices: Float[np.ndarray, " free"]
+) -> bool:
+    """True if a fit is likelier, prices included, and does not live on steering its path."""
+    return (
+        _penalised(fit, prices) < _penalised(than, prices) and divergence_rate(fit) < MAX_DIVERGENCE
+    )
+
+
+def restart_relaxed(
+    fit: TrajectoryFit,
+    around: DelayedGram | None,
     prices: Float[np.ndarray, " free"],
     *,
     max_terms: int,
-) -> AnnealedFit:
-    """Anneal again if states that are let go show a better support; the likelier of both.
+) -> tuple[TrajectoryFit, DelayedGram | None]:
+    """Continue again if states that are let go show a better support; the likelier of both.
 
     Exchanges between nearly exact flows cannot leave a wrong optimum of many terms. Free states
     hide part of what a term explains, so a support counts as better there only if it explains more
-    by no more terms.
+    by no more terms. around: of the fit, see `polish`.
     """
-    if not found.fit.total < FAR * problem.n_squares:
-        return found
-    rho, share = REHEATED
-    warm, level = at_level(problem, found.fit, replace(found.level, rho=rho))
-    pair = gram(problem, warm, level)
-    if not (pair.finite and np.isfinite(found.score)):
-        return found
-    cheap = share * prices
-    here = penalise(pair, warm.support, cheap)
-    other = best_support(problem, pair, cheap, warm.support, max_terms=max_terms)
+    if not fit.total < FAR * fit.problem.n_squares:
+        return fit, around
+    model_error, share = RELAXED
+    relaxed = at_level(fit, replace(fit.level, model_error=model_error))
+    pair, cheap = gram(relaxed), share * prices
+    if not pair.finite:
+        return fit, around
+    here = penalise(pair, relaxed.support, cheap)
+    other = best_support(fit.problem, pair, cheap, relaxed.support, max_terms=max_terms)
     n_more = int(other.support.sum()) - int(here.support.sum())
     gain = here.score - other.score - float(cheap[here.support].sum() - cheap[other.support].sum())
     if n_more > 0 or gain < EXPLAINS_MORE:
-        return found
-    start = replace(warm, support=other.support, free=other.free)
-    schedule = (*COOLING, COLD[-1])
-    again = anneal(problem, start, found.level.noise, prices, schedule, max_terms=max_terms)
-    again = polish(problem, again, prices, max_terms=max_terms)
-    likelier = again.score < found.score and parting(problem, again.fit, again.level) < STEERED
-    return again if likelier else found
+        return fit, around
+    start = replace(relaxed, support=other.support, free=other.free)
+    again = fit_by_continuation(
+        start, prices, (*CONTINUATION, NEARLY_EXACT[-1]), max_terms=max_terms
+    )
+    again, beside = polish(again, prices, max_terms=max_terms)
+    return (again, beside) if _is_likelier(again, fit, prices) else (fit, around)
 
 
-def at_level(
-    problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[TrajectoryFit, Level]:
+def at_level(fit: TrajectoryFit, level: Level) -> TrajectoryFit:
     """Fit at a level, with as many substeps as it needs."""
-    level = replace(level, n_substeps=enough_substeps(problem, fit, level))
-    if not np.isfinite(squares(problem, fit.paths, fit.free, level)).all():
+    n_substeps = enough_substeps(replace(fit, level=level))
+    fit = replace(fit, level=replace(level, n_substeps=n_substeps))
+    if not np.isfinite(fit.squares).all():
         fit = replace(fit, free=np.zeros_like(fit.free))  # the zero flow is finite
-    return fit_paths(problem, fit, level), level
+    return fit_paths(fit)
 
 
-def _exchange_terms(
-    problem: EstimationProblem,
-    fit: TrajectoryFit,
-    level: Level,
-    prices: Float[np.ndarray, " free"],
-    max_terms: int,
-) -> tuple[TrajectoryFit, float]:
+def exchange_terms(
+    fit: TrajectoryFit, prices: Float[np.ndarray, " free"], max_terms: int
+) -> TrajectoryFit:
     """Exchange terms by the Gram matrix, refit, and accept any fall of squares plus prices."""
-    score = fit.total + prices[fit.support].sum()
+    problem = fit.problem
     for _ in range(MAX_EXCHANGES):
-        pair = gram(problem, fit, level)
+        pair, score = gram(fit), _penalised(fit, prices)
         if not (pair.finite and np.isfinite(score)):
             break
         found = best_support(problem, pair, prices, fit.support, max_terms=max_terms)
         if np.array_equal(found.support, fit.support):
             break
-        tried = fit_paths(problem, replace(fit, support=found.support, free=found.free), level)
-        tried_score = tried.total + prices[tried.support].sum()
+        tried = fit_paths(replace(fit, support=found.support, free=found.free))
         too_large = excess(problem, fit.support, max_terms) > 0
-        if not (tried_score < score or (too_large and np.isfinite(tried_score))):
+        if not (_penalised(tried, prices) < score or (too_large and np.isfinite(tried.total))):
             break
-        fit, score = tried, tried_score
-    return fit, float(score)
+        fit = tried
+    return fit
 
 
-def start_from_smooth(
-    problem: EstimationProblem, log10_ratio: float | None
-) -> tuple[TrajectoryFit, tuple[np.ndarray, ...]]:
+def start_from_smooth(problem: EstimationProblem, log10_ratio: float | None) -> TrajectoryFit:
     """Start on smoothed states with all coefficients free.
 
     log10_ratio: of the smoother, process to measurement noise; None takes the most likely ratio of
     each record and state. Below about twenty samples a period this ratio may take signal for noise.
-    Returns the fit, and the residuals' standard deviations, by record (samples, d).
+    The noise of its level is that of the residuals.
     """
-    start = smoothed(problem, log10_ratio)
-    values = np.concatenate([joined(start.paths), problem.all_records.inputs], axis=1)
-    free = _regress(problem, problem.library.evaluate(values), joined(start.rates))
+    start = smooth_states(problem, log10_ratio)
+    values = np.concatenate([start.path, problem.all_records.inputs], axis=1)
+    free = _regress(problem, problem.library.evaluate(values), start.rates)
     support = np.ones(problem.n_free, dtype=np.bool_)
-    fit = TrajectoryFit(start.paths, free, support, np.full(len(problem.states), np.inf))
-    return fit, start.noise
+    return TrajectoryFit(problem, Level(start.noise, 1.0), start.path, free, support)
 
 
-def _estimated(
+def _smooth_record(
     problem: EstimationProblem, record: ScaledRecord, log10_ratio: float | None
 ) -> KalmanEstimate:
     """Smooth every state over the samples that it has; between these it follows a cubic."""
@@ -353,38 +353,35 @@ def _estimated(
     return replace(found, smoothed=smooth, derivative=rates, noise_std=std)
 
 
-@dataclass(frozen=True, eq=False)
-class Smoothed:
-    """Smoothed states, their rates, and standard deviations of the noise, by record (samples, d).
+class SmoothedStates(NamedTuple):
+    """Smoothed states, in the domains of the library's functions, their rates, and the noise.
 
-    They lie in the domains of the library's functions.
+    noise: standard deviations at all samples.
     """
 
-    paths: tuple[np.ndarray, ...]
-    rates: tuple[np.ndarray, ...]
-    noise: tuple[np.ndarray, ...]
+    path: Float[np.ndarray, "samples d"]
+    rates: Float[np.ndarray, "samples d"]
+    noise: Float[np.ndarray, "samples d"]
 
 
-def smoothed(problem: EstimationProblem, log10_ratio: float | None) -> Smoothed:
+def smooth_states(problem: EstimationProblem, log10_ratio: float | None) -> SmoothedStates:
     """Smooth the samples; log10_ratio as in `start_from_smooth`."""
-    estimates = []
+    estimates, paths = [], []
     for record in problem.records:
-        problem.watch.look()
-        estimates.append(_estimated(problem, record, log10_ratio))
-    variance = np.mean([np.square(e.noise_std) for e in estimates], axis=0)
-    paths = []
-    for each, record in zip(estimates, problem.records, strict=True):
-        samples = np.concatenate([record.samples, record.inputs], axis=1)
-        values = np.concatenate([each.smoothed, record.inputs], axis=1)
+        problem.monitor.look()
+        each = _smooth_record(problem, record, log10_ratio)
+        samples, values = (
+            np.concatenate([states, record.inputs], axis=1)
+            for states in (record.samples, each.smoothed)
+        )
         inside = keep_inside(problem.library, values, noise_inside(problem.library, samples))
+        estimates.append(each)
         paths.append(inside[:, : len(problem.states)])
+    variance = np.mean([np.square(each.noise_std) for each in estimates], axis=0)
     std = np.maximum(np.sqrt(variance), FLOOR if log10_ratio is None else UNSURE)
     std[~problem.measured] = std[problem.measured].mean()
-    return Smoothed(
-        paths=tuple(paths),
-        rates=tuple(each.derivative for each in estimates),
-        noise=tuple(np.tile(std, (len(path), 1)) for path in paths),
-    )
+    rates = np.concatenate([each.derivative for each in estimates])
+    return SmoothedStates(np.concatenate(paths), rates, np.tile(std, (len(rates), 1)))
 
 
 def _regress(

@@ -1,14 +1,19 @@
 """The working set: the few terms of each equation that a search weighs, out of a large library.
 
 The first set comes from each equation by itself: its own state is let go, the others are taken from
-their smoothed samples. After the search every term outside is tested on what the solution leaves,
-and terms that would pay for themselves enter. So the cost grows with the terms of the set, and only
-slowly with those of the library.
+their smoothed samples. After the search every term j outside is tested on what the solution leaves,
+and enters if its score test promises more than its price:
+
+    (dS/dz_j)^2 / (4 variance of dS/(2 dz_j)) > price_j
+
+where S is the objective of `likelihood`, and the variance is that under noise alone, the states and
+the chosen coefficients fitted to it. Assumed is that S is quadratic as far as the best z_j. The
+cost grows with the terms of the set, and only slowly with those of the library.
+Source: Rao 1948, doi:10.1017/S0305004100023987.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,37 +25,35 @@ from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import (
     FREE_START,
     Level,
+    Linearised,
     TrajectoryFit,
     hessian_on,
-    joined,
     observe,
 )
 from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.solution import Solution
 from ep2sindy.estimation.solver import (
+    COMPARED_AT,
     OTHER_STARTS,
     SAMPLES_PER_COEFFICIENT,
-    WEIGHED_AT,
-    Solution,
     at_level,
     from_smooth,
     settle,
-    smoothed,
+    smooth_states,
 )
 from ep2sindy.estimation.supports import N_BEST, inverse_of, term_prices
-from ep2sindy.model.flow import Flow
 from ep2sindy.regression.exchanges import exchanged_supports
 
-# rho of the first set: the state nearly free, or quite. One alone leaves out more true terms.
-WARM = (0.3, 3.0)
-MOST_ENTER, MAX_ENTRANCES = 3, 4  # terms of one equation that enter at once; times that some do
+# Model errors of the first set: the state nearly free, or quite. One alone leaves out more true
+# terms.
+FIRST_MODEL_ERRORS = (0.3, 3.0)
+MOST_ADMITTED, MAX_ADMISSIONS = 3, 4  # terms of one equation that enter at once; times that some do
 DEPENDENT = 1e-6  # share of a score's scatter that the chosen terms leave, if they span the term
 N_PROBES = 40  # draws of noise that tell how far a score scatters: to 22 % of its square
 
 
-def search_within(
-    problem: EstimationProblem, *, max_terms: int
-) -> tuple[EstimationProblem, Solution]:
-    """The solution from smoothed states by a working set, and the problem of the set's terms.
+def search_within(problem: EstimationProblem, *, max_terms: int) -> Solution:
+    """The solution from smoothed states by a working set, whose terms its problem has.
 
     Of a library that is large for its samples the linear terms are tried alone first: where they
     explain the samples and no other term would pay for itself, that is the solution. A search that
@@ -61,49 +64,48 @@ def search_within(
     few = problem.n_samples < SAMPLES_PER_COEFFICIENT * len(problem.library)
     if few and linear.n_free < problem.n_free > part.n_free:
         found = _linear_solution(linear, max_terms)
-        if found.fits and with_entrances(linear, found, max_terms=max_terms)[1] is found:
-            return linear, found
-    with problem.watch.stage(_weighed(part)):
+        if found.fits and admit_terms(found, max_terms=max_terms) is found:
+            return found
+    with problem.monitor.stage(_weighed(part)):
         found = from_smooth(part, None, max_terms=max_terms)
     # About a solution that does not fit first order tells little, and other starts cost less.
-    return with_entrances(part, found, max_terms=max_terms) if found.fits else (part, found)
+    return admit_terms(found, max_terms=max_terms) if found.fits else found
 
 
 def _linear_solution(linear: EstimationProblem, max_terms: int) -> Solution:
     """The likeliest solution of the linear terms alone that fits, from any start."""
-    with linear.watch.stage(_weighed(linear)):
+    with linear.monitor.stage(_weighed(linear)):
         tried = [
             from_smooth(linear, log10_ratio, max_terms=max_terms)
             for log10_ratio in (None, *OTHER_STARTS)
         ]
-    return min(tried, key=lambda each: (not each.fits, each.score))
+    return min(tried, key=lambda each: each.rank)
 
 
-def with_entrances(
-    part: EstimationProblem, found: Solution, *, max_terms: int
-) -> tuple[EstimationProblem, Solution]:
+def admit_terms(found: Solution, *, max_terms: int) -> Solution:
     """Let terms into the working set as long as they make the solution likelier."""
-    problem = part.candidates
-    problem.watch.best = part, found
-    for _ in range(MAX_ENTRANCES):
-        kept = part.taken
-        entering = ~kept & _would_pay(problem, kept, part, found)
+    problem = found.problem.candidates
+    problem.monitor.best = found
+    for _ in range(MAX_ADMISSIONS):
+        kept = found.problem.taken
+        entering = ~kept & _would_pay(problem, kept, found)
         if not entering.any():
             break
-        larger, fit = kept | entering, found.annealed.fit
+        larger, fit = kept | entering, found.fit
         whole = problem.restricted(larger)
         widened = replace(
             fit,
+            problem=whole,
+            level=replace(fit.level, noise=found.noise.effective),
             free=_spread(fit.free, kept)[larger],
             support=_spread(fit.support, kept)[larger] | entering[larger],
         )
-        with problem.watch.stage(_weighed(whole)):
-            tried = settle(whole, widened, found.noise.effective, max_terms=max_terms)
-        if (not tried.fits, tried.score) >= (not found.fits, found.score):
+        with problem.monitor.stage(_weighed(whole)):
+            tried = settle(widened, max_terms=max_terms)
+        if tried.rank >= found.rank:
             break
-        part, found = whole, tried
-        problem.watch.best = part, found
-    return part, found
+        found = problem.monitor.best = tried
+    return found
 
 
 def _weighed(part: EstimationProblem) -> str:
@@ -121,16 +123,17 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
     sizes = np.bincount(problem.block[~kept], minlength=len(problem.states))
     if problem.C is not None or not problem.measured.all() or (sizes <= SMALL).all():
         return np.ones_like(kept)
-    start = smoothed(problem, None)
-    steps = _integrals(problem, start.paths)
+    start = smooth_states(problem, None)
+    steps = _integrals(problem, start.path)
     for block in np.flatnonzero(sizes).tolist():
         own = np.flatnonzero((problem.block == block) & ~problem.required)
         if len(own) <= SMALL:
             kept[own] = True
             continue
-        for rho in WARM:
-            level = Level(start.noise, rho)
-            quadratic, linear, offset = _own_squares(problem, start.paths, level, steps, block, own)
+        for model_error in FIRST_MODEL_ERRORS:
+            level = Level(start.noise, model_error)
+            fit = TrajectoryFit(problem, level, start.path, np.zeros(problem.n_free), kept)
+            quadratic, linear, offset = _own_squares(fit, steps, block, own)
             size = np.sqrt(zero_to_one(np.diag(quadratic)))
             masks = exchanged_supports(
                 (quadratic / np.outer(size, size))[None],
@@ -158,13 +161,13 @@ def _mimicked(
 
 
 def _integrals(
-    problem: EstimationProblem, paths: Sequence[Float[np.ndarray, "samples d"]]
+    problem: EstimationProblem, path: Float[np.ndarray, "samples d"]
 ) -> Float[np.ndarray, "steps terms"]:
     """Integral of every term over each step along all paths, by the trapezoidal rule.
 
     It is zero from one path to the next. A term that overflows is not available: zero.
     """
-    record, path = problem.all_records, joined(paths)
+    record = problem.all_records
     with np.errstate(over="ignore", invalid="ignore"):
         ends = [
             problem.library.evaluate(np.concatenate([states, record.inputs_at(share)], axis=1))
@@ -176,9 +179,7 @@ def _integrals(
 
 @np.errstate(over="ignore", invalid="ignore")  # a term that overflows is not chosen
 def _own_squares(
-    problem: EstimationProblem,
-    paths: tuple[np.ndarray, ...],
-    level: Level,
+    fit: TrajectoryFit,
     steps: Float[np.ndarray, "steps terms"],
     block: int,
     own: np.ndarray,
@@ -187,15 +188,15 @@ def _own_squares(
 
     steps: integrals of the terms over each step. Returns the parts of `likelihood.Gram`.
     """
-    record, path, one = problem.all_records, joined(paths), slice(block, block + 1)
-    columns = steps[:, problem.column[own]]
+    record, path, one = fit.problem.all_records, fit.path, slice(block, block + 1)
+    columns = steps[:, fit.problem.column[own]]
     flow = np.concatenate([np.ones((len(columns), 1)), columns], axis=1)[:, None]
-    residuals, apparent, _ = observe(record, path, level.variance)
-    misses = -np.diff(path[:, one], axis=0)
-    flow[record.breaks] = misses[record.breaks] = 0.0
+    residuals, apparent, _ = observe(record, path, np.square(fit.level.noise))
+    defects = -np.diff(path[:, one], axis=0)
+    flow[record.breaks] = defects[record.breaks] = 0.0
     quadratic, linear, offset, _ = eliminate(
-        np.ascontiguousarray(flow), misses, np.ascontiguousarray(residuals[:, one]),
-        np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(level.process[:, one]),
+        np.ascontiguousarray(flow), defects, np.ascontiguousarray(residuals[:, one]),
+        np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(fit.process[:, one]),
         FREE_START,
     )  # fmt: skip
     tells = np.isfinite(np.diag(quadratic)) & np.isfinite(linear)
@@ -206,7 +207,6 @@ def _own_squares(
 def _would_pay(
     problem: EstimationProblem,
     kept: Bool[np.ndarray, " free"],
-    part: EstimationProblem,
     found: Solution,
 ) -> Bool[np.ndarray, " free"]:
     """Terms that would lower the squares by more than their price, at most a few per equation.
@@ -219,36 +219,30 @@ def _would_pay(
     enters = np.zeros_like(kept)
     if kept.all() or not np.isfinite(found.score):
         return enters
-    fit, level = at_level(part, found.annealed.fit, replace(found.annealed.level, rho=WEIGHED_AT))
-    gains = _gains(problem, part, fit, level)
-    gains -= term_prices(problem, float(part.n_samples))
+    fit = at_level(found.fit, replace(found.fit.level, model_error=COMPARED_AT))
+    gains = _gains(problem, fit) - term_prices(problem, float(problem.n_samples))
     gains[kept] = -np.inf
     for block in range(len(problem.states)):
         own = np.flatnonzero((problem.block == block) & (gains > 0.0))
-        enters[own[np.argsort(-gains[own])[:MOST_ENTER]]] = True
+        enters[own[np.argsort(-gains[own])[:MOST_ADMITTED]]] = True
     return enters
 
 
-def _gains(
-    problem: EstimationProblem,
-    part: EstimationProblem,
-    fit: TrajectoryFit,
-    level: Level,
-) -> Float[np.ndarray, " free"]:
+def _gains(problem: EstimationProblem, fit: TrajectoryFit) -> Float[np.ndarray, " free"]:
     """Fall of the squares that each coefficient by itself would bring, to first order."""
-    quadratic, _, _, flow = hessian_on(part, fit, fit.support, level)
+    quadratic, _, _, about = hessian_on(fit, fit.support)
     if not np.isfinite(quadratic).all():
         return np.zeros(problem.n_free)
     # Neither terms nor slopes lead from one record to the next, whatever is missed there.
-    terms, std = _integrals(problem, fit.paths), joined(level.noise)
-    score = np.square(terms.T @ ((flow.ends - joined(fit.paths)[1:]) / level.process))
+    terms, std = _integrals(problem, fit.path), fit.level.noise
+    score = np.square(terms.T @ (about.defects / about.process))
     with_states, with_all = np.zeros_like(score), np.zeros_like(score)
     rng, inverse = np.random.default_rng(0), inverse_of(quadratic)
     for _ in range(N_PROBES):
         noise = std * rng.standard_normal(std.shape)
-        without = _weighted_misses(part, fit, level, flow, noise, np.zeros(len(inverse)))
-        gradient = np.einsum("kd,kds->s", without, flow.slopes[:, :, len(part.states) :])
-        fitted = _weighted_misses(part, fit, level, flow, noise, -inverse @ gradient)
+        without = _weighted_defects(about, noise, np.zeros(len(inverse)))
+        gradient = np.einsum("kd,kds->s", without, about.slopes[:, :, fit.path.shape[1] :])
+        fitted = _weighted_defects(about, noise, -inverse @ gradient)
         with_states += np.square(terms.T @ without) / N_PROBES
         with_all += np.square(terms.T @ fitted) / N_PROBES
     # A term that the chosen ones span leaves only rounding: it is not available.
@@ -257,11 +251,8 @@ def _gains(
     return gains[problem.column, problem.equation]
 
 
-def _weighted_misses(
-    part: EstimationProblem,
-    fit: TrajectoryFit,
-    level: Level,
-    flow: Flow,
+def _weighted_defects(
+    about: Linearised,
     noise: Float[np.ndarray, "samples d"],
     change: Float[np.ndarray, " support"],
 ) -> Float[np.ndarray, "steps d"]:
@@ -269,13 +260,11 @@ def _weighted_misses(
 
     Over the variance of the flow's error.
     """
-    d, process = len(part.states), level.process
-    by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
-    moved = flow.slopes[:, :, d:] @ change
-    seen = observe(part.all_records, joined(fit.paths), level.variance)
-    draw = np.where(np.isfinite(seen.residuals), noise, np.nan)
-    off = departures(by_state, moved, draw, seen.variance, process, FREE_START)
-    return (np.einsum("kij,kj->ki", by_state, off[:-1]) + moved - off[1:]) / process
+    d, states = noise.shape[1], about.of_states
+    moved = about.slopes[:, :, d:] @ change
+    draw = np.where(np.isfinite(about.residuals), noise, np.nan)
+    off = departures(*states._replace(defects=moved, residuals=draw))
+    return (np.einsum("kij,kj->ki", states.slopes, off[:-1]) + moved - off[1:]) / about.process
 
 
 def _spread(values: np.ndarray, kept: Bool[np.ndarray, " free"]) -> np.ndarray:

@@ -1,6 +1,6 @@
 """States of a model along a record: its start and the noise, fitted to the past alone.
 
-A model follows a record apart from two errors: the noise of the samples, and a random push of every
+A model follows a record apart from two errors: the noise of the samples, and a random move of every
 state at every step (process noise), which stands for all that the model does not describe. Their
 sizes are the most likely ones for the record that the model was fitted to. States are then fitted
 to the samples of a window before any moment, by the model and under these errors.
@@ -25,7 +25,7 @@ from ep2sindy.estimation.problem import (
     ScaledRecord,
     scale_problem,
 )
-from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, error_variances, likely_errors
+from ep2sindy.estimation.process_noise import LEAST_NOISE, MOST, likely_errors
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
@@ -48,7 +48,7 @@ class ModelNoise:
     """Standard deviations of the errors with which a model follows a record, in SI.
 
     samples: (n_states,), of the samples' noise; NaN for a state that is not measured.
-    process: (n_states,), of the push of every state in a mean step.
+    process: (n_states,), of the process noise of every state over a mean step.
     """
 
     samples: Float[np.ndarray, " n_states"]
@@ -97,7 +97,7 @@ class Tracker:
         record = self.problem.record(_of_model(self.model, history)).end(self.memory)
         samples, process = self.scaled_noise()
         path = self.approach(record, record.samples.copy(), samples, process)
-        variances = error_variances(len(path), samples, process)
+        variances = _variances(len(path), samples, process)
         _, mean, covariance = filtered(*self.linear(record, path), *variances, FREE_START)
         end, scale = path[-1] + mean, self.problem.scale
         if not (np.isfinite(end).all() and np.isfinite(covariance).all()):
@@ -149,7 +149,7 @@ class Tracker:
         self, record: ScaledRecord, path: np.ndarray, samples: np.ndarray, process: np.ndarray
     ) -> np.ndarray:
         """Most likely path near the given one, by Gauss-Newton steps that are halved if needed."""
-        variances = error_variances(len(path), samples, process)
+        variances = _variances(len(path), samples, process)
         with np.errstate(over="ignore", invalid="ignore"):
             total = self._total(record, path, *variances)
             for _ in range(MAX_STEPS):
@@ -221,7 +221,7 @@ def track(
         model=model,
         problem=problem,
         free=free,
-        n_substeps=_substeps(problem, paths, free, rough),
+        n_substeps=enough_substeps(_as_fit(problem, paths, free, rough, rough)),
         per_period=_per_period(own, names),
         noise=_noise_of(problem, rough, 0.1 * rough),
     )
@@ -261,20 +261,32 @@ def _with_likely_noise(
     samples, process = tracker.scaled_noise()
     pairs = zip(tracker.problem.records, paths, strict=True)
     found = [(each, tracker.approach(each, path, samples, process)) for each, path in pairs]
-    linear = [tracker.linear(each, path) for each, path in found]
-    likely = likely_errors(linear, tracker.measured, samples, process)
-    noise = _noise_of(tracker.problem, likely.samples, likely.process)
-    return replace(tracker, noise=noise), [path for _, path in found]
+    paths = [path for _, path in found]
+    n = tracker.n_substeps
+    fit = _as_fit(tracker.problem, paths, tracker.free, samples, process, n_substeps=n)
+    level, _ = likely_errors(fit)
+    noise = _noise_of(tracker.problem, level.noise[0], level.process_noise)
+    return replace(tracker, noise=noise), paths
 
 
-def _substeps(
-    problem: EstimationProblem, paths: Sequence[np.ndarray], free: np.ndarray, noise: np.ndarray
-) -> int:
-    """Number of Runge-Kutta steps from one sample to the next."""
-    level = Level(tuple(np.tile(noise, (len(path), 1)) for path in paths), 1.0)
-    everything = np.ones(len(free), dtype=np.bool_)
-    fit = TrajectoryFit(tuple(paths), free, everything, np.zeros(len(noise)))
-    return enough_substeps(problem, fit, level)
+def _as_fit(
+    problem: EstimationProblem,
+    paths: Sequence[np.ndarray],
+    free: np.ndarray,
+    samples: np.ndarray,
+    process: np.ndarray,
+    *,
+    n_substeps: int = 1,
+) -> TrajectoryFit:
+    """Paths of all records as a fit under errors of these sizes."""
+    path = np.concatenate(paths)
+    level = Level(np.tile(samples, (len(path), 1)), 1.0, n_substeps, process)
+    return TrajectoryFit(problem, level, path, free, np.ones(len(free), dtype=np.bool_))
+
+
+def _variances(n: int, samples: np.ndarray, process: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Variances of n samples and of the pushes between them."""
+    return np.tile(np.square(samples), (n, 1)), np.tile(np.square(process), (n - 1, 1))
 
 
 def _noise_of(problem: EstimationProblem, samples: np.ndarray, process: np.ndarray) -> ModelNoise:

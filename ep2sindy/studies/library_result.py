@@ -376,8 +376,8 @@ def estimate_section(name: str, found: Estimate, data: Trajectory, *, of_model: 
         Table(rows, title="noise of the samples", note=NOISE),
         Text(found.misfit or FITS, warning=bool(found.misfit)),
     ]
-    if found.few:
-        blocks.append(Text(found.few, warning=True))
+    if found.too_few_samples:
+        blocks.append(Text(found.too_few_samples, warning=True))
     if found.rivals:
         rivals = ResultTable(found.rivals, RIVALS).screen()
         blocks.append(Table(rivals, title="other supports that may be"))
@@ -439,7 +439,7 @@ ESTIMATE: Metrics[Estimate] = [
     Metric("remarks", lambda found: list(found.remarks)),
     Metric("flow_error", lambda found: found.flow_error),
     Metric("misfit", lambda found: found.misfit or None),
-    Metric("few", lambda found: found.few or None),
+    Metric("too_few_samples", lambda found: found.too_few_samples or None),
     Metric("rivals", lambda found: [facts(rival, RIVALS) for rival in found.rivals]),
 ]  # fmt: skip
 

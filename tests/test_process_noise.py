@@ -1,4 +1,4 @@
-"""States that are pushed at random: the law is found, and what a library lacks is no push."""
+"""Process noise: the law is found, and what a library lacks is none."""
 
 from dataclasses import replace
 
@@ -7,16 +7,17 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit
 from ep2sindy.estimation.problem import scale_problem
-from ep2sindy.estimation.pushed import likely_errors, solve_pushed
+from ep2sindy.estimation.process_noise import likely_errors, solve_with_process_noise
 from ep2sindy.systems.systems import System
 
 VAN_DER_POL = replace(ep.systems.van_der_pol(), duration_s=12.0)
 N_SUBSTEPS = 10  # of the Euler-Maruyama scheme, around exact steps of the law
 
 
-def pushed(system: System, share: float, seed: int, *, noise: float = 0.01) -> Trajectory:
-    """A record whose states are pushed by a share of their RMS in ten samples."""
+def moved(system: System, share: float, seed: int, *, noise: float = 0.01) -> Trajectory:
+    """A record whose states process noise moves by a share of their RMS in ten samples."""
     rng, clean = np.random.default_rng(seed), system.trajectory()
     rms = np.sqrt(np.square(clean.states).mean(axis=0))
     size = share * rms / np.sqrt(10 * N_SUBSTEPS)
@@ -35,10 +36,10 @@ def counted(system: System, degree: int, seeds: range) -> tuple[int, int, int]:
     """Right supports, and intervals of them that hold the truth, of how many."""
     right = held = n = 0
     for seed in seeds:
-        run = pushed(system, 0.02, seed)
+        run = moved(system, 0.02, seed)
         found = ep.discover(run, ep.polynomial(run.state_names, degree=degree))
         assert found.misfit == ""
-        assert "states are pushed at random" in found.remarks[0]
+        assert "process noise moves the states" in found.remarks[0]
         truth = system.model
         if any(set(found.model.terms(s)) != set(truth.terms(s)) for s in truth.states):
             continue
@@ -50,7 +51,7 @@ def counted(system: System, degree: int, seeds: range) -> tuple[int, int, int]:
     return right, held, n
 
 
-def test_a_law_is_found_under_pushes_with_intervals_that_hold() -> None:
+def test_a_law_is_found_under_process_noise_with_intervals_that_hold() -> None:
     right, held, n = counted(VAN_DER_POL, 3, range(1))
     assert right == 1
     assert held >= n - 1
@@ -68,27 +69,28 @@ def test_the_law_is_found_in_most_draws(system: System, degree: int) -> None:
     assert held >= 0.8 * n  # nine in ten or so, less two standard errors
 
 
-def test_the_sizes_of_pushes_and_noise_are_found() -> None:
-    run = pushed(VAN_DER_POL, 0.02, 0)
+def test_the_sizes_of_process_noise_and_noise_are_found() -> None:
+    run = moved(VAN_DER_POL, 0.02, 0)
     rms = np.sqrt(np.square(run.states).mean(axis=0))
     found = ep.estimate(run, ep.polynomial(run.state_names, degree=3))
-    assert found.push_std / rms == pytest.approx(0.02 / np.sqrt(10), rel=0.25)
+    assert found.process_noise_std / rms == pytest.approx(0.02 / np.sqrt(10), rel=0.25)
     assert found.noise_std / rms == pytest.approx(0.01, rel=0.25)
     exact = ep.estimate(
         VAN_DER_POL.trajectory(noise=0.05, rng=0), ep.polynomial(["x", "y"], degree=3)
     )
-    assert exact.push_std.tolist() == [0.0, 0.0]
+    assert exact.process_noise_std.tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.05])
-def test_what_a_library_lacks_is_no_push(noise: float) -> None:
+def test_what_a_library_lacks_is_no_process_noise(noise: float) -> None:
     """x' lacks x^3."""
     run = ep.systems.van_der_pol().trajectory(noise=noise, rng=0)
-    found = solve_pushed(
+    found = solve_with_process_noise(
         scale_problem([run], ep.polynomial(run.state_names, degree=2)), max_terms=7
     )
-    assert found.single.max() > 6.0
-    assert not found.explains
+    _, _, single, _ = found.tests
+    assert single.statistic.max() > 6.0
+    assert not found.fits
 
 
 @pytest.mark.slow  # an equation without one of its states is told so in the fast suite
@@ -96,7 +98,7 @@ def test_an_equation_that_lacks_no_term_is_told_from_one_that_does() -> None:
     """x' lacks x^3, and the linear y' is right."""
     run = VAN_DER_POL.trajectory(noise=0.05, rng=0)
     found = ep.estimate(run, ep.polynomial(run.state_names, degree=2))
-    assert found.holds == ("y",)
+    assert found.explained_states == ("y",)
     assert "no law of this library explains x: a term or a state is missing" in found.misfit
     assert found.model.terms("y") == pytest.approx({"x": 0.5}, rel=0.03)
 
@@ -106,9 +108,12 @@ def test_the_likeliest_errors_of_a_random_walk_are_exact() -> None:
     rng, n = np.random.default_rng(1), 20_000
     walk = np.cumsum(0.3 * rng.standard_normal(n))
     samples = walk + 0.5 * rng.standard_normal(n)
-    slopes, misses = np.ones((n - 1, 1, 1)), -np.diff(samples)[:, None]
-    found = likely_errors(
-        [(slopes, misses, np.zeros((n, 1)))], np.array([True]), np.array([0.1]), np.array([0.1])
+    run = Trajectory(np.arange(float(n)), samples[:, None], ["x"])
+    problem = scale_problem([run], ep.polynomial(["x"], degree=1))
+    none, guess = np.zeros(2), np.array([0.1])
+    level = Level(np.ones((n, 1)), 1.0).with_errors(guess, guess)
+    found, _ = likely_errors(
+        TrajectoryFit(problem, level, problem.records[0].samples, none, none > 0.0)
     )
-    assert found.samples[0] == pytest.approx(0.5, rel=0.05)
-    assert found.process[0] == pytest.approx(0.3, rel=0.05)
+    assert found.noise[0] * problem.scale == pytest.approx([0.5], rel=0.05)
+    assert found.process_noise * problem.scale == pytest.approx([0.3], rel=0.05)

@@ -1,7 +1,12 @@
 """Channels that come late: a delay of each state, as one more parameter of how it is sampled.
 
-With a delayed channel, wrong equations with more terms fit the data no worse. So the delay is not
-read from the residuals: the test is whether fewer terms suffice with it.
+    y_k(t) = x_k(t - tau_k) + noise, about x_k(t) - tau_k x_k'(t) + noise
+
+With a delayed channel, wrong equations with more terms fit the data no worse. So the delays are not
+read from the residuals. They are unknowns beside the coefficients, and are believed if the squares
+plus the prices of terms and delays fall: fewer terms then suffice, or likelier ones. Assumed is
+that each delay is constant, and short beside the times on which the states change; without inputs
+a delay that all states share leaves no trace.
 """
 
 from __future__ import annotations
@@ -13,10 +18,10 @@ from math import log
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, hessian
-from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
+from ep2sindy.estimation.kernels import eliminate
+from ep2sindy.estimation.likelihood import Gram, TrajectoryFit, flow_by, linearise
+from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.supports import PenalisedFit, best_support, inverse_of, penalise
-from ep2sindy.model.flow import Flow
 
 PAYS = 1.0  # least fall of squares plus prices, beyond the delays' own price
 SURE = 6.0  # standard errors of every delay: true ones of a sample show ten and more
@@ -25,7 +30,9 @@ MAX_SAMPLES = 10.0  # largest delay that is believed: more is no small clock err
 
 @dataclass(frozen=True, eq=False)
 class DelayedGram:
-    """The squares as a quadratic function of all free coefficients and of delays of some states.
+    """The squares as a quadratic function of the free coefficients z and some states' delays tau.
+
+        S(z, tau) = at_rest(z) + 2 tau' of_both' z + tau' of_delays tau - 2 linear' tau
 
     Linearised about a fit without delays. at_rest: the part without delays. of_both: (free,
     delays), of_delays: (delays, delays), both quadratic; linear: (delays,).
@@ -63,25 +70,19 @@ class DelayedGram:
         return best, np.sqrt(np.maximum(np.diag(inverse), 0.0))
 
 
-def delayed_gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> DelayedGram:
+def delayed_gram(fit: TrajectoryFit) -> DelayedGram:
     """Linearise about a fit, with a delay of every state.
 
     Without inputs, a common delay of all states leaves no trace in the data. To first order, a
     state that is read tau early lies tau times its rate further on. At the start of a step this
     displacement goes through the flow; at the end of the step it is what the samples show.
     """
-    d, n = len(problem.states), len(fit.support)
-
-    def flow(record: ScaledRecord, path: np.ndarray) -> Flow:
-        everything = np.ones_like(fit.support)
-        found = problem.flow(record, path[:-1], fit.free, everything, level.n_substeps, n_more=d)
-        rates = problem.rates(record, path, fit.free)
-        columns = found.slopes[:, :, :d] * rates[:-1, None, :]
-        columns[:, np.arange(d), np.arange(d)] -= rates[1:]
-        found.slopes[:, :, -d:] = columns
-        return found
-
-    quadratic, gradient, least, _ = hessian(problem, fit, level, flow)
+    problem, d, n = fit.problem, fit.path.shape[1], len(fit.support)
+    flow = flow_by(fit, np.ones_like(fit.support), n_more=d)
+    rates = problem.rates(problem.all_records, fit.path, fit.free)
+    flow.slopes[:, :, -d:] = flow.slopes[:, :, :d] * rates[:-1, None, :]
+    flow.slopes[:, np.arange(d), np.arange(-d, 0)] -= rates[1:]
+    quadratic, gradient, least, _ = eliminate(*linearise(fit, flow))
     linear = quadratic[:, :n] @ fit.free + gradient
     own = quadratic[:n, :n]
     offset = least + fit.free @ own @ fit.free + 2.0 * fit.free @ gradient[:n]
@@ -106,7 +107,7 @@ def suspect_delays(
     gain = penalise(around.at_rest, support, prices).score - best.score
     if gain < delay_price(problem) + PAYS:
         return None
-    delays = _those_that_show(problem, around, best.support, late)
+    delays = _significant_delays(problem, around, best.support, late)
     gain -= np.count_nonzero(delays) * delay_price(problem)
     return delays if gain > PAYS and 0.0 < np.abs(delays).max() <= MAX_SAMPLES else None
 
@@ -133,7 +134,7 @@ def fit_delays(
     return best, delays, errors
 
 
-def _those_that_show(
+def _significant_delays(
     problem: EstimationProblem,
     around: DelayedGram,
     support: Bool[np.ndarray, " free"],
@@ -158,7 +159,7 @@ def _those_that_show(
     return np.zeros(len(late))
 
 
-def move_channels(
+def shift_channels(
     problem: EstimationProblem, paths: Sequence[np.ndarray], delays: Float[np.ndarray, " d"]
 ) -> EstimationProblem:
     """The problem with every channel brought forward by its delay, in mean steps.
@@ -192,7 +193,7 @@ def delay_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> 
     return " and ".join(parts)
 
 
-def late_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
+def delay_misfit(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
     """Explanation why samples with a late channel are a misfit, and what to do about it."""
     return (
         f"{delay_words(problem, delays)}: brought together, the samples are better explained "
