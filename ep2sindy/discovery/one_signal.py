@@ -30,7 +30,7 @@ from ep2sindy.estimation.explanation import FIRST_MAX_TERMS
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.rolling import RollingStarts, spread_starts
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill, horizon_errors
-from ep2sindy.forecasting.tracking import Tracker, track
+from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import relations_of
 from ep2sindy.model.comparison import REPEATS, FreeRunBounds
@@ -79,14 +79,14 @@ MIN_JUDGED = 1.5  # periods that a held-out part must have
 class Attempt:
     """A model in a number of states.
 
-    tracker: of its states along the fitted part. error: of its forecasts up to a period there, in
+    estimator: of its states along the fitted part. error: of its forecasts up to a period there, in
     standard deviations. share: of the next state's variance that neighbours in these states do not
     explain; None for hidden states, of which there is no next one.
     """
 
     chosen: Chosen
     found: Discovery
-    tracker: Tracker
+    estimator: StateEstimator
     error: float
     share: float | None
 
@@ -115,12 +115,12 @@ def choose_attempt(attempts: Sequence[Attempt]) -> Attempt:
     return best
 
 
-def error_where_fitted(past: Trace, chosen: Chosen, tracker: Tracker) -> float:
+def error_where_fitted(past: Trace, chosen: Chosen, estimator: StateEstimator) -> float:
     """Error of forecasts up to a period from starts in the last half of the fitted part."""
     record, longest = with_all_states(past, chosen), max(2, round(past.per_period))
     n = record.n_samples
     first = spread_starts(record.t, n // 2, longest, N_TRIED)
-    rolling = RollingStarts(tracker, record, [past.name], first, longest)
+    rolling = RollingStarts(estimator, record, [past.name], first, longest)
     ahead = rolling.forecasts(partial(states_before, past, chosen.embedding), N_DRAWS_TRIED, seed=0)
     scale = past.x[n // 2 :].std()
     return float(horizon_errors(rolling.measured(ahead), rolling.truth, scale).mean())
@@ -141,7 +141,7 @@ def with_all_states(signal: Trace, chosen: Chosen) -> Trajectory:
 
 def states_before(signal: Trace, embedding: Embedding, past: Trajectory) -> Trajectory:
     """The states at a time, made from samples before it alone."""
-    if isinstance(embedding, HiddenStates):  # the tracker fits them itself
+    if isinstance(embedding, HiddenStates):  # the estimator fits them itself
         return alone(signal.with_samples(past.t, past.states[:, 0]))
     return embedding.embed(signal.with_samples(past.t, past.states[:, 0])).run
 
@@ -244,11 +244,11 @@ class SignalSearch:
     ) -> Attempt:
         with progress.stage(None, "", "forecasts where it was fitted"):
             record = with_all_states(past, chosen)
-            tracker = track(found.model, record, measured=[past.name])
-            error = error_where_fitted(past, chosen, tracker)
+            estimator = tune_estimator(found.model, record, measured=[past.name])
+            error = error_where_fitted(past, chosen, estimator)
             own = chosen.embedding
             share = unexplained(past, own) if isinstance(own, AnyEmbedding) else None
-        return Attempt(chosen, found, tracker, error, share)
+        return Attempt(chosen, found, estimator, error, share)
 
     def _embedded(self, signal: Trace, n_states: int) -> Chosen:
         known = embeddings(self.harmonics, n_states)
@@ -456,13 +456,13 @@ def evaluate(
     own = [signal.name]
     is_whole, before = n_fitted == len(signal.t), partial(states_before, signal, chosen.embedding)
     if is_whole:
-        first, tracker = int(np.searchsorted(signal.t, chosen.embedded.run.t[0])), best.tracker
+        first, estimator = int(np.searchsorted(signal.t, chosen.embedded.run.t[0])), best.estimator
         start = chosen.embedded.run.states[0]
     else:
         first, past = n_fitted - 1, with_all_states(signal.window(0, n_fitted), chosen)
         with progress.stage(None, "", "width of the forecasts' bands"):
-            tracker = calibrate(best.tracker, past, states_of=before)
-        start = tracker.end_of(before(past)).mean
+            estimator = calibrate(best.estimator, past, states_of=before)
+        start = estimator.filter(before(past)).mean
     measured = whole.window(first, whole.n_samples)
     with progress.stage(None, "", "free run and limit cycle"):
         cycle = FreeCycle.of(free_run(model, measured, initial=start, judged=own))
@@ -470,7 +470,7 @@ def evaluate(
         return SignalDiscovery(signal, best, attempts, whole, measured, cycle, None)
     with progress.stage(None, "start", "forecasts") as advance:
         skill = forecast_skill(
-            model, whole, n_fitted=n_fitted, measured=own, states_of=before, tracker=tracker,
+            model, whole, n_fitted=n_fitted, measured=own, states_of=before, estimator=estimator,
             advance=advance,
         )  # fmt: skip
     return SignalDiscovery(signal, best, attempts, whole, measured, cycle, skill)

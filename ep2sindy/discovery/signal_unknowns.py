@@ -17,7 +17,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import TrajectorySearch
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.estimate import Estimate
-from ep2sindy.forecasting.tracking import Tracker, track
+from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import number_text
 from ep2sindy.model.comparison import SPIRALS, Verdict
@@ -43,24 +43,24 @@ class HiddenStates:
     noise_std: of the signal's samples, in SI.
     """
 
-    tracker: Tracker
+    estimator: StateEstimator
     noise_std: float
 
     @property
     def n_states(self) -> int:
-        return len(self.tracker.model.states)
+        return len(self.estimator.model.states)
 
     @property
     def says(self) -> str:
         return f"the signal and {self.n_states - 1} that nobody measured"
 
     def names(self, signal: str) -> tuple[str, ...]:
-        return tuple(self.tracker.model.states)
+        return tuple(self.estimator.model.states)
 
     def embed(self, signal: Trace) -> Embedded:
-        model = self.tracker.model
+        model = self.estimator.model
         known = {signal.name: tuple(model.terms(signal.name))}  # its term sets a scale
-        return Embedded(self.tracker.along(alone(signal)), (), known, self.noise_std)
+        return Embedded(self.estimator.smooth(alone(signal)), (), known, self.noise_std)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +77,8 @@ class HiddenSearch:
 
     def chosen(self, signal: Trace) -> Chosen:
         """The states along a signal."""
-        tracker = track(self.found.model, alone(signal))
-        own = HiddenStates(tracker, float(self.estimate.noise_std[0]))
+        estimator = tune_estimator(self.found.model, alone(signal))
+        own = HiddenStates(estimator, float(self.estimate.noise_std[0]))
         reason = "their equations explain the signal to its noise" if self.explains else "set"
         return Chosen(own, reason, own.embed(signal))
 
