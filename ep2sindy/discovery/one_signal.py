@@ -22,6 +22,7 @@ from ep2sindy.discovery.signal_unknowns import (
     FITTED,
     HiddenStates,
     alone,
+    embed_hidden,
     fit_functions,
     names_of,
     search_hidden,
@@ -46,13 +47,12 @@ from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.embedding import (
+    EMBEDDINGS,
     HARMONICS,
     AnyEmbedding,
     Chosen,
-    Delays,
     Embedded,
     Embedding,
-    LogRate,
     Rate,
     embed,
     unexplained,
@@ -66,6 +66,7 @@ CLEARLY, N_TRIED, N_DRAWS_TRIED = 0.8, 20, 20
 # Candidates per equation if no equation is known, so that there are few combinations.
 DEPTH_OF_BOTH = 2
 
+EXPLAINED = "their equations explain the signal to its noise"
 NOT_EXPLAINED = (
     "no equations of the signal and states that nobody measured explain it to its noise and live: "
     "states are made by smoothing"
@@ -164,15 +165,15 @@ class SignalSearch:
     function_degree: int = 1
 
     def __post_init__(self) -> None:
-        known = ("hidden", *embeddings(self.harmonics, 2))
+        known = ("hidden", *EMBEDDINGS)
         if self.embedding not in ("auto", *known):
             raise ValueError(
                 f"embedding must be auto, {' or '.join(known)}: {self.embedding!r} came"
             )
-        if self.n_states != "auto":
-            if isinstance(self.n_states, str):
-                raise ValueError(f"n_states must be auto or a number: {self.n_states!r} came")
-            embeddings(self.harmonics, self.n_states)
+        if isinstance(self.n_states, str) and self.n_states != "auto":
+            raise ValueError(f"n_states must be auto or a number: {self.n_states!r} came")
+        n_states = 2 if isinstance(self.n_states, str) else self.n_states
+        Rate(self.harmonics, n_states)  # refuses settings that no embedding has
 
     def attempts(
         self,
@@ -192,12 +193,14 @@ class SignalSearch:
         numbers = self._numbers(whole)
         if self.embedding in ("auto", "hidden"):
             libraries = self._libraries(past, numbers)
-            search = search_hidden(past, libraries, self.by_trajectories, progress, once)
-            if search.explains or self.embedding == "hidden":
-                return [self._attempt(past, search.chosen(past), search.found, progress)]
+            found, explains = search_hidden(past, libraries, self.by_trajectories, progress, once)
+            if explains or self.embedding == "hidden":
+                chosen = embed_hidden(past, found, EXPLAINED if explains else "set")
+                return [self._attempt(past, chosen, found, progress)]
             if say is not None:
                 say(NOT_EXPLAINED)
-        return [self._smoothed(past, n, seed, progress, once) for n in numbers]
+        pairs = [once(partial(self._smoothed, past, n, seed, progress)) for n in numbers]
+        return [self._attempt(past, *pair, progress) for pair in pairs]
 
     def _numbers(self, signal: Trace) -> list[int]:
         """Numbers of states to try; a signal of two states either repeats itself or spirals."""
@@ -227,12 +230,6 @@ class SignalSearch:
         return TrajectorySearch()
 
     def _smoothed(
-        self, past: Trace, n_states: int, seed: int, progress: Progress, once: Once
-    ) -> Attempt:
-        chosen, found = once(partial(self._searched, past, n_states, seed, progress))
-        return self._attempt(past, chosen, found, progress)
-
-    def _searched(
         self, past: Trace, n_states: int, seed: int, progress: Progress
     ) -> tuple[Chosen, Discovery]:
         with progress.stage(None, "", f"{n_states} states of the signal"):
@@ -251,14 +248,9 @@ class SignalSearch:
         return Attempt(chosen, found, estimator, error, share)
 
     def _embedded(self, signal: Trace, n_states: int) -> Chosen:
-        known = embeddings(self.harmonics, n_states)
-        if self.embedding in known:
-            return embed(signal, known[self.embedding])
-        chosen = embed(signal, n_states=n_states)
-        (fitting,) = (e for e in known.values() if type(e) is type(chosen.embedding))
-        return chosen if fitting == chosen.embedding else replace(
-            embed(signal, fitting), reason=chosen.reason
-        )  # fmt: skip
+        kind = EMBEDDINGS.get(self.embedding)
+        own = kind(harmonics=self.harmonics, n_states=n_states) if kind else None
+        return embed(signal, own, n_states=n_states, harmonics=self.harmonics)
 
     def library(
         self, names: Sequence[str], functions: Sequence[str], degree: int | None = None
@@ -301,14 +293,6 @@ class SignalSearch:
         return (
             replace(found, model=replace(found.model, covariance=None)) if found.misfit else found
         )
-
-
-def embeddings(harmonics: float, n_states: int) -> dict[str, AnyEmbedding]:
-    return {
-        "log_rate": LogRate(harmonics, n_states),
-        "rate": Rate(harmonics, n_states),
-        "delays": Delays(harmonics=harmonics, n_states=n_states),
-    }
 
 
 def repeats(signal: Trace) -> bool:
