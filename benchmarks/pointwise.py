@@ -30,8 +30,7 @@ from benchmarks.timing import cpu_s
 from ep2sindy.data.open import read_field
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
-from ep2sindy.discovery.point_search import PointSearch
-from ep2sindy.discovery.pointwise import blocks_of, pointwise
+from ep2sindy.discovery.pointwise import PointSearch, blocks_of, pointwise
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential

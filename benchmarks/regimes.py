@@ -13,8 +13,7 @@ from sklearn.metrics import adjusted_rand_score
 
 from benchmarks.regions import REGIONS, STATES, RegionField, three_regions
 from ep2sindy.discovery.method import Regression
-from ep2sindy.discovery.point_search import PointSearch
-from ep2sindy.discovery.pointwise import pointwise
+from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential

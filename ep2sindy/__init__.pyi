@@ -70,7 +70,7 @@ from ep2sindy.forecasting.forecast import forecast as forecast
 from ep2sindy.forecasting.bands import Forecast as Forecast
 from ep2sindy.forecasting.skill import forecast_skill as forecast_skill
 from ep2sindy.forecasting.skill import ForecastSkill as ForecastSkill
-from ep2sindy.forecasting.tracking import estimate_states as estimate_states
+from ep2sindy.forecasting.state_estimation import estimate_states as estimate_states
 
 # Refinement
 from ep2sindy.refinement.refine import refine as refine

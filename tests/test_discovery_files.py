@@ -98,6 +98,10 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"fronts": {"mapping": [["x", {"array": [], "type": "object"}]]}}, "an array of type"),
     ({"ambiguities": ["x"]}, "ambiguities of another kind"),
     ({"constraint": METHOD}, "constraint of another kind"),
+    ({"chosen": {"mapping": [["x", METHOD]]}}, "chosen of another kind"),
+    # What Python itself says of a value without a part, or with one too many, names only code.
+    ({"noise_test": {"class": "NoiseTest", "more": 1}}, "JSON: it is damaged, or of another kind"),
+    ({"remarks": 1}, "JSON: it is damaged, or of another kind"),
 ]
 
 

@@ -16,7 +16,7 @@ import ep2sindy as ep
 from benchmarks.estimation import LORENZ, SHORT
 from benchmarks.known_systems import noisy
 from ep2sindy.data.sensor import Bounds
-from ep2sindy.discovery.recipe import method_of
+from ep2sindy.discovery.method import method_of
 from ep2sindy.estimation import cost, explanation, kernels, likelihood
 from ep2sindy.estimation.kernels import departures, eliminate, filtered
 from ep2sindy.estimation.likelihood import (

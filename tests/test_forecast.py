@@ -9,8 +9,9 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.data.numbers import quantiles
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.likelihood import linearise
 from ep2sindy.forecasting.baselines import Autoregression, Harmonics, Persistence
-from ep2sindy.forecasting.tracking import track
+from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
 from tests.models import model_of
 
@@ -33,28 +34,28 @@ def spring(noise: float, *, push: float = 0.0, n: int = 1200, seed: int = 0) -> 
 
 @pytest.mark.parametrize(("noise", "push"), [(0.1, 0.0), (0.05, 0.02)])
 def test_noise_and_pushes_are_those_of_the_record(noise, push) -> None:
-    tracker = track(SPRING, spring(noise, push=push, n=3000))
+    estimator = tune_estimator(SPRING, spring(noise, push=push, n=3000))
     # The standard error of either is a hundredth or two of it.
-    assert tracker.noise.samples == pytest.approx([noise, noise], rel=0.1)
+    assert estimator.noise.samples == pytest.approx([noise, noise], rel=0.1)
     if push:
-        assert tracker.noise.process[1] == pytest.approx(push, rel=0.15)
+        assert estimator.noise.process[1] == pytest.approx(push, rel=0.15)
     else:
-        assert tracker.noise.process.max() < 0.1 * noise
+        assert estimator.noise.process.max() < 0.1 * noise
 
 
 def test_a_start_is_the_kalman_filter_of_the_window() -> None:
     """For a linear model the fitted state is the least-squares fit of the window's samples."""
     run = spring(0.1)
-    tracker = track(SPRING, run)
-    end = tracker.end_of(run.window(0, 800))
-    n = tracker.memory
+    estimator = tune_estimator(SPRING, run)
+    end = estimator.filter(run.window(0, 800))
+    n = estimator.memory
     age = run.t[799] - run.t[800 - n : 800]
     rows = np.stack(
         [np.column_stack([np.cos(age), -np.sin(age)]), np.column_stack([np.sin(age), np.cos(age)])]
     ).reshape(2 * n, 2)
     fit = np.linalg.lstsq(rows, run.states[800 - n : 800].T.ravel(), rcond=None)[0]
     assert end.mean == pytest.approx(fit, abs=2e-3)  # pushes are small, and not nothing
-    expected = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) * tracker.noise.samples
+    expected = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) * estimator.noise.samples
     assert np.sqrt(np.diag(end.covariance)) == pytest.approx(expected, rel=0.1)
 
 
@@ -102,10 +103,10 @@ def test_a_state_that_was_not_measured_is_fitted_by_the_model() -> None:
     run = spring(0.05)
     nothing = 0.3 + 1e-3 * np.sin(run.t)
     blind = replace(run, states=np.column_stack([run.states[:, 0], nothing]))
-    tracker = track(SPRING, blind, measured=["x"])
-    assert np.isnan(tracker.noise.samples[1])
+    estimator = tune_estimator(SPRING, blind, measured=["x"])
+    assert np.isnan(estimator.noise.samples[1])
     truth = [np.cos(run.t[-1]), -np.sin(run.t[-1])]
-    assert tracker.end_of(blind).mean == pytest.approx(truth, abs=0.05)
+    assert estimator.filter(blind).mean == pytest.approx(truth, abs=0.05)
 
 
 def test_frequencies_and_amplitudes_come_with_intervals() -> None:
@@ -248,7 +249,7 @@ def test_what_cannot_be_forecast_is_refused(call, message) -> None:
 def test_a_model_that_runs_away_forecasts_without_breaking() -> None:
     wild = replace(LORENZ.model, coef=1e6 * LORENZ.model.coef)
     run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 300)
-    end = track(wild, run).end_of(run)
+    end = tune_estimator(wild, run).filter(run)
     assert np.isfinite(end.mean).all()
     assert np.isfinite(end.covariance).all()
     ahead = ep.forecast(wild, run, 0.05, n_draws=10)
@@ -259,11 +260,12 @@ def test_rounded_samples_are_compared_as_they_are() -> None:
     run = spring(0.0)
     step = 0.2 * run.states.std()
     rounded = Trajectory(run.t, step * np.round(run.states / step), run.state_names)
-    tracker = track(SPRING, rounded)
-    (record,) = tracker.problem.records
+    estimator = tune_estimator(SPRING, rounded)
+    (record,) = estimator.problem.records
     assert record.limits is not None
-    path = record.samples + 0.1
-    assert tracker.linear(record, path)[2] == pytest.approx(-0.1)
+    fit = estimator.fit_path(record, record.samples)
+    residuals = linearise(fit).residuals
+    np.testing.assert_allclose(residuals, record.samples - fit.path, rtol=1e-12)
     skill = ep.forecast_skill(SPRING, rounded, n_fitted=900, starts=10)
     assert np.mean(skill.nrmse["model"]) < 0.1
 

@@ -11,7 +11,7 @@ from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.forecasting.rolling import spread_starts
-from ep2sindy.forecasting.tracking import track
+from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.refinement.windows import cut_windows, dominant_window
 
 LV = ep.lotka_volterra().model
@@ -90,7 +90,7 @@ def test_a_derivative_takes_no_samples_from_beyond_a_gap() -> None:
 
 
 def test_the_noise_that_a_tracker_finds_does_not_know_of_a_gap() -> None:
-    whole, gappy = (track(LV, run).noise for run in (WHOLE, GAPPY))
+    whole, gappy = (tune_estimator(LV, run).noise for run in (WHOLE, GAPPY))
     assert gappy.samples == pytest.approx(whole.samples, rel=0.15)
     # A step across the gap would need pushes as large as the states.
     assert (gappy.process < 0.02 * WHOLE.states.std(axis=0)).all()

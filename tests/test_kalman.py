@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 from scipy.linalg import cho_factor, cho_solve, null_space
 
-from ep2sindy.signals import wiener
-from ep2sindy.signals.kalman import KalmanSmoother, most_likely_ratios
+from ep2sindy.signals import kalman
+from ep2sindy.signals.kalman import KalmanSmoother, WienerProcess, most_likely_ratios
 from ep2sindy.signals.smoothers import Smoother
-from ep2sindy.signals.wiener import WienerProcess
 from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 
 SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
@@ -92,7 +91,7 @@ def test_both_factorisations_give_one_likelihood(
     process, values = WienerProcess.at(steps), np.cumsum(rng.normal(size=(3000, 2)), axis=0)
     ratios = 10.0 ** np.arange(-10.0, 5.0, 2.0)
     plain = [process.likelihood(values, ratio) for ratio in ratios]
-    monkeypatch.setattr(wiener, "WELL_CONDITIONED", np.inf)
+    monkeypatch.setattr(kalman, "WELL_CONDITIONED", np.inf)
     joint = [process.likelihood(values, ratio) for ratio in ratios]
     np.testing.assert_allclose(plain, joint, rtol=1e-6, atol=0.01)  # as WELL_CONDITIONED says
 
@@ -248,7 +247,7 @@ def test_samples_that_nearly_coincide_are_two_samples_of_one_time(log10_ratio: f
     [
         (-14.1, UNEQUAL, r"must lie in \[-14, 4\]: -14.1 came"),
         (np.nan, UNEQUAL, r"must lie in \[-14, 4\]: nan came"),
-        (None, UNEQUAL[:4], "at least 5 samples: 4 came; join more data"),
+        (None, UNEQUAL[:4], "at least 5 samples, one row of values per time: 4 rows came"),
         (0.0, np.maximum(UNEQUAL - 0.7, 0.0), r"t must increase: t\[1\] = 0 s follows 0 s"),
     ],
 )

@@ -4,8 +4,7 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.data.prepare import gradient
-from ep2sindy.discovery.point_search import PointSearch
-from ep2sindy.discovery.pointwise import STATUSES, blocks_of
+from ep2sindy.discovery.pointwise import STATUSES, PointSearch, blocks_of
 from ep2sindy.runtime import parallel
 from ep2sindy.runtime.parallel import Loky, Serial
 from ep2sindy.signals.smoothers import NoSmoothing

@@ -7,7 +7,7 @@ from sklearn.metrics import adjusted_rand_score
 
 import ep2sindy as ep
 from benchmarks.regions import REGIONS, STATES, RegionField, three_regions
-from ep2sindy.discovery.point_search import PointSearch
+from ep2sindy.discovery.pointwise import PointSearch
 from ep2sindy.discovery.regimes import Regimes, find_regimes, group_points
 from ep2sindy.runtime.parallel import Serial
 from tests.models import point_study

@@ -19,8 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy._stubs import place_of
 from ep2sindy.app.targets import nodes_of, target_of
-from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.discovery.recipe import method_of
+from ep2sindy.discovery.method import AnyMethod, method_of
 from ep2sindy.runtime.screen import joined, near_words
 from ep2sindy.studies.source import Source, Step
 from ep2sindy.studies.study import Check, Deferred

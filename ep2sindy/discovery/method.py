@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool
@@ -401,3 +401,47 @@ def _limits(runs: Sequence[Trajectory]) -> tuple[str, ...]:
     words = dict.fromkeys(each for bounds in found if bounds for each in bounds.words)
     way_out = "rows take them for values; TrajectorySearch() reads them as limits"
     return tuple(f"{each}: {way_out}" for each in words)
+
+
+def method_of(
+    formulation: Formulation,
+    search: TrajectorySearch | Search,
+    bootstraps: Bootstraps,
+    selection: SystemSelection | Selection,
+    depth: int,
+) -> AnyMethod:
+    """The method for settings that are chosen one by one, such as the groups of a config.
+
+    A `TrajectorySearch` takes the rule and the depth, unless its own are set, and ignores the
+    formulation: it makes no rows, but experiments may make some beside it.
+    Raises ValueError for bootstraps that do not go with the search, or a rule or depth that differs
+    from the search's own.
+    """
+    if not isinstance(search, TrajectorySearch):
+        return Regression(formulation, search, selection, bootstraps, depth)
+    if bootstraps.n:
+        raise ValueError(
+            f"a search of trajectories draws no bootstraps: {bootstraps!r} came; take "
+            "Bootstraps(n=0) (bootstraps=none), or a regression"
+        )
+    plain = TrajectorySearch()
+    return replace(
+        search,
+        selection=_once("selection", search.selection, selection, plain.selection),
+        depth=_once("depth", search.depth, depth, plain.depth),
+    )
+
+
+def _once(name: str, own: Any, given: Any, default: Any) -> Any:
+    """A setting of the search, or what was given beside it: a config always has a value there.
+
+    Raises ValueError for a setting that the search has already, with another value.
+    """
+    if given == default:
+        return own
+    if own not in (default, given):
+        raise ValueError(
+            f"{name} must be set once: {own!r} came in the search (search.{name}), and "
+            f"{given!r} beside it; leave one of them out"
+        )
+    return given

@@ -22,6 +22,7 @@ from ep2sindy.discovery.signal_unknowns import (
     FITTED,
     HiddenStates,
     alone,
+    embed_hidden,
     fit_functions,
     names_of,
     search_hidden,
@@ -30,7 +31,7 @@ from ep2sindy.estimation.explanation import FIRST_MAX_TERMS
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.rolling import RollingStarts, spread_starts
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill, horizon_errors
-from ep2sindy.forecasting.tracking import Tracker, track
+from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import relations_of
 from ep2sindy.model.comparison import REPEATS, FreeRunBounds
@@ -46,13 +47,12 @@ from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.embedding import (
+    EMBEDDINGS,
     HARMONICS,
     AnyEmbedding,
     Chosen,
-    Delays,
     Embedded,
     Embedding,
-    LogRate,
     Rate,
     embed,
     unexplained,
@@ -66,6 +66,7 @@ CLEARLY, N_TRIED, N_DRAWS_TRIED = 0.8, 20, 20
 # Candidates per equation if no equation is known, so that there are few combinations.
 DEPTH_OF_BOTH = 2
 
+EXPLAINED = "their equations explain the signal to its noise"
 NOT_EXPLAINED = (
     "no equations of the signal and states that nobody measured explain it to its noise and live: "
     "states are made by smoothing"
@@ -79,14 +80,14 @@ MIN_JUDGED = 1.5  # periods that a held-out part must have
 class Attempt:
     """A model in a number of states.
 
-    tracker: of its states along the fitted part. error: of its forecasts up to a period there, in
+    estimator: of its states along the fitted part. error: of its forecasts up to a period there, in
     standard deviations. share: of the next state's variance that neighbours in these states do not
     explain; None for hidden states, of which there is no next one.
     """
 
     chosen: Chosen
     found: Discovery
-    tracker: Tracker
+    estimator: StateEstimator
     error: float
     share: float | None
 
@@ -115,12 +116,12 @@ def choose_attempt(attempts: Sequence[Attempt]) -> Attempt:
     return best
 
 
-def error_where_fitted(past: Trace, chosen: Chosen, tracker: Tracker) -> float:
+def error_where_fitted(past: Trace, chosen: Chosen, estimator: StateEstimator) -> float:
     """Error of forecasts up to a period from starts in the last half of the fitted part."""
     record, longest = with_all_states(past, chosen), max(2, round(past.per_period))
     n = record.n_samples
     first = spread_starts(record.t, n // 2, longest, N_TRIED)
-    rolling = RollingStarts(tracker, record, [past.name], first, longest)
+    rolling = RollingStarts(estimator, record, [past.name], first, longest)
     ahead = rolling.forecasts(partial(states_before, past, chosen.embedding), N_DRAWS_TRIED, seed=0)
     scale = past.x[n // 2 :].std()
     return float(horizon_errors(rolling.measured(ahead), rolling.truth, scale).mean())
@@ -141,7 +142,7 @@ def with_all_states(signal: Trace, chosen: Chosen) -> Trajectory:
 
 def states_before(signal: Trace, embedding: Embedding, past: Trajectory) -> Trajectory:
     """The states at a time, made from samples before it alone."""
-    if isinstance(embedding, HiddenStates):  # the tracker fits them itself
+    if isinstance(embedding, HiddenStates):  # the estimator fits them itself
         return alone(signal.with_samples(past.t, past.states[:, 0]))
     return embedding.embed(signal.with_samples(past.t, past.states[:, 0])).run
 
@@ -164,15 +165,15 @@ class SignalSearch:
     function_degree: int = 1
 
     def __post_init__(self) -> None:
-        known = ("hidden", *embeddings(self.harmonics, 2))
+        known = ("hidden", *EMBEDDINGS)
         if self.embedding not in ("auto", *known):
             raise ValueError(
                 f"embedding must be auto, {' or '.join(known)}: {self.embedding!r} came"
             )
-        if self.n_states != "auto":
-            if isinstance(self.n_states, str):
-                raise ValueError(f"n_states must be auto or a number: {self.n_states!r} came")
-            embeddings(self.harmonics, self.n_states)
+        if isinstance(self.n_states, str) and self.n_states != "auto":
+            raise ValueError(f"n_states must be auto or a number: {self.n_states!r} came")
+        n_states = 2 if isinstance(self.n_states, str) else self.n_states
+        Rate(self.harmonics, n_states)  # refuses settings that no embedding has
 
     def attempts(
         self,
@@ -192,12 +193,14 @@ class SignalSearch:
         numbers = self._numbers(whole)
         if self.embedding in ("auto", "hidden"):
             libraries = self._libraries(past, numbers)
-            search = search_hidden(past, libraries, self.by_trajectories, progress, once)
-            if search.explains or self.embedding == "hidden":
-                return [self._attempt(past, search.chosen(past), search.found, progress)]
+            found, explains = search_hidden(past, libraries, self.by_trajectories, progress, once)
+            if explains or self.embedding == "hidden":
+                chosen = embed_hidden(past, found, EXPLAINED if explains else "set")
+                return [self._attempt(past, chosen, found, progress)]
             if say is not None:
                 say(NOT_EXPLAINED)
-        return [self._smoothed(past, n, seed, progress, once) for n in numbers]
+        pairs = [once(partial(self._smoothed, past, n, seed, progress)) for n in numbers]
+        return [self._attempt(past, *pair, progress) for pair in pairs]
 
     def _numbers(self, signal: Trace) -> list[int]:
         """Numbers of states to try; a signal of two states either repeats itself or spirals."""
@@ -227,12 +230,6 @@ class SignalSearch:
         return TrajectorySearch()
 
     def _smoothed(
-        self, past: Trace, n_states: int, seed: int, progress: Progress, once: Once
-    ) -> Attempt:
-        chosen, found = once(partial(self._searched, past, n_states, seed, progress))
-        return self._attempt(past, chosen, found, progress)
-
-    def _searched(
         self, past: Trace, n_states: int, seed: int, progress: Progress
     ) -> tuple[Chosen, Discovery]:
         with progress.stage(None, "", f"{n_states} states of the signal"):
@@ -244,21 +241,16 @@ class SignalSearch:
     ) -> Attempt:
         with progress.stage(None, "", "forecasts where it was fitted"):
             record = with_all_states(past, chosen)
-            tracker = track(found.model, record, measured=[past.name])
-            error = error_where_fitted(past, chosen, tracker)
+            estimator = tune_estimator(found.model, record, measured=[past.name])
+            error = error_where_fitted(past, chosen, estimator)
             own = chosen.embedding
             share = unexplained(past, own) if isinstance(own, AnyEmbedding) else None
-        return Attempt(chosen, found, tracker, error, share)
+        return Attempt(chosen, found, estimator, error, share)
 
     def _embedded(self, signal: Trace, n_states: int) -> Chosen:
-        known = embeddings(self.harmonics, n_states)
-        if self.embedding in known:
-            return embed(signal, known[self.embedding])
-        chosen = embed(signal, n_states=n_states)
-        (fitting,) = (e for e in known.values() if type(e) is type(chosen.embedding))
-        return chosen if fitting == chosen.embedding else replace(
-            embed(signal, fitting), reason=chosen.reason
-        )  # fmt: skip
+        kind = EMBEDDINGS.get(self.embedding)
+        own = kind(harmonics=self.harmonics, n_states=n_states) if kind else None
+        return embed(signal, own, n_states=n_states, harmonics=self.harmonics)
 
     def library(
         self, names: Sequence[str], functions: Sequence[str], degree: int | None = None
@@ -301,14 +293,6 @@ class SignalSearch:
         return (
             replace(found, model=replace(found.model, covariance=None)) if found.misfit else found
         )
-
-
-def embeddings(harmonics: float, n_states: int) -> dict[str, AnyEmbedding]:
-    return {
-        "log_rate": LogRate(harmonics, n_states),
-        "rate": Rate(harmonics, n_states),
-        "delays": Delays(harmonics=harmonics, n_states=n_states),
-    }
 
 
 def repeats(signal: Trace) -> bool:
@@ -456,13 +440,13 @@ def evaluate(
     own = [signal.name]
     is_whole, before = n_fitted == len(signal.t), partial(states_before, signal, chosen.embedding)
     if is_whole:
-        first, tracker = int(np.searchsorted(signal.t, chosen.embedded.run.t[0])), best.tracker
+        first, estimator = int(np.searchsorted(signal.t, chosen.embedded.run.t[0])), best.estimator
         start = chosen.embedded.run.states[0]
     else:
         first, past = n_fitted - 1, with_all_states(signal.window(0, n_fitted), chosen)
         with progress.stage(None, "", "width of the forecasts' bands"):
-            tracker = calibrate(best.tracker, past, states_of=before)
-        start = tracker.end_of(before(past)).mean
+            estimator = calibrate(best.estimator, past, states_of=before)
+        start = estimator.filter(before(past)).mean
     measured = whole.window(first, whole.n_samples)
     with progress.stage(None, "", "free run and limit cycle"):
         cycle = FreeCycle.of(free_run(model, measured, initial=start, judged=own))
@@ -470,7 +454,7 @@ def evaluate(
         return SignalDiscovery(signal, best, attempts, whole, measured, cycle, None)
     with progress.stage(None, "start", "forecasts") as advance:
         skill = forecast_skill(
-            model, whole, n_fitted=n_fitted, measured=own, states_of=before, tracker=tracker,
+            model, whole, n_fitted=n_fitted, measured=own, states_of=before, estimator=estimator,
             advance=advance,
         )  # fmt: skip
     return SignalDiscovery(signal, best, attempts, whole, measured, cycle, skill)

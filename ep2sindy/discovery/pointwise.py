@@ -7,28 +7,92 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.point_search import (
-    LAYOUT,
-    PointSearch,
-    nothing,
-    search_point,
-)
+from ep2sindy.discovery.method import Regression, SearchedEquation
+from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Constraint, Relation, constraint, relations_of
 from ep2sindy.library.units import unit_product
+from ep2sindy.model.scores import r2
+from ep2sindy.regression.constrained import constrained_draws
 from ep2sindy.runtime.parallel import Workers, run_alike
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
+from ep2sindy.runtime.values import check_kind, check_list
 
 NO_FIT = "no_fit"
 
 STATUSES = ("fitted", "no_plasma", "missing_samples", "too_little_variation", NO_FIT)
+
+# Dimensions of every result, followed by those of space.
+LAYOUT: Mapping[str, tuple[str, ...]] = {
+    "coef": ("equation", "term"),
+    "inclusion": ("equation", "term"),
+    "weight": ("equation", "term"),
+    "coef_draws": ("draw", "equation", "term"),
+    "weight_draws": ("draw", "equation", "term"),
+    "r2_train": ("equation",),
+    "r2_test": ("equation",),
+    "n_terms": ("equation",),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PointSearch:
+    """Settings of the search at every point, whose spread is taken over the bootstraps.
+
+    relations: between coefficients, such as "n_i: S == -1 * n_n: S" for ionization S, which makes
+    of a neutral an ion; the same at every point.
+    least_variation: standard deviation of every state, as a share of its root mean square, below
+    which a point counts as having no dynamics. seed: every point has the same split and the same
+    draws, so that results differ by place alone.
+    """
+
+    states: Sequence[str]
+    library: Library
+    method: Regression
+    least_variation: float = 1e-3
+    seed: int = 0
+    relations: Sequence[Relation | str] = ()
+
+    def __post_init__(self) -> None:
+        check_list("states", self.states)
+        check_kind("library", self.library, Library, "ep.polynomial(['x', 'y'], degree=2)")
+        object.__setattr__(self, "states", tuple(self.states))
+        if not 0.0 <= self.least_variation < 1.0:
+            raise ValueError(
+                f"least_variation must lie in [0, 1): {self.least_variation} came; it is a share"
+            )
+        check_kind("method", self.method, Regression, "ep.Regression(bootstraps=ep.Bootstraps())")
+        if not (n := self.method.bootstraps.n):
+            raise ValueError(f"a pointwise study needs bootstraps for its spread: n={n} came")
+        object.__setattr__(self, "relations", relations_of(self.relations))
+        every_term = dict.fromkeys(self.states, self.library.names)
+        constraint(self.library, every_term, self.relations)  # refuses those that cannot hold
+        if self.relations and (n_culled := self.method.bootstraps.n_culled):
+            raise ValueError(
+                "relations need all their terms in every bootstrap: n_culled must be 0, "
+                f"{n_culled} came"
+            )
+
+    @cached_property
+    def variables(self) -> tuple[str, ...]:
+        """States, then the other variables that the library needs."""
+        others = (v for v in self.library.variables if v not in self.states)
+        return (*self.states, *others)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Lengths of the dimensions in `LAYOUT`."""
+        n_draws, n_terms = self.method.bootstraps.n, len(self.library)
+        return {"draw": n_draws, "equation": len(self.states), "term": n_terms}
 
 
 def pointwise(
@@ -59,26 +123,14 @@ def pointwise(
     blocks = blocks_of(part, block_points)
     result = _empty(part, search)
     n_points = sum(block.n_points for block in blocks)
+    pieces = (part.isel(block.slices) for block in blocks)  # once read, none is held
     with as_progress(progress).stage(n_points, "point") as advance:
-        for block, done in _search_blocks(part, search, blocks, workers):
-            _place(result, block, done)
-            advance(block.n_points)
+        for k, done in run_alike(workers, partial(_search_block, search), pieces, len(blocks)):
+            _place(result, blocks[k], done)
+            advance(blocks[k].n_points)
     if not (result["status"] == 0).any():
         raise ValueError(f"no point could be fitted: {_why_none(result)}")
     return result
-
-
-def _search_blocks(
-    part: xr.Dataset,
-    search: PointSearch,
-    blocks: Sequence[Block],
-    workers: Workers,
-) -> Iterator[tuple[Block, Mapping[str, np.ndarray]]]:
-    """Every block with its results, as they come."""
-    function = partial(_search_block, search)
-    pieces = (part.isel(block.slices) for block in blocks)  # once read, none is held
-    for number, done in run_alike(workers, function, pieces, len(blocks)):
-        yield blocks[number], done
 
 
 def _why_none(result: xr.Dataset) -> str:
@@ -113,13 +165,8 @@ def _empty(field: xr.Dataset, search: PointSearch) -> xr.Dataset:
         [unit_product([(units[state], 1), ("s", -1), (unit, -1)]) for unit in term_units]
         for state in search.states
     ]
-    sizes = {
-        "draw": search.method.bootstraps.n,
-        "equation": len(search.states),
-        "term": len(search.library),
-    }
     values = {
-        name: ((*dims, *axes), np.full((*(sizes[d] for d in dims), *shape), np.nan))
+        name: ((*dims, *axes), np.full((*(search.sizes[d] for d in dims), *shape), np.nan))
         for name, dims in LAYOUT.items()
     }
     flags = {"flag_values": list(range(len(STATUSES))), "flag_meanings": " ".join(STATUSES)}
@@ -233,3 +280,65 @@ def blocks_of(field: xr.Dataset, n_points: int) -> list[Block]:
         parts = [slice(k, min(k + steps[axis], n)) for k in range(0, n, steps[axis])]
         blocks = [Block({**block.slices, axis: part}) for block in blocks for part in parts]
     return blocks
+
+
+# The search at one point.
+
+
+def nothing(search: PointSearch) -> dict[str, np.ndarray]:
+    """The result at a point that cannot be fitted."""
+    sizes = search.sizes
+    return {name: np.full([sizes[d] for d in dims], np.nan) for name, dims in LAYOUT.items()}
+
+
+def search_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
+    """Search, select and fit at one point, and the spread over the bootstraps."""
+    rng = np.random.default_rng(search.seed)
+    task = Task([run], search.library, relations_of(search.relations))
+    equations = search.method.search_equations(task, rng=rng)
+    fronts = [equation.front for equation in equations]
+    choice = search.method.choose(fronts, task)
+    point = nothing(search)
+    for row, (equation, chosen) in enumerate(zip(equations, choice.chosen, strict=True)):
+        problem = equation.front.rows
+        mask: Bool[np.ndarray, " terms"] = np.isin(search.library.names, chosen.terms)
+        point["coef"][row] = choice.model.coef[:, row]
+        point["inclusion"][row] = equation.supports.inclusion[chosen.n_terms]
+        point["weight"][row] = shares(point["coef"][row] * problem.theta_scale)
+        fits = equation.draws.fits(equation.number, equation.found, mask)
+        point["coef_draws"][:, row] = problem.coef_SI(fits, equation.number)
+        point["weight_draws"][:, row] = shares(fits)
+        point["r2_train"][row], point["r2_test"][row] = chosen.r2_train, chosen.r2_test
+        point["n_terms"][row] = chosen.n_terms
+    return point if choice.constraint is None else _constrained(point, equations, choice.constraint)
+
+
+def _constrained(
+    point: Mapping[str, np.ndarray], equations: Sequence[SearchedEquation], held: Constraint
+) -> dict[str, np.ndarray]:
+    """A point's results with draws and R2 of coefficients that obey the constraint."""
+    problems = list(dict.fromkeys(equation.front.rows for equation in equations))
+    draws = {equation.front.equation: equation.draws for equation in equations}
+    found = constrained_draws(problems, draws, held)
+    drawn, weights = np.zeros((2, *point["coef_draws"].shape))
+    scores = np.full((2, len(equations)), np.nan)
+    for row, equation in enumerate(equations):
+        problem, target = equation.front.rows, equation.front.rows.target[:, equation.number]
+        for k, (state, term) in enumerate(held.coefficients):
+            if state == equation.front.equation:
+                drawn[:, row, problem.library.index(term)] = found[:, k]
+        weights[:, row] = shares(drawn[:, row] * problem.theta_scale)
+        for held_out in sorted({False, bool(problem.test.any())}):
+            at = problem.test == held_out
+            fitted = problem.theta[at] @ point["coef"][row]
+            scores[int(held_out), row] = r2(truth=target[at], prediction=fitted[None])[0]
+    return {
+        **point, "coef_draws": drawn, "weight_draws": weights,
+        "r2_train": scores[0], "r2_test": scores[1],
+    }  # fmt: skip
+
+
+def shares(contributions: Float[np.ndarray, "*draws terms"]) -> Float[np.ndarray, "*draws terms"]:
+    """Each term's part in the sum of absolute values, with its sign; zeros if all are zero."""
+    total = np.abs(contributions).sum(axis=-1, keepdims=True)
+    return contributions / np.where(total > 0.0, total, 1.0)

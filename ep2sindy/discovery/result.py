@@ -20,12 +20,11 @@ from ep2sindy.discovery.method import DiscoveryMethod
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.forecasting.bands import Forecast
 from ep2sindy.forecasting.forecast import forecast
-from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.relations import Constraint, Process
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
-from ep2sindy.model.storage import read_stored
+from ep2sindy.model.storage import read_as, read_stored
 from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
 from ep2sindy.runtime.files import read_json, write_text
@@ -158,7 +157,7 @@ class Discovery:
         No code from the text runs, and functions of your own must be registered before.
         Raises ValueError for anything else.
         """
-        try:
+        with read_as(f"a discovery must be {FORMAT} JSON"):
             content = read_json(text)
             if content["format"] != FORMAT:
                 raise ValueError(f"format {content['format']!r}")
@@ -166,12 +165,6 @@ class Discovery:
             found = Discovery(model=model, **{name: _restored(content[name]) for name in _PARTS})
             _check_parts(found)
             return found
-        except UnknownFunctionError:
-            raise  # the text is sound: a function must be registered before it is read
-        except KeyError as error:
-            raise ValueError(f"a discovery must be {FORMAT} JSON: {error} is missing") from error
-        except (TypeError, ValueError, AttributeError, AssertionError, RecursionError) as error:
-            raise ValueError(f"a discovery must be {FORMAT} JSON: {error}") from error
 
     def save(self, path: str | Path) -> None:
         """Write the discovery as JSON, completely or not at all; see `to_json`."""
@@ -270,15 +263,18 @@ def _check_parts(found: Discovery) -> None:
     """Raise ValueError for parts of other kinds, or not of the model's states and terms."""
     if not isinstance(found.method, DiscoveryMethod):
         raise ValueError(f"a method that finds nothing: {found.method!r:.80}")
-    kinds = (found.noise_test, NoiseTest), (found.constraint, Constraint | None)
-    if not all(isinstance(value, kind) for value, kind in kinds):
-        raise ValueError("noise_test or constraint of another kind")
-    if not all(isinstance(each, Ambiguity) for each in found.ambiguities):
-        raise ValueError("ambiguities of another kind")
-    if not all(isinstance(each, OtherSystem) for each in found.others):
-        raise ValueError("others of another kind")
-    if not all(isinstance(text, str) for text in (found.note, *found.remarks)):
-        raise ValueError("a note and remarks that are no texts")
+    parts: dict[str, tuple[Sequence[Any], Any]] = {
+        "noise_test": ([found.noise_test], NoiseTest),
+        "constraint": ([found.constraint], Constraint | None),
+        "ambiguities": (found.ambiguities, Ambiguity),
+        "others": (found.others, OtherSystem),
+        "note and remarks": ((found.note, *found.remarks), str),
+        "fronts": (list(found.fronts.values()), ParetoFront),
+        "chosen": (list(found.chosen.values()), Candidate),
+    }
+    for name, (values, kind) in parts.items():
+        if not all(isinstance(value, kind) for value in values):
+            raise ValueError(f"{name} of another kind")
     if {*found.fronts, *found.chosen} != set(found.model.states):
         raise ValueError(f"fronts and candidates of other states than {found.model.states}")
     for state, front in found.fronts.items():

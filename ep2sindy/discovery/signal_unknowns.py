@@ -5,6 +5,7 @@ These are further states, the offset that the signal has lost, and numbers insid
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +18,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import TrajectorySearch
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.estimate import Estimate
-from ep2sindy.forecasting.tracking import Tracker, track
+from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import number_text
 from ep2sindy.model.comparison import SPIRALS, Verdict
@@ -43,44 +44,32 @@ class HiddenStates:
     noise_std: of the signal's samples, in SI.
     """
 
-    tracker: Tracker
+    estimator: StateEstimator
     noise_std: float
 
     @property
     def n_states(self) -> int:
-        return len(self.tracker.model.states)
+        return len(self.estimator.model.states)
 
     @property
     def says(self) -> str:
         return f"the signal and {self.n_states - 1} that nobody measured"
 
     def names(self, signal: str) -> tuple[str, ...]:
-        return tuple(self.tracker.model.states)
+        return tuple(self.estimator.model.states)
 
     def embed(self, signal: Trace) -> Embedded:
-        model = self.tracker.model
+        model = self.estimator.model
         known = {signal.name: tuple(model.terms(signal.name))}  # its term sets a scale
-        return Embedded(self.tracker.along(alone(signal)), (), known, self.noise_std)
+        return Embedded(self.estimator.smooth(alone(signal)), (), known, self.noise_std)
 
 
-@dataclass(frozen=True, eq=False)
-class HiddenSearch:
-    """A model with hidden states.
-
-    explains: whether it explains the signal to its noise, and run freely stays with it where it was
-    fitted.
-    """
-
-    found: Discovery
-    estimate: Estimate
-    explains: bool
-
-    def chosen(self, signal: Trace) -> Chosen:
-        """The states along a signal."""
-        tracker = track(self.found.model, alone(signal))
-        own = HiddenStates(tracker, float(self.estimate.noise_std[0]))
-        reason = "their equations explain the signal to its noise" if self.explains else "set"
-        return Chosen(own, reason, own.embed(signal))
+def embed_hidden(signal: Trace, found: Discovery, reason: str) -> Chosen:
+    """The states that a model with hidden ones has along a signal."""
+    assert found.estimate is not None  # a search of trajectories has one
+    estimator = tune_estimator(found.model, alone(signal))
+    own = HiddenStates(estimator, float(found.estimate.noise_std[0]))
+    return Chosen(own, reason, own.embed(signal))
 
 
 def search_hidden(
@@ -89,21 +78,20 @@ def search_hidden(
     method: TrajectorySearch,
     progress: Progress,
     once: Once = at_once,
-) -> HiddenSearch:
-    """The model of the first library that explains a signal, or of the last.
+) -> tuple[Discovery, bool]:
+    """The model of the first library that explains a signal, or of the last, and if it explains it.
 
-    once: does each search, or takes it from a run that was broken off.
+    It explains the signal if it does so to its noise, and run freely stays with it where it was
+    fitted. once: does each search, or takes it from a run that was broken off.
     """
-    run = alone(past.window(max(0, len(past.t) - MAX_FITTED), len(past.t)))
+    run, explains = _last_of(past), False
     for library in libraries:
         hidden = [name for name in library.variables if name != past.name]
         found = once(partial(discover, run, library, method, hidden=hidden, progress=progress))
-        estimate = found.estimate
-        assert estimate is not None  # a search of trajectories has one
-        search = HiddenSearch(found, estimate, not found.misfit and _endures(estimate, past.name))
-        if search.explains:
+        assert found.estimate is not None  # a search of trajectories has one
+        if explains := not found.misfit and _endures(found.estimate, past.name):
             break
-    return search
+    return found, explains
 
 
 @dataclass(frozen=True)
@@ -132,7 +120,7 @@ def fit_offset(
     Raises ValueError if none of its models explains the signal to its noise, or if the signal and
     its offset are not positive.
     """
-    run = alone(past.window(max(0, len(past.t) - MAX_FITTED), len(past.t)))
+    run = _last_of(past)
     mean, spread = run.states.mean(), run.states.std()
     x, g = library.variables
     for share in SHIFTS:
@@ -191,6 +179,11 @@ def alone(signal: Trace) -> Trajectory:
     )
 
 
+def _last_of(past: Trace) -> Trajectory:
+    """The samples that the search sees, as a record of one state."""
+    return alone(past.window(max(0, len(past.t) - MAX_FITTED), len(past.t)))
+
+
 # Numbers inside functions, written as `?`.
 
 FITTED = "?"  # stands for a number to be fitted
@@ -238,7 +231,7 @@ def fit_functions(
 
 def _unit(text: str, run: Trajectory) -> float:
     """Standard deviation of the variable that a function with one unknown number is of."""
-    named = [name for name in run.names if name in _words(text)]
+    named = [name for name in run.names if name in re.findall(r"[\w@]+", text)]
     if text.count(FITTED) != 1 or len(named) != 1:
         raise ValueError(
             f"a function with a number to be fitted must have one {FITTED} and one variable of "
@@ -246,11 +239,6 @@ def _unit(text: str, run: Trajectory) -> float:
             f"'1/({FITTED}+{run.names[0]})': {text!r} came"
         )
     return float(run.columns(named).std())
-
-
-def _words(text: str) -> list[str]:
-    kept = "".join(c if c.isalnum() or c in "_@" else " " for c in text)
-    return kept.split()
 
 
 def _filled(text: str, size: float, unit: float) -> str:

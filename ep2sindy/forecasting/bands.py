@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ep2sindy.data.numbers import band_of, quantiles
-from ep2sindy.forecasting.tracking import FittedState, Tracker
+from ep2sindy.forecasting.state_estimation import FittedState, StateEstimator
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
 from ep2sindy.model.inputs import driven
@@ -81,7 +81,7 @@ class Forecast:
 
 
 def forecasts(
-    tracker: Tracker,
+    estimator: StateEstimator,
     ends: Sequence[FittedState],
     begins: Float[np.ndarray, " starts"],
     times: Float[np.ndarray, "starts samples"],
@@ -95,7 +95,7 @@ def forecasts(
 
     begins: times of the fitted states, in s.
     """
-    model, rng = tracker.model, np.random.default_rng(seed)
+    model, rng = estimator.model, np.random.default_rng(seed)
     starts = np.concatenate([draw_normal(end.mean, end.covariance, n_draws, rng) for end in ends])
     coef = draw_coef(model, model.covariance, len(starts), rng)
     grid = np.append(begins[0], times[0])
@@ -106,9 +106,9 @@ def forecasts(
         starts,
         coef,
         drive=drive,
-        push_std=tracker.noise.process,
-        push_step_s=tracker.problem.step_s,
-        reach=tracker.problem.scale,
+        push_std=estimator.noise.process,
+        push_step_s=estimator.problem.step_s,
+        reach=estimator.problem.scale,
         rng=rng,
     )[:, 1:].reshape(len(ends), n_draws, times.shape[1], -1)
     return [
@@ -116,7 +116,7 @@ def forecasts(
             t=own,
             states=quantiles(draws, [0.5])[0],
             draws=draws,
-            noise_std=tracker.noise.samples,
+            noise_std=estimator.noise.samples,
             state_names=tuple(model.states),
             units=model.units,
             clock=clock,

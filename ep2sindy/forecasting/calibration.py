@@ -11,8 +11,8 @@ import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.bands import LEVEL
-from ep2sindy.forecasting.rolling import RollingStarts, StatesOf
-from ep2sindy.forecasting.tracking import Tracker
+from ep2sindy.forecasting.rolling import RollingStarts, StatesOf, spread_evenly
+from ep2sindy.forecasting.state_estimation import StateEstimator
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.signals.spectrum import is_uniform
 
@@ -23,21 +23,21 @@ FACTORS = 10.0 ** np.arange(-2.0, 2.1, 0.25)  # of the likeliest pushes
 
 @one_thread()
 def calibrate(
-    tracker: Tracker, run: Trajectory, *, states_of: StatesOf | None = None, seed: int = 0
-) -> Tracker:
-    """The tracker with pushes whose bands hold 90 % of the record that the model was fitted to.
+    estimator: StateEstimator, run: Trajectory, *, states_of: StatesOf | None = None, seed: int = 0
+) -> StateEstimator:
+    """The estimator with pushes whose bands hold 90 % of the record that the model was fitted to.
 
     run: that record. states_of: as for `forecast_skill`. Forecasts of up to one and a half periods
-    from its later half are counted. A tracker that is calibrated already, a driven model, and a
+    from its later half are counted. A estimator that is calibrated already, a driven model, and a
     record at unequal steps come back unchanged.
     """
-    ahead = max(2, int(PERIODS_AHEAD * tracker.per_period))
-    first = np.arange(max(tracker.memory, run.n_samples // 3), run.n_samples - ahead)
-    if tracker.model.inputs or not is_uniform(run.t) or len(first) < N_STARTS:
-        return tracker
-    first = first[np.linspace(0, len(first) - 1, N_STARTS).round().astype(np.int64)]
-    names = [n for n, own in zip(tracker.model.states, tracker.measured, strict=True) if own]
-    rolling = RollingStarts(tracker, run, names, first, ahead)
+    ahead = max(2, int(PERIODS_AHEAD * estimator.per_period))
+    first = np.arange(max(estimator.memory, run.n_samples // 3), run.n_samples - ahead)
+    if estimator.model.inputs or not is_uniform(run.t) or len(first) < N_STARTS:
+        return estimator
+    first = first[spread_evenly(len(first), N_STARTS)]
+    names = [n for n, own in zip(estimator.model.states, estimator.measured, strict=True) if own]
+    rolling = RollingStarts(estimator, run, names, first, ahead)
     ends = rolling.ends(states_of)
 
     def coverage(factor: float) -> float:
@@ -45,9 +45,9 @@ def calibrate(
         return pushed.coverage(pushed.from_ends(ends, N_DRAWS, seed), LEVEL)
 
     if abs(coverage(1.0) - LEVEL) <= TOLERANCE:
-        return tracker
+        return estimator
     below, above = 0, len(FACTORS) - 1
     while above - below > 1:  # more pushes, wider bands
         middle = (below + above) // 2
         below, above = (middle, above) if coverage(FACTORS[middle]) < LEVEL else (below, middle)
-    return rolling.with_pushes(float(FACTORS[above])).tracker
+    return rolling.with_pushes(float(FACTORS[above])).estimator

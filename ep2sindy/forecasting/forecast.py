@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.forecasting.bands import Forecast, forecasts
 from ep2sindy.forecasting.calibration import calibrate
-from ep2sindy.forecasting.tracking import track
+from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count
@@ -57,10 +57,10 @@ def forecast(
     past = trajectory_of(history)
     times = _times(past.t, past.dt_s, horizon)
     known = past if fitted_to is None else trajectory_of(fitted_to)
-    tracker = calibrate(track(model, known, measured=measured), known, seed=seed)
-    end = tracker.end_of(past)
+    estimator = calibrate(tune_estimator(model, known, measured=measured), known, seed=seed)
+    end = estimator.filter(past)
     return forecasts(
-        tracker, [end], past.t[-1:], times[None], inputs=inputs,
+        estimator, [end], past.t[-1:], times[None], inputs=inputs,
         n_draws=check_count("n_draws", n_draws), seed=seed, clock=past.clock,
     )[0]  # fmt: skip
 

@@ -13,7 +13,7 @@ from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.bands import Forecast, forecasts
 from ep2sindy.forecasting.baselines import Baseline
-from ep2sindy.forecasting.tracking import FittedState, Tracker
+from ep2sindy.forecasting.state_estimation import FittedState, StateEstimator
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.signals.spectrum import is_uniform
 
@@ -33,7 +33,12 @@ def spread_starts(
     piece = np.searchsorted(end, starts - 1, side="right")
     inside = starts + longest <= end[piece]
     starts = starts[inside] if inside.any() else starts
-    return starts[np.unique(np.linspace(0, len(starts) - 1, n).round().astype(np.int64))]
+    return starts[spread_evenly(len(starts), n)]
+
+
+def spread_evenly(n_all: int, n: int) -> Int[np.ndarray, " places"]:
+    """At most n places among n_all, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, n_all - 1, n).round().astype(np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +48,7 @@ class RollingStarts:
     names: the measured states.
     """
 
-    tracker: Tracker
+    estimator: StateEstimator
     record: Trajectory
     names: Sequence[str]
     first: Int[np.ndarray, " starts"]
@@ -64,8 +69,8 @@ class RollingStarts:
         """The state before every start, from its past alone."""
         found = []
         for k in self.first.tolist():
-            past = self.record.window(max(0, k - 2 * self.tracker.memory), k)
-            found.append(self.tracker.end_of(past if states_of is None else states_of(past)))
+            past = self.record.window(max(0, k - 2 * self.estimator.memory), k)
+            found.append(self.estimator.filter(past if states_of is None else states_of(past)))
             advance(1)
         return found
 
@@ -77,7 +82,7 @@ class RollingStarts:
     def from_ends(self, ends: Sequence[FittedState], n_draws: int, seed: int) -> list[Forecast]:
         """Forecasts from fitted states; at equal steps, all of them are drawn together."""
         t, begins = self.record.t, self.record.t[self.first - 1]
-        draw = partial(forecasts, self.tracker, n_draws=n_draws, clock=self.record.clock)
+        draw = partial(forecasts, self.estimator, n_draws=n_draws, clock=self.record.clock)
         if is_uniform(t):
             times = begins[:, None] + self.steps_s
             return draw(ends, begins, times, seed=seed)
@@ -107,9 +112,9 @@ class RollingStarts:
 
     def with_pushes(self, factor: float) -> RollingStarts:
         """The same with pushes larger by a factor."""
-        noise = replace(self.tracker.noise, process=factor * self.tracker.noise.process)
-        return replace(self, tracker=replace(self.tracker, noise=noise))
+        noise = replace(self.estimator.noise, process=factor * self.estimator.noise.process)
+        return replace(self, estimator=replace(self.estimator, noise=noise))
 
     @property
     def _columns(self) -> list[int]:
-        return [list(self.tracker.model.states).index(name) for name in self.names]
+        return [list(self.estimator.model.states).index(name) for name in self.names]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.runs import Run, trajectory_of
@@ -15,8 +15,8 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.bands import LEVEL, Forecast
 from ep2sindy.forecasting.baselines import Autoregression, Baseline, Harmonics, Persistence
 from ep2sindy.forecasting.calibration import calibrate
-from ep2sindy.forecasting.rolling import RollingStarts, StatesOf, spread_starts
-from ep2sindy.forecasting.tracking import Tracker, measured_states, track
+from ep2sindy.forecasting.rolling import RollingStarts, StatesOf, spread_evenly, spread_starts
+from ep2sindy.forecasting.state_estimation import StateEstimator, measured_states, tune_estimator
 from ep2sindy.library.units import Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Advance, nothing
@@ -66,18 +66,12 @@ class ForecastSkill:
 
         From zero if it begins at the first horizon; (0, 0) if there is none.
         """
-        is_better = (self.nrmse[MODEL] < self.nrmse[self.rival]).tolist()
-        best, begin = (0, 0), 0
-        for k, good in enumerate([*is_better, False]):
-            if good:
-                continue
-            if k - begin > best[1] - best[0]:
-                best = (begin, k)
-            begin = k + 1
-        if best[1] == best[0]:
+        is_better = self.nrmse[MODEL] < self.nrmse[self.rival]
+        edges = np.flatnonzero(np.diff(is_better, prepend=False, append=False)).reshape(-1, 2)
+        if not len(edges):
             return 0.0, 0.0
-        first = 0.0 if best[0] == 0 else float(self.horizons_s[best[0]])
-        return first, float(self.horizons_s[best[1] - 1])
+        begin, end = edges[np.argmax(edges[:, 1] - edges[:, 0])].tolist()
+        return float(self.horizons_s[begin]) if begin else 0.0, float(self.horizons_s[end - 1])
 
     @property
     def better_until_periods(self) -> float:
@@ -140,7 +134,7 @@ def forecast_skill(
     measured: Sequence[str] | None = None,
     states_of: StatesOf | None = None,
     n_draws: int = 100,
-    tracker: Tracker | None = None,
+    estimator: StateEstimator | None = None,
     seed: int = 0,
     advance: Advance = nothing,
 ) -> ForecastSkill:
@@ -150,46 +144,36 @@ def forecast_skill(
     and also serve the baselines. starts: number of starts, evenly spread over the rest. horizon_s:
     the longest horizon; None takes four periods, or what half of the rest allows. measured: as for
     `forecast`. states_of: makes the states of a past whose first columns are the measured ones
-    (`ep.signals.embed`). tracker: of the model on the fitted part, if it is known already.
-    n_draws: of every forecast.
+    (`ep.signals.embed`). estimator: calibrated on the fitted part. n_draws: of every forecast.
     Raises ValueError for a driven model, or a part that is too short.
     """
     record = trajectory_of(run)
     names = measured_states(model, record) if measured is None else list(measured)
     _check_skill(model, record, n_fitted)
     fitted = record.window(0, n_fitted)
-    if tracker is None:
-        tracker = calibrate(track(model, fitted, measured=names), fitted, states_of=states_of)
-    period_s = _period_s(fitted, names)
-    longest = _longest(record, n_fitted, period_s, horizon_s)
+    if estimator is None:
+        estimator = tune_estimator(model, fitted, measured=names)
+        estimator = calibrate(estimator, fitted, states_of=states_of)
+    longest = _longest(record, n_fitted, period_s := _period_s(fitted, names), horizon_s)
     first = spread_starts(record.t, n_fitted, longest, check_count("starts", starts))
-    rolling = RollingStarts(tracker, record, names, first, longest)
+    rolling = RollingStarts(estimator, record, names, first, longest)
     ahead = rolling.forecasts(states_of, check_count("n_draws", n_draws), seed, advance)
-    shown = _spread(0, longest - 1, min(longest, N_HORIZONS))
+    shown = spread_evenly(longest, N_HORIZONS)
     baselines, order = _baselines(fitted, names)
-    paths = {MODEL: rolling.measured(ahead)}
-    paths |= {name: rolling.continued(each) for name, each in baselines.items()}
-    errors = _errors(paths, rolling.truth, record.columns(names)[n_fitted:])
+    paths = {name: rolling.continued(baseline) for name, baseline in baselines.items()}
+    paths = {MODEL: rolling.measured(ahead), **paths}
+    scale = zero_to_one(record.columns(names)[n_fitted:].std(axis=0))
+    errors = {n: horizon_errors(path, rolling.truth, scale)[shown] for n, path in paths.items()}
     return ForecastSkill(
         horizons_s=rolling.steps_s[shown],
         period_s=period_s,
-        nrmse=MappingProxyType({n: values[shown] for n, values in errors.items()}),
+        nrmse=MappingProxyType(errors),
         coverage_90=rolling.coverage(ahead, LEVEL),
         n_starts=len(first),
         example=ahead[0],
         order=order,
         clock=record.clock,
     )
-
-
-def _errors(
-    paths: Mapping[str, Float[np.ndarray, "starts ahead measured"]],
-    truth: Float[np.ndarray, "starts ahead measured"],
-    held_out: Float[np.ndarray, "samples measured"],
-) -> dict[str, Float[np.ndarray, " ahead"]]:
-    """Errors by horizon, in standard deviations of the held-out samples."""
-    scale = zero_to_one(held_out.std(axis=0))
-    return {name: horizon_errors(path, truth, scale) for name, path in paths.items()}
 
 
 def _check_skill(model: SparseModel, record: Trajectory, n_fitted: int) -> None:
@@ -241,11 +225,6 @@ def _baselines(fitted: Trajectory, names: Sequence[str]) -> tuple[dict[str, Base
     if (linear := Autoregression.of(own)) is not None:
         found[AUTOREGRESSION] = linear
     return found, 0 if linear is None else linear.order
-
-
-def _spread(first: int, last: int, n: int) -> Int[np.ndarray, " _"]:
-    """At most n whole numbers, evenly spread from first to last."""
-    return np.unique(np.linspace(first, last, n).round().astype(np.int64))
 
 
 def horizon_errors(

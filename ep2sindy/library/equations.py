@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from html.entities import name2codepoint
 from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias
@@ -98,39 +99,68 @@ def equation_parts(
     terms: or groups of them, which become `+ n_i n_n (1.6e-32 n_i + 3.1e-33 n_n)`. reach:
     half-width of the confidence interval by term name; adds it as `(±2e-16)`.
     """
+    return _parts_in(TEXT, terms, digits, reach)
+
+
+@dataclass(frozen=True)
+class Notation:
+    """How the parts of an equation are written.
+
+    term: product of a number, perhaps with the half-width of its interval, and a term. factor: of a
+    group of terms. first_gap: between the sign of the first term and the term.
+    """
+
+    term: Callable[[str, float, float | None, int], str]
+    factor: Callable[[str], str]
+    first_gap: str
+
+
+def _parts_in(
+    notation: Notation, terms: Sum, digits: int, reach: Mapping[str, float] = NOTHING
+) -> list[str]:
+    """Every term, or group of terms, with its sign."""
     if not isinstance(terms, Mapping):
-        return _group_parts(
-            terms,
-            lambda group: equation_parts(group.terms, digits=digits, reach=group.reach),
-            lambda factor: factor.replace("*", " "),
-        )
+        return [_group_in(notation, group, digits, first=k == 0) for k, group in enumerate(terms)]
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
-        sign = "-" if coef < 0 else "+" if k else ""
-        error = f" (±{reach[name]:.2g})" if name in reach else ""
-        factors = "" if name == "1" else " " + name.replace("*", " ")
-        factors = factors.replace(" 1/", "/", 1) if name.startswith(RECIPROCAL) else factors
-        parts.append(f"{sign}{' ' if k else ''}{abs(coef):.{digits}g}{error}{factors}")
+        body = notation.term(name, abs(coef), reach.get(name), digits)
+        parts.append(_signed(body, coef, notation.first_gap, first=k == 0))
     return parts
 
 
-def _group_parts(
-    groups: Sequence[Group], write: Callable[[Group], list[str]], name: Callable[[str], str]
-) -> list[str]:
-    """Groups with their signs. write: the terms of a group; name: its factor."""
-    parts = []
-    for k, group in enumerate(groups):
-        inner = write(group)
-        value = next(iter(group.terms.values()))
-        if len(inner) == 1:  # its own sign and that of the group make one
-            sign = group.sign if value > 0.0 else -group.sign
-            body = inner[0].removeprefix("-").strip()
-        else:
-            factor = f"{name(group.factor)} " if group.factor != "1" else ""
-            sign, body = group.sign, f"{factor}({' '.join(inner)})"
-        mark = "-" if sign < 0 else "+" if k else ""
-        parts.append(f"{mark}{' ' if k else ''}{body}")
-    return parts
+def _group_in(notation: Notation, group: Group, digits: int, *, first: bool) -> str:
+    inner, sign = _parts_in(notation, group.terms, digits, group.reach), group.sign
+    if len(inner) > 1:
+        factor = f"{notation.factor(group.factor)} " if group.factor != "1" else ""
+        return _signed(f"{factor}({' '.join(inner)})", sign, "", first=first)
+    # The sign of a single term and that of the group make one.
+    sign *= 1 if next(iter(group.terms.values())) > 0.0 else -1
+    return _signed(inner[0].removeprefix("-").strip(), sign, "", first=first)
+
+
+def _signed(body: str, value: float, first_gap: str, *, first: bool) -> str:
+    if value < 0.0:
+        return f"-{first_gap if first else ' '}{body}"
+    return body if first else f"+ {body}"
+
+
+def _text_term(name: str, size: float, half_width: float | None, digits: int) -> str:
+    error = "" if half_width is None else f" (±{half_width:.2g})"
+    factors = "" if name == "1" else " " + name.replace("*", " ")
+    factors = factors.replace(" 1/", "/", 1) if name.startswith(RECIPROCAL) else factors
+    return f"{size:.{digits}g}{error}{factors}"
+
+
+def _latex_term(name: str, size: float, half_width: float | None, digits: int) -> str:
+    mantissa, exponent = _number(size, digits)
+    number = mantissa + ("" if exponent is None else rf" \cdot 10^{{{exponent}}}")
+    factors = [] if name == "1" else [latex_term_name(name)]
+    return r" \, ".join([*([] if factors and size == 1.0 else [number]), *factors])
+
+
+def _html_term(name: str, size: float, half_width: float | None, digits: int) -> str:
+    error = "" if half_width is None else f" (&plusmn;{_number_html(half_width, 2)})"
+    return f"{_number_html(size, digits)}{error} {_term_html(name)}".strip()
 
 
 def sum_latex(terms: Sum, *, digits: int = 3) -> str:
@@ -140,22 +170,7 @@ def sum_latex(terms: Sum, *, digits: int = 3) -> str:
 
 def terms_latex(terms: Sum, *, digits: int = 3) -> list[str]:
     """LaTeX of every term, or group of terms, with its sign; a factor of one is not written."""
-    if not isinstance(terms, Mapping):
-        return _group_parts(
-            terms,
-            lambda group: terms_latex(group.terms, digits=digits),
-            lambda factor: rf"{latex_term_name(factor)} \,",
-        )
-    parts = []
-    for k, (name, coef) in enumerate(terms.items()):
-        sign = "-" if coef < 0 else "+" if k else ""
-        mantissa, exponent = _number(coef, digits)
-        number = mantissa + ("" if exponent is None else rf" \cdot 10^{{{exponent}}}")
-        factors = [] if name == "1" else [latex_term_name(name)]
-        numbers = [] if factors and abs(coef) == 1.0 else [number]
-        product = r" \, ".join([*numbers, *factors])
-        parts.append(f"{sign} {product}".strip())
-    return parts
+    return _parts_in(LATEX, terms, digits)
 
 
 def equations_latex(equations: Mapping[str, Sum], *, digits: int = 3) -> str:
@@ -174,25 +189,8 @@ def equation_html(
 
     terms: or groups of them. reach: half-width of the confidence interval by term name.
     """
-    right = " ".join(_html_parts(terms, digits=digits, reach=reach)) or "0"
+    right = " ".join(_parts_in(HTML, terms, digits, reach)) or "0"
     return f"d{_variable_html(state)}/dt = {right}".replace("-", "&minus;")
-
-
-def _html_parts(terms: Sum, *, digits: int, reach: Mapping[str, float]) -> list[str]:
-    if not isinstance(terms, Mapping):
-        return _group_parts(
-            terms,
-            lambda group: _html_parts(group.terms, digits=digits, reach=group.reach),
-            _term_html,
-        )
-    parts = []
-    for k, (name, coef) in enumerate(terms.items()):
-        sign = "-" if coef < 0 else "+" if k else ""
-        number = _number_html(coef, digits)
-        if name in reach:
-            number += f" (&plusmn;{_number_html(reach[name], 2)})"
-        parts.append(" ".join([sign, number, _term_html(name)]).strip())
-    return parts
 
 
 def sum_sympy(terms: Mapping[str, float]) -> sympy.Expr:
@@ -282,3 +280,8 @@ def _is_greek(stem: str) -> bool:
     """True for small Greek letters that LaTeX, matplotlib and HTML call by the same name."""
     alpha_to_omega = 0x3B1 <= name2codepoint.get(stem, 0) <= 0x3C9
     return alpha_to_omega and stem not in ("omicron", "sigmaf")
+
+
+TEXT = Notation(_text_term, lambda factor: factor.replace("*", " "), "")
+LATEX = Notation(_latex_term, lambda factor: rf"{latex_term_name(factor)} \,", " ")
+HTML = Notation(_html_term, _term_html, " ")

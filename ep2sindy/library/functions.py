@@ -173,38 +173,18 @@ def _of(name: str) -> Values:
     return lambda x: getattr(array_namespace(x), name)(x)
 
 
-def _negative_sine(x: Any) -> Any:
-    return -array_namespace(x).sin(x)
-
-
-def _half_root(x: Any) -> Any:
-    return 0.5 / array_namespace(x).sqrt(x)
-
-
-def _bell(x: Any) -> Any:
-    return 1.0 - array_namespace(x).tanh(x) ** 2
-
-
-def _reciprocal(x: Any) -> Any:
-    return 1.0 / x
-
-
-def _negative_square(x: Any) -> Any:
-    return -1.0 / (x * x)
-
-
 _POSITIVE: tuple[Interval, ...] = ((0.0, np.inf),)
 _POLE: tuple[Interval, ...] = ((-np.inf, 0.0), (0.0, np.inf))
 _BUILT_IN = (
     Kind("sin", _of("sin"), _of("cos")),
-    Kind("cos", _of("cos"), _negative_sine),
+    Kind("cos", _of("cos"), lambda x: -array_namespace(x).sin(x)),
     Kind("exp", _of("exp"), _of("exp"), ((-np.inf, LARGEST_EXPONENT),)),
-    Kind("log", _of("log"), _reciprocal, _POSITIVE),
-    Kind("sqrt", _of("sqrt"), _half_root, _POSITIVE, degree=0.5),
+    Kind("log", _of("log"), lambda x: 1.0 / x, _POSITIVE),
+    Kind("sqrt", _of("sqrt"), lambda x: 0.5 / array_namespace(x).sqrt(x), _POSITIVE, degree=0.5),
     Kind("abs", _of("abs"), _of("sign"), degree=1.0),
     # Smooth, so that it can be integrated and refined: sign(v/w) turns over a width w.
-    Kind("sign", _of("tanh"), _bell),
-    Kind(RECIPROCAL, _reciprocal, _negative_square, _POLE, degree=-1.0),
+    Kind("sign", _of("tanh"), lambda x: 1.0 - array_namespace(x).tanh(x) ** 2),
+    Kind(RECIPROCAL, lambda x: 1.0 / x, lambda x: -1.0 / (x * x), _POLE, degree=-1.0),
 )
 _kinds = {kind.name: kind for kind in _BUILT_IN}  # register_function adds to it
 INVERSE = "inverse"  # name that asks for the reciprocal of every variable

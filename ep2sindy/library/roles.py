@@ -184,19 +184,20 @@ class Roles:
                     f"numbers, or {FREE!r}"
                 )
 
-        def put(role: Role) -> Any:
-            asked = role.name in self.open
-            return dict(known.get(role.name, {})) or FREE if asked else role.how
-
-        new = {role.name: put(role) for role in self._roles}
-        named = isinstance(self.outflow, Mapping)
+        roles = [
+            role._replace(how=dict(known.get(role.name, {})) or FREE)
+            if role.name in self.open
+            else role
+            for role in self._roles
+        ]
         return replace(
             self,
-            exchange=[(*entry[:2], new[f"{entry[0]} to {entry[1]}"]) for entry in self.exchange],
-            outflow={s: new[f"{s} out"] for s in self.outflow} if named else self.outflow,
+            exchange=[tuple(role) for role in roles if role.giver and role.taker],
+            outflow={role.giver: role.how for role in roles if not role.taker},
             inflow={
-                s: how["1"] if isinstance(how := new[f"{s} in"], Mapping) else how
-                for s in self.inflow
+                role.taker: role.how["1"] if isinstance(role.how, Mapping) else role.how
+                for role in roles
+                if not role.giver
             },
         )
 
@@ -347,22 +348,20 @@ class Roles:
 
 def _check_how(role: Role) -> None:
     """Raises ValueError for a role that is not played in one of the ways that `Roles` names."""
-    how = role.how
-    words = (KNOWN, FREE, EITHER)
+    how, words = role.how, (KNOWN, FREE, EITHER)
     if isinstance(how, str):
-        if how in words:
-            return
+        is_one = how in words
     elif isinstance(how, Mapping):
-        values = list(how.values())
-        if all(not isinstance(v, str | bool) and np.isfinite(v) for v in values) and values:
-            return
-    elif isinstance(how, Sequence):
+        is_number = [not isinstance(v, str | bool) and np.isfinite(v) for v in how.values()]
+        is_one = bool(how) and all(is_number)
+    else:
+        is_one = isinstance(how, Sequence)
+    if is_one:
         return
     ways = "terms with their coefficients in SI" if role.giver else "a number in SI per second"
     raise ValueError(
         f"how {role.name!r} is played must be {ways}, a list of terms, {KNOWN!r}, {FREE!r} or "
-        f"{EITHER!r}: "
-        f"{how!r} came"
+        f"{EITHER!r}: {how!r} came"
     )
 
 

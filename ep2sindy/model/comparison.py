@@ -15,13 +15,13 @@ from ep2sindy.signals.attractor import (
     Cycle,
     distribution_distances,
     find_cycle,
+    quarter_distances,
     spectrum_distance,
     waveform_errors,
     white_variance,
 )
 from ep2sindy.signals.oscillation import DIED_OUT, has_decayed
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.signals.stationarity import quarter_distances
 
 LONG = 8.0  # fewest periods in a record whose first half may be left out as a transient
 REPEATS = 0.9  # least share of the variance that the waveform of a cycle explains; chaos: 0.5-0.75

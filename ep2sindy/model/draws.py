@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.model.inputs import Curve
-from ep2sindy.model.many import Steps, run_many
+from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.vector_field import Equations, VectorField
 
 # Substeps between two samples: the fewest whose central run differs from that of twice as many by
@@ -92,11 +92,11 @@ def _fine_enough(
     t: Float[np.ndarray, " samples"],
     drive: Curve | None,
     bound: Float[np.ndarray, " n_states"],
-) -> Steps:
+) -> WindowSteps:
     """Steps between the samples that follow the central run."""
 
     def runs(starts: np.ndarray, first: np.ndarray, n_samples: int, n_substeps: int) -> np.ndarray:
-        steps = Steps.along(t, drive, first, n_samples, n_substeps)
+        steps = WindowSteps.along(t, drive, first, n_samples, n_substeps)
         found = run_many(field, starts[None], steps, centre=np.zeros(len(bound)), reach=bound)
         return found[0]
 
@@ -113,7 +113,7 @@ def _fine_enough(
         if off.max() <= ACCURATE:
             break
         n, run = 2 * n, finer
-    return Steps.along(t, drive, begin, len(t), n)
+    return WindowSteps.along(t, drive, begin, len(t), n)
 
 
 def starts_around(states: np.ndarray, n_starts: int, spread: tuple[float, float]) -> np.ndarray:

@@ -180,8 +180,7 @@ def advance(
     `blow_up` in the last step, and samples are filled up to the crossing; FAILED: the step became
     too small.
     """
-    n = len(y)
-    slopes, shape = np.empty((16, n)), np.empty((7, n))
+    n, slopes, shape = len(y), np.empty((16, len(y))), np.empty((7, len(y)))
     at, room, columns = np.empty(n), np.empty(n), np.ones(n + equations[5].shape[2] + 1)
     for i in range(n):  # array expressions take seconds longer to compile
         slopes[0, i] = slope[i]

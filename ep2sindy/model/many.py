@@ -24,7 +24,7 @@ BLOW_UP = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class WindowSteps:
     """Steps through windows of equally many samples, with the inputs on the way.
 
     h: (windows, steps), lengths in s, n_substeps from one sample to the next. inputs: (windows,
@@ -42,7 +42,7 @@ class Steps:
         first: Int[np.ndarray, " windows"],
         n_samples: int,
         n_substeps: int,
-    ) -> Steps:
+    ) -> WindowSteps:
         """Steps from some samples of a record, through as many samples as each window has.
 
         curve: the inputs over the record; None for none.
@@ -50,17 +50,17 @@ class Steps:
         places = first[:, None] + np.arange(n_samples - 1)
         h = np.repeat((t[places + 1] - t[places]) / n_substeps, n_substeps, axis=1)
         if curve is None:
-            return Steps(h, np.empty((*h.shape, 0, 3)), n_substeps)
+            return WindowSteps(h, np.empty((*h.shape, 0, 3)), n_substeps)
         shares = (np.arange(n_substeps)[:, None] + [0.0, 0.5, 1.0]) / n_substeps
         nodes = np.array([[curve.at(share)[places] for share in row] for row in shares.tolist()])
         inputs = nodes.transpose(2, 3, 0, 4, 1)  # windows, samples, substeps, inputs, nodes
-        return Steps(h, np.ascontiguousarray(inputs.reshape(*h.shape, -1, 3)), n_substeps)
+        return WindowSteps(h, np.ascontiguousarray(inputs.reshape(*h.shape, -1, 3)), n_substeps)
 
 
 def run_many(
     field: VectorField,
     starts: Float[np.ndarray, "models windows d"],
-    steps: Steps,
+    steps: WindowSteps,
     *,
     centre: Float[np.ndarray, " d"],
     reach: Float[np.ndarray, " d"],
@@ -81,7 +81,7 @@ def run_many(
 def _compiled(
     field: VectorField,
     starts: np.ndarray,
-    steps: Steps,
+    steps: WindowSteps,
     centre: np.ndarray,
     reach: np.ndarray,
     pushes: np.ndarray,
@@ -101,7 +101,7 @@ def _compiled(
 def _in_arrays(
     field: VectorField,
     starts: np.ndarray,
-    steps: Steps,
+    steps: WindowSteps,
     centre: np.ndarray,
     reach: np.ndarray,
     pushes: np.ndarray,
@@ -131,7 +131,7 @@ def _in_arrays(
 class DrivenWindows:
     """Windows of one trajectory, to be run from their initial states (windows, n_states)."""
 
-    steps: Steps
+    steps: WindowSteps
     start: Float[np.ndarray, "windows n_states"]
 
     @staticmethod
@@ -144,7 +144,7 @@ class DrivenWindows:
     ) -> DrivenWindows:
         """Windows from these samples on, through n_steps samples more, from smoothed states."""
         curve = curve_through(run.t, run.columns(inputs), [None] * len(inputs))
-        steps = Steps.along(run.t, curve, starts, n_steps + 1, N_SUBSTEPS)
+        steps = WindowSteps.along(run.t, curve, starts, n_steps + 1, N_SUBSTEPS)
         return DrivenWindows(steps, smoothed[starts])
 
     @staticmethod
@@ -153,7 +153,7 @@ class DrivenWindows:
     ) -> DrivenWindows:
         """Windows with equal steps from given starts, without inputs."""
         h = np.full((start.shape[1], N_SUBSTEPS * (n_samples - 1)), step_s / N_SUBSTEPS)
-        return DrivenWindows(Steps(h, np.empty((*h.shape, 0, 3)), N_SUBSTEPS), start.T)
+        return DrivenWindows(WindowSteps(h, np.empty((*h.shape, 0, 3)), N_SUBSTEPS), start.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -59,7 +60,7 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
     registered beforehand.
     Raises ValueError for any other text, also if `make` rejects the content.
     """
-    try:
+    with read_as(f"a model file must hold {FORMAT} JSON"):
         content = read_json(text)
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")
@@ -76,12 +77,21 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
             clock=_clock_in(content["clock"]) if "clock" in content else SECONDS,
             courses=texts_in(content.get("courses", {}), "courses"),
         )
+
+
+@contextmanager
+def read_as(wanted: str) -> Iterator[None]:
+    """Turn whatever goes wrong in reading a text into a ValueError that says what was wanted."""
+    try:
+        yield
     except UnknownFunctionError:
-        raise  # the file is sound: a function must be registered before it is read
+        raise  # the text is sound: a function must be registered before it is read
     except KeyError as error:
-        raise ValueError(f"a model file must hold {FORMAT} JSON: {error} is missing") from error
-    except (TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
-        raise ValueError(f"a model file must hold {FORMAT} JSON: {words_of(error)}") from error
+        raise ValueError(f"{wanted}: {error} is missing") from error
+    except (
+        TypeError, ValueError, AttributeError, AssertionError, RecursionError, OverflowError
+    ) as error:  # fmt: skip
+        raise ValueError(f"{wanted}: {words_of(error)}") from error
 
 
 def read_stored(path: Path, read: Callable[[str], Model]) -> Model:

@@ -82,7 +82,8 @@ class VectorField:
         """The same with states in units of `scale` and time in units of `time_s`; inputs in SI."""
         n_inputs = len(self.library.variables) - len(scale)
         library, numbers = self.library.scaled(np.append(scale, np.ones(n_inputs)))
-        return VectorField(library, self.coef * numbers[:, None] * (time_s / scale))
+        with np.errstate(over="ignore"):  # rates are then infinite, which is a verdict
+            return VectorField(library, self.coef * numbers[:, None] * (time_s / scale))
 
     def rates(self, values: Float[np.ndarray, "... variables"]) -> Float[np.ndarray, "... d"]:
         """f at any number of points; NaN outside the domain of a function.

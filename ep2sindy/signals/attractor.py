@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -11,7 +12,14 @@ from scipy import fft
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.runtime.values import read_only
-from ep2sindy.signals.spectrum import at_mean_step, is_uniform, noise_floor, peak, power_spectrum
+from ep2sindy.signals.spectrum import (
+    at_mean_step,
+    dominant_frequency,
+    is_uniform,
+    noise_floor,
+    peak,
+    power_spectrum,
+)
 
 MIN_PERIODS = 3.0  # fewest periods in a record that counts as repeating
 
@@ -34,6 +42,9 @@ N_SHIFTS = 720  # trial shifts of one waveform over another, before the best one
 N_QUANTILES = 256
 
 BANDS_PER_OCTAVE = 3
+
+# Number of parts of a record, and periods that each part must hold; otherwise there are two parts.
+N_PARTS, TURNS = 4, 2.0
 
 # Least ratio of the diagonal elements of a triangular factor that products of columns give to
 # twelve digits or more.
@@ -364,6 +375,23 @@ def spectrum_distance(
         shares = [_power_by_band(t, column) for column in (ours, theirs)]
         apart.append(0.5 * float(np.abs(shares[0] - shares[1]).sum()))
     return float(np.mean(apart))
+
+
+def quarter_distances(
+    t: Float[np.ndarray, " samples"], states: Float[np.ndarray, "samples n_states"]
+) -> tuple[Float[np.ndarray, " n_states"], float]:
+    """Mean distances between quarters of a record: of distributions, by state, and of spectra.
+
+    If the quarters are independent, the distance is twice that between two whole records of the
+    same motion. Halves are compared if a quarter holds less than two periods of the fastest state.
+    """
+    fastest_Hz = max(dominant_frequency(t, column) for column in states.T)
+    n_parts = N_PARTS if fastest_Hz * (t[-1] - t[0]) >= N_PARTS * TURNS else 2
+    n = len(t) // n_parts
+    pairs = list(combinations([states[k * n : (k + 1) * n] for k in range(n_parts)], 2))
+    distributions = [distribution_distances(*pair) for pair in pairs]
+    spectra = [spectrum_distance(t[:n], *pair) for pair in pairs]
+    return np.mean(distributions, axis=0), float(np.mean(spectra))
 
 
 def _power_by_band(t: np.ndarray, column: np.ndarray) -> np.ndarray:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -110,11 +111,8 @@ class LogRate:
         smoother = LogSmoother(**_memory_bounds(signal, self.harmonics))
         found = smoother.estimate(signal.t, signal.x)
         states = [found.smoothed, *_derivatives(signal.t, found.log, self.n_states)[1:]]
-        units = {x: signal.unit} | _rate_units("s^-1", [g, *higher])
-        run = _trajectory(signal, signal.t, np.column_stack(states), units)
-        relations, terms = _known_chain([g, *higher])
-        relations, terms = (f"{x}: {x}*{g} == 1", *relations), {x: (f"{x}*{g}",)} | terms
-        return Embedded(run, relations, terms, found.noise_std)
+        chain = {x: f"{x}*{g}"} | dict(pairwise([g, *higher]))
+        return _embedded(signal, [x, g, *higher], "s^-1", states, chain, found.noise_std)
 
 
 @dataclass(frozen=True)
@@ -139,15 +137,11 @@ class Rate:
         return _chain(signal, "vwuz"[: self.n_states - 1])
 
     def embed(self, signal: Trace) -> Embedded:
-        x, v, *higher = self.names(signal.name)
+        names = self.names(signal.name)
         smoothed, derivative, noise_std = _smooth(signal, self.harmonics)
-        slopes = _derivatives(signal.t, smoothed, self.n_states)[2:]
-        rate_unit = unit_product([(signal.unit, 1), ("s", -1)])
-        units = {x: signal.unit} | _rate_units(rate_unit, [v, *higher])
-        states = np.column_stack([smoothed, derivative, *slopes])
-        run = _trajectory(signal, signal.t, states, units)
-        relations, terms = _known_chain([x, v, *higher])
-        return Embedded(run, relations, terms, noise_std)
+        states = [smoothed, derivative, *_derivatives(signal.t, smoothed, self.n_states)[2:]]
+        unit = unit_product([(signal.unit, 1), ("s", -1)])
+        return _embedded(signal, names, unit, states, dict(pairwise(names)), noise_std)
 
 
 @dataclass(frozen=True)
@@ -186,8 +180,8 @@ class Delays:
             if b - a > CUBIC
         ]
         t, states = (np.concatenate(each) for each in zip(*parts, strict=True))
-        run = _trajectory(signal, t, states, dict.fromkeys(self.names(signal.name), signal.unit))
-        return Embedded(run, (), {}, noise_std)
+        late = signal.with_samples(t, states[:, 0])
+        return _embedded(late, self.names(signal.name), "", list(states.T), {}, noise_std)
 
 
 AnyEmbedding = LogRate | Rate | Delays
@@ -202,23 +196,35 @@ class Chosen:
     embedded: Embedded = field(repr=False)
 
 
-def embed(signal: Trace, embedding: AnyEmbedding | None = None, *, n_states: int = 2) -> Chosen:
+# The embeddings by the names that settings give them.
+EMBEDDINGS: Mapping[str, Callable[..., AnyEmbedding]] = MappingProxyType(
+    {"log_rate": LogRate, "rate": Rate, "delays": Delays}
+)
+
+
+def embed(
+    signal: Trace,
+    embedding: AnyEmbedding | None = None,
+    *,
+    n_states: int = 2,
+    harmonics: float = HARMONICS,
+) -> Chosen:
     """Embed a signal as states; None chooses the embedding by the signal's sign and noise.
 
-    n_states: number of states if the embedding is chosen.
+    n_states: number of states, and harmonics: that are followed, if the embedding is chosen.
     Raises ValueError if the given embedding does not suit the signal.
     """
     if embedding is not None:
         return Chosen(embedding, "set", embedding.embed(signal))
     if signal.is_positive:
-        positive = LogRate(n_states=n_states)
+        positive = LogRate(harmonics, n_states)
         return Chosen(positive, f"{signal.name} is positive", positive.embed(signal))
-    rate = Rate(n_states=n_states)
+    rate = Rate(harmonics, n_states)
     found = rate.embed(signal)
     share = found.noise_std / float(signal.x.std())
     if share <= DROWNED:
         return Chosen(rate, f"{signal.name} takes either sign", found)
-    delays = Delays(n_states=n_states)
+    delays = Delays(harmonics=harmonics, n_states=n_states)
     why = f"{signal.name} takes either sign, and noise is {share:.2f} of its standard deviation"
     return Chosen(delays, why, delays.embed(signal))
 
@@ -240,17 +246,27 @@ def _memory_bounds(signal: Trace, harmonics: float) -> dict[str, float]:
     return {"finest_s": finest_s, "coarsest_s": max(coarsest_s, finest_s)}
 
 
-def _trajectory(
-    signal: Trace, t: np.ndarray, states: np.ndarray, units: Mapping[str, str]
-) -> Trajectory:
-    return Trajectory(
-        t=t,
-        states=states,
-        state_names=tuple(units),
-        units=units,
+def _embedded(
+    signal: Trace, names: Sequence[str], rate_unit: str, states: Sequence[np.ndarray],
+    chain: Mapping[str, str], noise_std: float,
+) -> Embedded:  # fmt: skip
+    """States of a signal, with the equations that are known.
+
+    rate_unit: unit of the second state, of which those after it are derivatives; empty if all have
+    the signal's. chain: state -> the only term of its equation, whose coefficient is one.
+    """
+    rates = [unit_product([(rate_unit or signal.unit, 1), ("s", -k)]) for k in range(len(names))]
+    units = [signal.unit, *rates] if rate_unit else [signal.unit] * len(names)
+    run = Trajectory(
+        t=signal.t,
+        states=np.column_stack(states),
+        state_names=tuple(names),
+        units=dict(zip(names, units, strict=False)),
         label=signal.name,
         clock=signal.clock,
     )
+    relations = tuple(f"{state}: {term} == 1" for state, term in chain.items())
+    return Embedded(run, relations, {state: (term,) for state, term in chain.items()}, noise_std)
 
 
 def _chain(signal: str, letters: str) -> tuple[str, ...]:
@@ -273,17 +289,6 @@ def _derivatives(t: np.ndarray, x: np.ndarray, n: int) -> list[np.ndarray]:
     """x and its derivatives, n in all, by the quintic spline through the samples."""
     spline = make_interp_spline(t, x, k=5)
     return [x, *(spline.derivative(order)(t) for order in range(1, n))]
-
-
-def _rate_units(first: str, names: Sequence[str]) -> dict[str, str]:
-    """Units of a rate and its derivatives."""
-    return {name: unit_product([(first, 1), ("s", -k)]) for k, name in enumerate(names)}
-
-
-def _known_chain(names: Sequence[str]) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
-    """Relations and terms that say that each state but the last has the next as derivative."""
-    pairs = list(pairwise(names))
-    return tuple(f"{x}: {v} == 1" for x, v in pairs), {x: (v,) for x, v in pairs}
 
 
 def _check_settings(embedding: LogRate | Rate | Delays) -> None:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
-from scipy.linalg import cholesky_banded, solveh_banded
 
 from ep2sindy.data.numbers import least_beside_grid
-from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.values import read_only
-from ep2sindy.signals.kalman import check_memory_bounds, ratio_bounds
-from ep2sindy.signals.wiener import third_differences
+from ep2sindy.signals.kalman import WienerProcess, check_memory_bounds, ratio_bounds, unit_steps
 
 # Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
 # time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.
@@ -57,14 +55,25 @@ class LogEstimate:
 class LogSmoother:
     """Smoother for a positive signal with additive white noise and a smooth logarithm.
 
+    It minimises, over logarithms f,
+
+        sum_i (x_i - exp f(t_i))^2 + (1 / ratio) integral (d^3 f / dt^3)^2 dt.
+
     The logarithm is a twice integrated Wiener process, as in `KalmanSmoother`; the samples are
     its exponential plus noise of constant standard deviation. A sample in a trough no higher than
     the noise says little about the logarithm there and has little weight; it may be zero or
-    negative. The mode of the posterior is found by the Gauss-Newton method; the ratio of process
-    to measurement noise is the most likely one (Laplace's approximation).
+    negative. The mode of the posterior is found by the Gauss-Newton method, each step of which
+    solves for a `WienerProcess` with weights; the ratio of process to measurement noise is the most
+    likely one (Laplace's approximation).
     finest_s, coarsest_s: bounds on the memory of the process, in s, where the signal is at its
     mean, as for `KalmanSmoother`. None leaves it to the data.
     Source: Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, section 3.4.
+
+    >>> t = np.linspace(0.0, 6.0, 301)
+    >>> noisy = np.exp(np.sin(t)) + 0.05 * np.random.default_rng(0).normal(size=301)
+    >>> found = ep.signals.LogSmoother().estimate(t, noisy)
+    >>> bool(np.abs(found.log - np.sin(t)).max() < 0.1)
+    True
     """
 
     finest_s: float | None = None
@@ -80,13 +89,17 @@ class LogSmoother:
 
         Raises ValueError for fewer than eight samples, or a mean that is not positive.
         """
-        _check(t, x)
-        step_s = (t[-1] - t[0]) / (len(t) - 1)
+        steps, step_s = unit_steps(t, x, MIN_SAMPLES)
         mean = float(x.mean())
-        y, penalty = x / mean, _roughness(np.diff(t) / step_s)
+        if not mean > 0.0:
+            raise ValueError(
+                f"a signal must be positive for its logarithm to be taken: its mean is {mean:.3g}; "
+                "take its derivative instead (ep.signals.Rate)"
+            )
+        y, process = x / mean, WienerProcess.at(steps, lumped=True)
         limits = (LOG10_RATIO_MIN, LOG10_RATIO_MAX)
         ratio, found = _best_mode(
-            y, penalty, *ratio_bounds(self.finest_s, self.coarsest_s, step_s, limits)
+            y, process, *ratio_bounds(self.finest_s, self.coarsest_s, step_s, limits)
         )
         log = found.log + np.log(mean)
         return LogEstimate(
@@ -111,7 +124,7 @@ class _Mode:
 
 
 def _best_mode(
-    y: np.ndarray, penalty: np.ndarray, lowest: float, highest: float
+    y: np.ndarray, process: WienerProcess, lowest: float, highest: float
 ) -> tuple[float, _Mode]:
     """Ratio of greatest likelihood, and the mode of the posterior for it.
 
@@ -121,89 +134,41 @@ def _best_mode(
     decades = np.append(np.arange(highest, lowest, -1.0), lowest)
     modes, log = [], np.log(np.maximum(y, FLOOR))
     for decade in decades:
-        modes.append(_mode(y, penalty, decade, log))
+        modes.append(_mode(y, process, decade, log))
         log = modes[-1].log
     misfits = np.array([mode.misfit for mode in modes])
     start = modes[int(misfits.argmin())].log
     ratio = least_beside_grid(
-        lambda ratio: _mode(y, penalty, ratio, start).misfit,
+        lambda ratio: _mode(y, process, ratio, start).misfit,
         decades,
         misfits,
         tolerance=LOG10_RATIO_TOLERANCE,
     )
-    return ratio, _mode(y, penalty, ratio, start)
+    return ratio, _mode(y, process, ratio, start)
 
 
-def _mode(y: np.ndarray, penalty: np.ndarray, log10_ratio: float, log: np.ndarray) -> _Mode:
+def _mode(y: np.ndarray, process: WienerProcess, log10_ratio: float, log: np.ndarray) -> _Mode:
     """Most likely logarithm for one ratio, by damped Gauss-Newton steps."""
-    prior = penalty * 10.0**-log10_ratio
-    squares = _squares(y, prior, log)
+    n, ratio = len(y) - 3, 10.0**log10_ratio
+    squares_at = partial(_squares, y, process, ratio)
+    squares = squares_at(log)
     for _ in range(MAX_ITER):
         value = np.exp(log)
-        curvature = _with_weights(prior, np.square(value))
-        step = solveh_banded(curvature, value * (y - value) - _times(prior, log), lower=True)
+        pull = value * (y - value)
+        step = -process.solve(log[:, None], ratio, weights=value**2, pull=pull[:, None])[0][:, 0]
         share = min(1.0, 2.0 / max(np.abs(step).max(), 1e-300))
-        while (tried := _squares(y, prior, log + share * step)) > squares and share > 1e-6:
+        while (tried := _squares(y, process, ratio, log + share * step)) > squares and share > 1e-6:
             share *= 0.5
         if tried > squares:
             break
         log, gained, squares = log + share * step, squares - tried, tried
         if gained <= TOLERANCE * squares:
             break
-    factor = cholesky_banded(_with_weights(prior, np.exp(2.0 * log)), lower=True)
-    n = len(y) - 3
+    _, _, logs = process.solve(log[:, None], ratio, weights=np.exp(2.0 * log))
     squares = max(squares, n * ROUNDING)
-    misfit = n * np.log(squares) + 2.0 * np.log(factor[0]).sum() + n * np.log(10.0) * log10_ratio
-    return _Mode(log, squares, float(misfit))
+    return _Mode(log, squares, float(n * np.log(squares) + logs))
 
 
-def _squares(y: np.ndarray, prior: np.ndarray, log: np.ndarray) -> float:
+def _squares(y: np.ndarray, process: WienerProcess, ratio: float, log: np.ndarray) -> float:
     with np.errstate(over="ignore"):  # a step that is too long overflows, and is then halved
-        return float(np.square(y - np.exp(log)).sum() + log @ _times(prior, log))
-
-
-def _roughness(steps: np.ndarray) -> np.ndarray:
-    """Lower diagonals of the matrix of the integral of the squared third derivative.
-
-    The matrix is a quadratic form of the samples. It is built from third divided differences, each
-    weighted by a third of the span of its four samples.
-
-    steps: (samples - 1,) in mean steps. Returns (4, samples).
-    """
-    n = len(steps) - 2
-    weights = third_differences(steps) * np.sqrt((steps[:-2] + steps[1:-1] + steps[2:]) / 3.0)
-    diagonals = np.zeros((4, n + 3))
-    for lower in range(4):
-        for k in range(4 - lower):
-            diagonals[lower, k : k + n] += weights[k] * weights[k + lower]
-    return diagonals
-
-
-def _with_weights(diagonals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Banded matrix with weights added to its main diagonal."""
-    found = diagonals.copy()
-    found[0] += weights
-    return found
-
-
-def _times(diagonals: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Product of a symmetric banded matrix and a vector."""
-    product = diagonals[0] * x
-    for k in range(1, len(diagonals)):
-        product[k:] += diagonals[k, :-k] * x[:-k]
-        product[:-k] += diagonals[k, :-k] * x[k:]
-    return product
-
-
-def _check(t: np.ndarray, x: np.ndarray) -> None:
-    if len(t) < MIN_SAMPLES or len(x) != len(t):
-        raise ValueError(
-            f"smoothing needs {MIN_SAMPLES} samples or more, one per time: {len(x)} came with "
-            f"{len(t)} times; join more data"
-        )
-    check_time(t)
-    if not x.mean() > 0.0:
-        raise ValueError(
-            f"a signal must be positive for its logarithm to be taken: its mean is {x.mean():.3g}; "
-            "take its derivative instead (ep.signals.Rate)"
-        )
+        return float(np.square(y - np.exp(log)).sum() + process.roughness(log) / ratio)

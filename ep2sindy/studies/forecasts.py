@@ -13,7 +13,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.series import forecast_figure
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
-from ep2sindy.forecasting.tracking import track
+from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -51,12 +51,12 @@ def skill_of(
     if not starts or model.inputs or is_short(run, n_fitted) or not model.coef.any():
         return None
     fitted = run.window(0, n_fitted)
-    tracker = track(model, fitted, progress=progress)
+    estimator = tune_estimator(model, fitted, progress=progress)
     with progress.stage(None, "", "width of the forecasts' bands"):
-        tracker = calibrate(tracker, fitted)
+        estimator = calibrate(estimator, fitted)
     with progress.stage(starts, "start", "forecasts") as advance:
         return forecast_skill(
-            model, run, n_fitted=n_fitted, starts=starts, tracker=tracker, advance=advance
+            model, run, n_fitted=n_fitted, starts=starts, estimator=estimator, advance=advance
         )
 
 

@@ -14,10 +14,8 @@ import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.fields import SPACE, write_netcdf
-from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.discovery.point_search import PointSearch
-from ep2sindy.discovery.pointwise import STATUSES, pointwise
-from ep2sindy.discovery.recipe import regression_of
+from ep2sindy.discovery.method import AnyMethod, Regression
+from ep2sindy.discovery.pointwise import STATUSES, PointSearch, pointwise
 from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes, spread
 from ep2sindy.figures.maps import coefficient_maps, quality_maps, regime_map
 from ep2sindy.library.library import Library, named_terms
@@ -96,8 +94,13 @@ class Study:
         return named_terms(list(used), terms)
 
     def search(self, library: Library, *, seed: int) -> PointSearch:
-        method = regression_of(self.method)
-        return PointSearch(self.states, library, method, self.least_variation, seed, self.relations)
+        if not isinstance(self.method, Regression):
+            raise ValueError(
+                "a search of trajectories fits them whole, and a pointwise study searches rows: "
+                f"{self.method!r} came; use Regression(search=BestSubset()) (search=best_subset)"
+            )
+        settings = self.method, self.least_variation, seed, self.relations
+        return PointSearch(self.states, library, *settings)
 
     def compute(self, run: Run) -> Outcome:
         with run.progress(None, "", "data"):

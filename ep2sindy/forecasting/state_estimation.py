@@ -1,9 +1,10 @@
-"""States of a model along a record: its start and the noise, fitted to the past alone.
+"""State estimation: states of a model along a record, from its samples and under process noise.
 
-A model follows a record apart from two errors: the noise of the samples, and a random move of every
-state at every step (process noise), which stands for all that the model does not describe. Their
-sizes are the most likely ones for the record that the model was fitted to. States are then fitted
-to the samples of a window before any moment, by the model and under these errors.
+A model follows a record apart from two errors: the noise of the samples, and process noise, a
+random push of every state at every step, which stands for all that the model does not describe.
+Their sizes are the most likely ones for the record that the model was fitted to. States are then
+fitted to samples by the model and under these errors: those of a window before a moment (filtering)
+or those of a whole record (smoothing).
 """
 
 from __future__ import annotations
@@ -17,8 +18,15 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import with_guess_by
-from ep2sindy.estimation.kernels import departures, filtered
-from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, enough_substeps
+from ep2sindy.estimation.kernels import filtered
+from ep2sindy.estimation.likelihood import (
+    FREE_START,
+    Level,
+    TrajectoryFit,
+    enough_substeps,
+    fit_paths,
+    linearise,
+)
 from ep2sindy.estimation.problem import (
     MIN_SAMPLES,
     EstimationProblem,
@@ -39,8 +47,7 @@ N_PASSES = 3  # states and noise, fitted in turn
 
 # Process noise, in noise of the samples, of the fits that approach the final one. Free states find
 # their way to the samples first.
-COOLING = (3.0, 0.3, 0.03)
-MAX_STEPS, SETTLED, SHORTEST = 8, 1e-3, 1e-2
+CONTINUATION = (3.0, 0.3, 0.03)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +55,7 @@ class ModelNoise:
     """Standard deviations of the errors with which a model follows a record, in SI.
 
     samples: (n_states,), of the samples' noise; NaN for a state that is not measured.
-    process: (n_states,), of the process noise of every state over a mean step.
+    process: (n_states,), of the push of every state in a mean step.
     """
 
     samples: Float[np.ndarray, " n_states"]
@@ -64,12 +71,20 @@ class FittedState:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracker:
+class StateEstimator:
     """A model that can follow records, with the errors that it makes on one.
 
+    The states x of n samples y minimise, with the model's coefficients fixed,
+
+        sum_k ((y_k - x_k) / noise.samples)^2
+        + sum_k ((flow of x_k over a step - x_(k+1)) / noise.process)^2,
+
+    which is an iterated Kalman smoother (`estimation.likelihood`). It assumes that both errors are
+    white and normal.
     problem: scales and steps of that record, and which states were measured. free: the model's
     coefficients, scaled. n_substeps: Runge-Kutta steps between samples. per_period: samples to a
     period of the record.
+    Source: Bell 1994, doi:10.1137/0804035.
     """
 
     model: SparseModel
@@ -89,23 +104,21 @@ class Tracker:
         """Length in samples of the window that a start is fitted to."""
         return int(np.clip(MEMORY_PERIODS * self.per_period, MIN_MEMORY, MAX_MEMORY))
 
-    def end_of(self, history: Trajectory) -> FittedState:
+    def filter(self, history: Trajectory) -> FittedState:
         """Fit the states of the last samples of a history, and return the last state.
 
         history: has the measured states of the model; others that it has only start the fit.
         """
         record = self.problem.record(_of_model(self.model, history)).end(self.memory)
-        samples, process = self.scaled_noise()
-        path = self.approach(record, record.samples.copy(), samples, process)
-        variances = _variances(len(path), samples, process)
-        _, mean, covariance = filtered(*self.linear(record, path), *variances, FREE_START)
-        end, scale = path[-1] + mean, self.problem.scale
+        fit = self.fit_path(record, record.samples)
+        _, mean, covariance = filtered(*linearise(fit))
+        end, scale = fit.path[-1] + mean, self.problem.scale
         if not (np.isfinite(end).all() and np.isfinite(covariance).all()):
             # The model runs away between two samples: they tell no more than a guess does.
             end, covariance = record.samples[-1], FREE_START * np.eye(len(scale))
         return FittedState(scale * end, np.outer(scale, scale) * covariance)
 
-    def along(self, run: Trajectory) -> Trajectory:
+    def smooth(self, run: Trajectory) -> Trajectory:
         """All states of the model along a run, fitted to the measured ones under the errors.
 
         Between gaps it starts anew. Stretches of under five samples are left out.
@@ -113,8 +126,8 @@ class Tracker:
         own = _of_model(self.model, run)
         whole = self.problem.record(own)
         pieces = whole.stretches()
-        paths = [self.approach(each, each.samples.copy(), *self.scaled_noise()) for each in pieces]
-        kept = np.isin(whole.times, np.concatenate([each.times for each in pieces]))
+        paths = [self.fit_path(piece, piece.samples).path for piece in pieces]
+        kept = np.isin(whole.times, np.concatenate([piece.times for piece in pieces]))
         states = np.concatenate(paths) * self.problem.scale
         return replace(own, t=own.t[kept], states=states, inputs=own.inputs[kept])
 
@@ -128,66 +141,25 @@ class Tracker:
         )
         return np.where(self.measured, samples, samples[self.measured].mean()), process
 
-    def approach(
-        self, record: ScaledRecord, path: np.ndarray, samples: np.ndarray, process: np.ndarray
-    ) -> np.ndarray:
-        """The most likely path near the given one, by way of larger pushes that fade."""
-        for share in (*COOLING, 0.0):
-            path = self._smooth(record, path, samples, np.maximum(process, share * samples))
-        return path
-
-    def linear(
-        self, record: ScaledRecord, path: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Derivatives of the flow, its misses, and residuals, NaN where nothing was measured."""
-        none = np.zeros(len(self.free), dtype=np.bool_)
-        flow = self.problem.flow(record, path[:-1], self.free, none, self.n_substeps)
-        residuals = np.where(self.measured, record.samples - path, np.nan)
-        return np.ascontiguousarray(flow.slopes), flow.ends - path[1:], residuals
-
-    def _smooth(
-        self, record: ScaledRecord, path: np.ndarray, samples: np.ndarray, process: np.ndarray
-    ) -> np.ndarray:
-        """Most likely path near the given one, by Gauss-Newton steps that are halved if needed."""
-        variances = _variances(len(path), samples, process)
-        with np.errstate(over="ignore", invalid="ignore"):
-            total = self._total(record, path, *variances)
-            for _ in range(MAX_STEPS):
-                linear = self.linear(record, path)
-                if not all(np.isfinite(part).all() for part in linear[:2]):
-                    return path
-                move, share = departures(*linear, *variances, FREE_START), 1.0
-                while share >= SHORTEST:
-                    ahead = self._total(record, path + share * move, *variances)
-                    if ahead < total:
-                        break
-                    share *= 0.5
-                else:
-                    return path
-                gain, path, total = total - ahead, path + share * move, ahead
-                if gain < SETTLED * max(total, 1.0) and share == 1.0:
-                    break
-        return path
-
-    def _total(
-        self, record: ScaledRecord, path: np.ndarray, variance: np.ndarray, pushes: np.ndarray
-    ) -> float:
-        """The squares that the most likely path makes least."""
-        misses = self.problem.ends(record, path[:-1], self.free, self.n_substeps) - path[1:]
-        residuals = (record.samples - path)[:, self.measured]
-        total = float((np.square(residuals) / variance[:, self.measured]).sum())
-        total += float((np.square(misses) / pushes).sum())
-        return total if np.isfinite(total) else np.inf
+    def fit_path(self, record: ScaledRecord, path: Float[np.ndarray, "samples d"]) -> TrajectoryFit:
+        """The most likely path near the given one, by way of larger process noise that fades."""
+        samples, process = self.scaled_noise()
+        level = Level(np.tile(samples, (len(path), 1)), 1.0, self.n_substeps)
+        fit = _fit_of(self.problem, [record], [path], self.free, level)
+        for share in (*CONTINUATION, 0.0):
+            level = replace(level, process_noise=np.maximum(process, share * samples))
+            fit = fit_paths(replace(fit, level=level))
+        return fit
 
 
 @one_thread()
-def track(
+def tune_estimator(
     model: SparseModel,
     run: Trajectory,
     *,
     measured: Sequence[str] | None = None,
     progress: bool | Progress = False,
-) -> Tracker:
+) -> StateEstimator:
     """Estimate with what errors a model follows a record, usually the one that it was fitted to.
 
     run: has the measured states and the inputs of the model. measured: states whose samples count;
@@ -217,18 +189,19 @@ def track(
     differences = np.concatenate([np.diff(path, n=3, axis=0) for path in paths])
     rough = np.sqrt(np.square(differences).mean(axis=0) / 20.0)
     rough = np.clip(rough, LEAST_NOISE, MOST)
-    tracker = Tracker(
+    level = Level(np.tile(rough, (sum(map(len, paths)), 1)), 1.0)
+    estimator = StateEstimator(
         model=model,
         problem=problem,
         free=free,
-        n_substeps=enough_substeps(_as_fit(problem, paths, free, rough, rough)),
+        n_substeps=enough_substeps(_fit_of(problem, problem.records, paths, free, level)),
         per_period=_per_period(own, names),
         noise=_noise_of(problem, rough, 0.1 * rough),
     )
     watch = as_progress(progress)
     for _ in count_pieces(watch, range(N_PASSES), "pass", "errors of the model, for forecasts"):
-        tracker, paths = _with_likely_noise(tracker, paths)
-    return tracker
+        estimator, paths = _with_likely_noise(estimator, paths)
+    return estimator
 
 
 @one_thread()
@@ -239,7 +212,7 @@ def estimate_states(
 
     The states follow the model but for random pushes, and the samples but for noise; the sizes of
     both are the likeliest ones for this record (Kalman smoothing, iterated).
-    run: has the inputs and some states of the model. measured: as for `track`.
+    run: has the inputs and some states of the model. measured: as for `tune_estimator`.
     Raises ValueError for a run without any state of the model, or a state that the model cannot
     tell from the others.
 
@@ -251,42 +224,36 @@ def estimate_states(
     True
     """
     record = trajectory_of(run)
-    return track(model, record, measured=measured).along(record)
+    return tune_estimator(model, record, measured=measured).smooth(record)
 
 
 def _with_likely_noise(
-    tracker: Tracker, paths: Sequence[np.ndarray]
-) -> tuple[Tracker, list[np.ndarray]]:
-    """The tracker with the most likely noise about the states, and these states, by stretch."""
-    samples, process = tracker.scaled_noise()
-    pairs = zip(tracker.problem.records, paths, strict=True)
-    found = [(each, tracker.approach(each, path, samples, process)) for each, path in pairs]
-    paths = [path for _, path in found]
-    n = tracker.n_substeps
-    fit = _as_fit(tracker.problem, paths, tracker.free, samples, process, n_substeps=n)
-    level, _ = likely_errors(fit)
-    noise = _noise_of(tracker.problem, level.noise[0], level.process_noise)
-    return replace(tracker, noise=noise), paths
+    estimator: StateEstimator, paths: Sequence[np.ndarray]
+) -> tuple[StateEstimator, list[np.ndarray]]:
+    """The estimator with the most likely noise about the states, and these states, by stretch."""
+    records = estimator.problem.records
+    paths = [estimator.fit_path(*pair).path for pair in zip(records, paths, strict=True)]
+    samples, process = estimator.scaled_noise()
+    level = Level(np.tile(samples, (sum(map(len, paths)), 1)), 1.0, estimator.n_substeps, process)
+    found, _ = likely_errors(_fit_of(estimator.problem, records, paths, estimator.free, level))
+    noise = _noise_of(estimator.problem, found.noise[0], found.process_noise)
+    return replace(estimator, noise=noise), paths
 
 
-def _as_fit(
+def _fit_of(
     problem: EstimationProblem,
+    records: Sequence[ScaledRecord],
     paths: Sequence[np.ndarray],
     free: np.ndarray,
-    samples: np.ndarray,
-    process: np.ndarray,
-    *,
-    n_substeps: int = 1,
+    level: Level,
 ) -> TrajectoryFit:
-    """Paths of all records as a fit under errors of these sizes."""
-    path = np.concatenate(paths)
-    level = Level(np.tile(samples, (len(path), 1)), 1.0, n_substeps, process)
-    return TrajectoryFit(problem, level, path, free, np.ones(len(free), dtype=np.bool_))
+    """A fit of these paths, whose coefficients stay as they are.
 
-
-def _variances(n: int, samples: np.ndarray, process: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Variances of n samples and of the pushes between them."""
-    return np.tile(np.square(samples), (n, 1)), np.tile(np.square(process), (n - 1, 1))
+    Clipped and rounded samples are taken as they are: forecasts are compared with them.
+    """
+    problem = replace(problem, records=tuple(replace(each, limits=None) for each in records))
+    fixed = np.zeros(len(free), dtype=np.bool_)
+    return TrajectoryFit(problem, level, np.concatenate(paths), free, fixed)
 
 
 def _noise_of(problem: EstimationProblem, samples: np.ndarray, process: np.ndarray) -> ModelNoise:
