@@ -15,10 +15,11 @@ from ep2sindy.estimation.explanation import explain
 from ep2sindy.estimation.likelihood import Gram, gram
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import WEIGHED_AT, Solution, at_level, from_smooth
-from ep2sindy.estimation.supports import inverse_of, term_prices
+from ep2sindy.estimation.supports import term_prices
 from ep2sindy.estimation.working_set import first_set
 from ep2sindy.regression import searches
 from ep2sindy.regression.exchanges import exchanged_supports
+from ep2sindy.regression.least_squares import invert_gram
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System
 from tests.models import model_of
@@ -181,7 +182,7 @@ def test_small_libraries_are_weighed_whole() -> None:
 
 def exact_gains(pair: Gram, support: np.ndarray) -> np.ndarray:
     """Fall of the quadratic function of all coefficients by each one beside a support."""
-    inverse = inverse_of(pair.quadratic[np.ix_(support, support)])
+    inverse = invert_gram(pair.quadratic[np.ix_(support, support)])
     share = pair.quadratic[:, support] @ inverse
     own = np.diag(pair.quadratic) - np.einsum("js,js->j", share, pair.quadratic[:, support])
     score = pair.linear - share @ pair.linear[support]

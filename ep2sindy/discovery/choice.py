@@ -22,6 +22,7 @@ from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
@@ -317,14 +318,13 @@ def reweight(
     the truth.
     """
     theta, target, scale = _whitened_terms(problem, candidate, n_steps=n_steps)
-    upper = np.linalg.qr(theta, mode="r")
-    root = np.linalg.inv(upper) * scale[:, None]
-    fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
-    left = _compare_with_noise(target - theta @ fitted, n_free=len(scale))
+    fit = LeastSquares.of_rows(theta, target)
+    root = fit.root * scale[:, None]
+    left = _compare_with_noise(target - theta @ fit.coef, n_free=len(scale))
     return EquationFit(
         equation=candidate.equation,
         terms=candidate.terms,
-        coef=fitted * scale,
+        coef=fit.coef * scale,
         covariance=root @ root.T if left.leaves_noise else None,
         left=left,
     )
@@ -333,7 +333,7 @@ def reweight(
 def _left_of_terms(problem: RegressionRows, fit: EquationFit) -> LeftOver:
     """Residuals of a fit's terms, fitted again with weights as by `reweight`."""
     theta, target, _ = _whitened_terms(problem, fit, negligible=NEGLIGIBLE)
-    fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
+    fitted = LeastSquares.of_rows(theta, target).coef
     return _compare_with_noise(target - theta @ fitted, n_free=len(fitted))
 
 

@@ -37,8 +37,9 @@ from ep2sindy.estimation.solver import (
     settle,
     smoothed,
 )
-from ep2sindy.estimation.supports import N_BEST, inverse_of, term_prices
+from ep2sindy.estimation.supports import N_BEST, term_prices
 from ep2sindy.regression.exchanges import exchanged_supports
+from ep2sindy.regression.least_squares import invert_gram
 
 # rho of the first set: the state nearly free, or quite. One alone leaves out more true terms.
 WARM = (0.3, 3.0)
@@ -243,7 +244,7 @@ def _gains(
     terms, std = _integrals(problem, fit.paths), joined(level.noise)
     score = np.square(terms.T @ ((flow.ends - joined(fit.paths)[1:]) / level.process))
     with_states, with_all = np.zeros_like(score), np.zeros_like(score)
-    rng, inverse = np.random.default_rng(0), inverse_of(quadratic)
+    rng, inverse = np.random.default_rng(0), invert_gram(quadratic)
     for _ in range(N_PROBES):
         noise = std * rng.standard_normal(std.shape)
         without = _weighted_misses(part, fit, level, flow, noise, np.zeros(len(inverse)))

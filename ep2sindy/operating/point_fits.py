@@ -36,6 +36,7 @@ from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
 from ep2sindy.regression.constrained import WeightedEquation, constrained_fit, weighted_equations
+from ep2sindy.regression.least_squares import invert_gram
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Workers, collect
@@ -307,7 +308,7 @@ def resample_coefficients(
         dtype=np.float64,
     )
     grams = np.tensordot(counts, sums, axes=1)
-    z = np.linalg.solve(grams[:, :-1, :-1], grams[:, :-1, -1:])[:, :, 0]
+    z = (invert_gram(grams[:, :-1, :-1]) @ grams[:, :-1, -1:])[:, :, 0]
     z *= scale[-1] / scale[:-1]
     return (z - z.mean(axis=0) + coef[constraint.free]) @ constraint.C.T + constraint.d
 

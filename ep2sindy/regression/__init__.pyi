@@ -8,3 +8,4 @@ from ep2sindy.regression.front import pareto_front as pareto_front
 from ep2sindy.regression.front import ParetoFront as ParetoFront
 from ep2sindy.regression.front import Candidate as Candidate
 from ep2sindy.regression.bootstraps import pooled_supports as pooled_supports
+from ep2sindy.regression.least_squares import LeastSquares as LeastSquares

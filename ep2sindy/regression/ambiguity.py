@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.library import Library
 from ep2sindy.regression.gram_kernels import independent_terms
+from ep2sindy.regression.least_squares import LeastSquares, invert_gram
 from ep2sindy.regression.rows import RegressionRows
 
 # Bounds on one minus the cosine between two columns: at 1e-10 they differ by 1e-5 of their size.
@@ -186,10 +187,10 @@ def _combinations(
     found = []
     for rank in np.flatnonzero(~independent):
         basis = np.sort(columns[:rank][independent[:rank]])
-        weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, columns[rank]])
+        weights = invert_gram(xx[np.ix_(basis, basis)]) @ xx[basis, columns[rank]]
         if (np.abs(weights) > 1e-6).sum() > MAX_PARTS:
             # The Gram matrix has lost half the digits; a fit on the rows may need fewer parts.
             values = theta()
-            weights = np.linalg.lstsq(values[:, basis], values[:, columns[rank]], rcond=None)[0]
+            weights = LeastSquares.of_rows(values[:, basis], values[:, columns[rank]]).coef
         found.append((int(columns[rank]), basis[np.abs(weights) > 1e-6].tolist()))
     return found

@@ -9,10 +9,10 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.relations import ROUNDING, Constraint, place_of
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.bootstraps import Resamples
+from ep2sindy.regression.least_squares import LeastSquares, invert_gram
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.whitening import WhitenedRows, whitened_rows
 
@@ -95,10 +95,7 @@ def constrained_draws(
         weighted = (inverse * constraint.C[equation.at]).transpose(0, 2, 1) / equation.std**2
         normal = normal + weighted @ gram @ (inverse * constraint.C[equation.at])
         right = right + weighted @ (drawn.xy[:, number, own, None] - gram @ known)
-    size = np.sqrt(np.diagonal(normal, axis1=1, axis2=2))[:, :, None]
-    size = np.where(size > 0.0, size, 1.0)
-    inverted = np.linalg.pinv(normal / size / size.transpose(0, 2, 1), hermitian=True)
-    free = inverted @ (right / size) / size
+    free = invert_gram(normal) @ right
     return free[:, :, 0] @ constraint.C.T + constraint.d
 
 
@@ -190,19 +187,19 @@ def _fit_alone(
     problem: RegressionRows, number: int, at: np.ndarray, terms: np.ndarray
 ) -> WeightedEquation:
     theta, target = problem.train_theta[:, terms], problem.train_target(number)
-    start = np.linalg.lstsq(theta, target, rcond=None)[0]
-    variance = np.square(target - theta @ start).sum() / max(len(target) - len(terms), 1)
+    fit = LeastSquares.of_rows(theta, target)
+    variance = fit.squares / max(len(target) - len(terms), 1)
     least = MIN_RESIDUAL**2 * np.square(target).mean()
     if problem.noisy is not None:
-        white = _whiten(problem, terms, start, n_steps=8)
+        white = _whiten(problem, terms, fit.coef, n_steps=8)
         problem = replace(problem, noisy=replace(problem.noisy, smoothed=white.corrected))
-        start = np.linalg.lstsq(white.theta[:, terms], white.target, rcond=None)[0]
+        fit = LeastSquares.of_rows(white.theta[:, terms], white.target)
     return WeightedEquation(
         problem=problem,
         number=number,
         at=at,
         terms=terms,
-        start=start * problem.coef_scale(number)[terms],
+        start=fit.coef * problem.coef_scale(number)[terms],
         std=float(np.sqrt(max(variance, least))) or 1.0,
     )
 
@@ -224,45 +221,11 @@ def _solve(
             terms, slope = equation.rows(coef[equation.at])
             theta = np.concatenate([theta, terms @ C[equation.at]])
             target = np.concatenate([target, slope - terms @ d[equation.at]])
-        names = [constraint.coefficients[k] for k in constraint.free]
-        z, root, variance = _least_squares(theta, target, bounds, names)
-        coef = constraint.coef(z)
-    return coef, C @ root @ (C @ root).T * (1.0 if all(noisy) else variance)
-
-
-def _least_squares(
-    theta: Float[np.ndarray, "rows free"],
-    target: Float[np.ndarray, " rows"],
-    bounds: Float[np.ndarray, "2 free"],
-    names: Sequence[tuple[str, str]],
-) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"], float]:
-    """Coefficients, a root of their covariance for rows of variance 1, and the rows' variance."""
-    from scipy.optimize import lsq_linear  # import takes 0.5 s; most searches do not need it
-
-    n = theta.shape[1]
-    if not n:  # nothing is free
-        return np.zeros(0), np.zeros((0, 0)), float(target @ target / max(len(target), 1))
-    norms, size = column_norms(theta), np.linalg.norm(target) or 1.0
-    columns = np.column_stack([theta / norms, target / size])
-    triangle = np.asarray(np.linalg.qr(columns, mode="r"))
-    upper = triangle[:n, :n]
-    _, singular, directions = np.linalg.svd(upper)
-    vanishing = directions[singular <= ROUNDING * singular.max(initial=0.0)]
-    if len(vanishing):
-        part = (np.abs(vanishing) > 1e-3).any(axis=0)
-        joined = [name for name, is_part in zip(names, part, strict=True) if is_part]
-        raise ValueError(f"coefficients must be independent to be fitted: {joined} are not")
-    solution = lsq_linear(
-        upper,
-        triangle[:n, n],
-        bounds=bounds * norms / size,
-        method="bvls",
-        max_iter=10 * n + 10,
-    )
-    assert solution.success
-    loose = solution.active_mask == 0
-    root = np.zeros((n, n))
-    root[loose] = np.linalg.pinv(upper[:, loose])
-    squares = np.square(triangle[n:, n]).sum() + np.square(solution.fun).sum()
-    variance = squares * size**2 / max(len(target) - loose.sum(), 1)
-    return solution.x * size / norms, root / norms[:, None], float(variance)
+        fit = LeastSquares.of_rows(theta, target, bounds)
+        if not fit.is_determined:
+            names = [constraint.coefficients[k] for k in constraint.free[fit.dependent]]
+            raise ValueError(f"coefficients must be independent to be fitted: {names} are not")
+        coef = constraint.coef(fit.coef)
+    root, n_free = C @ fit.root, np.count_nonzero(~fit.held)
+    variance = 1.0 if all(noisy) else fit.squares / max(len(target) - n_free, 1)
+    return coef, root @ root.T * variance

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.regression.gram_kernels import DEPENDENT
+from ep2sindy.regression.least_squares import invert_gram
 
-DEPENDENT = 1e-10  # share of a column's square that the chosen terms leave, if it depends on them
 ROUNDING = 1e-14  # of the target's square: a smaller residual is rounding
 MAX_EXCHANGES = 50  # at one size; a handful is usual
 
@@ -96,7 +97,7 @@ def _best_with_one_less(
 ) -> tuple[frozenset[int], float]:
     """The support without the term whose loss costs least, and the residual."""
     terms = sorted(support)
-    inverse = np.linalg.pinv(xx[:, terms][:, :, terms], rcond=DEPENDENT, hermitian=True)
+    inverse = invert_gram(xx[:, terms][:, :, terms])
     coef = np.einsum("pst,pt->ps", inverse, xy[:, terms])
     losses = np.square(coef) / zero_to_one(np.einsum("pss->ps", inverse))
     left = yy - np.einsum("ps,ps->p", coef, xy[:, terms])
@@ -121,7 +122,7 @@ def _residuals_with(
     Of several problems it is the sum of the residuals' logarithms.
     """
     columns, target = xx[:, :, chosen], xy[:, chosen]
-    inverse = np.linalg.pinv(columns[:, chosen], rcond=DEPENDENT, hermitian=True)
+    inverse = invert_gram(columns[:, chosen])
     share = columns @ inverse
     square = np.einsum("pjj->pj", xx)
     own = square - np.einsum("pjs,pjs->pj", share, columns)

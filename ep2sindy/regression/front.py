@@ -13,13 +13,11 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
-from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, solve_masks
+from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
+from ep2sindy.regression.least_squares import fit_masks_to_rows
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
-
-# Correction of coefficients, as a share of them, after which another one would be rounding.
-REFINED = 1e-9
 
 ROWS_AT_ONCE = 4096  # rows whose residuals, of all fits, are held at once
 
@@ -362,22 +360,14 @@ def _fit(
     masks: Bool[np.ndarray, "supports terms"],
     about_mean: Spread,
 ) -> RowFits:
-    """Fit every support to the training rows, and score it on both training and held-out rows.
-
-    The Gram matrix squares the condition number of the rows, so its solution is refined with the
-    residuals of the rows themselves (Bjorck 1996, Numerical Methods for Least Squares, 2.9.3).
-    """
+    """Fit every support to the training rows, and score it on both training and held-out rows."""
     gram = problem.train_gram
-    xx = gram.xx[0]
-    coef = fit_masks(xx, gram.xy[0, equation], masks)
-    for _ in range(2):
+
+    def residuals(coef: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         left = np.zeros_like(coef)
-        squares = _residual_squares(problem, equation, coef, test=False, products=left)
-        step = solve_masks(xx, left, masks)
-        coef += step
-        squares -= (step * (2.0 * left - step @ xx)).sum(axis=1)  # what the step explains
-        if not (np.abs(step) > REFINED * np.abs(coef).max(axis=1, keepdims=True)).any():
-            break  # the next step would be as much smaller again
+        return _residual_squares(problem, equation, coef, test=False, products=left), left
+
+    coef, squares = fit_masks_to_rows(gram.xx[0], gram.xy[0, equation], masks, residuals)
     r2_train = r2_of(squares, spread=about_mean.train)
     if np.isnan(about_mean.test):
         return RowFits(coef, r2_train, np.full(len(coef), np.nan))

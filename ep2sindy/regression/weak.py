@@ -17,6 +17,7 @@ from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.model.inputs import plausible_courses
 from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
@@ -253,7 +254,7 @@ class WeightedWeak:
         everything = usable_terms(problem)
         coef = np.zeros(len(problem.library))
         theta, target = problem.train_theta[:, everything], problem.train_target(0)
-        coef[everything] = np.linalg.lstsq(theta, target)[0]
+        coef[everything] = LeastSquares.of_rows(theta, target).coef
         white = whitened_rows(problem, everything, coef, n_steps=self.n_steps)
         # Whitened rows are in standard deviations; rescale to about the unit of the derivative.
         size = 1.0 / np.linalg.norm(white.target)

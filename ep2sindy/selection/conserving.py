@@ -17,6 +17,7 @@ from ep2sindy.refinement.refine import with_coef
 from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.gram_kernels import fit_masks
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
 from ep2sindy.selection.systems import Systems, TrialSystem, broken_demands
@@ -93,7 +94,7 @@ def _joint_rows(
             fixed = np.array([known.get((state, term), 0.0) for term in library.names])
             target = problem.train_target(k)
             theta = problem.train_theta
-            left = target - theta @ np.linalg.lstsq(theta, target, rcond=None)[0]
+            left = target - theta @ LeastSquares.of_rows(theta, target).coef
             std = max(float(left.std()), MIN_RESIDUAL * float(np.sqrt(np.square(target).mean())))
             theta = theta / problem.coef_scale(k) / std
             columns.append(theta @ shares)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.library.library import Library
 from ep2sindy.regression.front import ParetoFront
+from ep2sindy.regression.least_squares import LeastSquares, fit_masks_to_rows
 from ep2sindy.regression.whitening import whitened_rows
 
 # Least residual squares, as a share of the target's squares: below this value a criterion would
@@ -113,10 +114,17 @@ def _fits(
     # R of the QR factors holds all that least squares needs, without squaring the condition number.
     triangle = np.asarray(np.linalg.qr(np.column_stack([theta, target]), mode="r"))
     columns, right = triangle[:, :-1], triangle[:, -1]
-    coef = np.zeros(masks.shape)
-    for fit, mask in zip(coef, masks, strict=True):
-        fit[mask] = np.linalg.lstsq(columns[:, mask], right)[0]
-    return np.square(right - coef @ columns.T).sum(axis=1), coef
+
+    def residuals(coef: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        left = right - coef @ columns.T
+        return np.square(left).sum(axis=1), left @ columns
+
+    coef, squares = fit_masks_to_rows(columns.T @ columns, columns.T @ right, masks, residuals)
+    for k in np.flatnonzero(np.isnan(squares)):  # weights have made its terms dependent
+        fit = LeastSquares.of_rows(columns[:, masks[k]], right)
+        coef[k], squares[k] = 0.0, fit.squares
+        coef[k, masks[k]] = fit.coef
+    return squares, coef
 
 
 @dataclass(frozen=True)
