@@ -8,11 +8,11 @@ import pytest
 from ep2sindy.regression.bootstraps import (
     Bootstraps,
     Resamples,
-    moving_block_counts,
+    count_block_draws,
     pool,
 )
-from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, solve_masks
-from ep2sindy.regression.least_squares import LeastSquares, invert_gram
+from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, invert_gram, solve_masks
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.searches import STLSQ
 
 
@@ -43,7 +43,7 @@ def test_draws_are_those_of_plain_calls_of_the_generator(block: int) -> None:
         np.testing.assert_array_equal(count, np.bincount(rows, minlength=60))
         culled = rng.permutation([0, 1, 3, 4])[:2]
         assert own.tolist() == [t and k not in culled for k, t in enumerate(terms.tolist())]
-    one = moving_block_counts(60, n_drawn=13, block=block, rng=np.random.default_rng(5))
+    one = count_block_draws(60, n_drawn=13, block=block, rng=np.random.default_rng(5))
     first = np.random.default_rng(5).integers(60 - block + 1, size=-(-13 // block))
     rows = (first[:, None] + np.arange(block)).ravel()[:13]
     np.testing.assert_array_equal(one, np.bincount(rows, minlength=60))

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory, spread_blocks
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library
@@ -26,16 +27,10 @@ from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.whitening import NEGLIGIBLE, whitened_rows
+from ep2sindy.regression.whitening import NEGLIGIBLE, whiten_rows
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.rule import (
-    Decision,
-    OtherSystem,
-    Selection,
-    SystemSelection,
-    best_first,
-    support_of,
-)
+from ep2sindy.selection.combinations import best_first, support_of
+from ep2sindy.selection.rule import Decision, OtherSystem, Selection
 
 # Most combinations, of the fronts that relations tie together, to look at for one with the terms.
 MAX_COMBINATIONS = 100_000
@@ -127,23 +122,24 @@ class Choice:
 def choose(
     fronts: Sequence[ParetoFront],
     rule: Selection,
-    relations: Sequence[Relation] = (),
+    task: Task,
     *,
-    units: Mapping[str, str],
     provenance: Mapping[str, str],
     progress: Progress = SILENT,
 ) -> Choice:
     """Select from the candidates of a regression, and fit: constrained, weighted or unchanged.
 
-    Under relations, only combinations that have the terms of the relations count. The one of least
-    summed score wins, and all equations are fitted at once.
+    A rule that runs whole systems has fitted the winner. For any other, under relations, only
+    combinations that have the terms of the relations count. The one of least summed score wins,
+    and all equations are fitted at once.
     Raises ValueError for relations that no combination has the terms for, or that tie so many
     states to each other that their combinations exceed a million.
     """
-    library = fronts[0].rows.library
-    with progress.stage(None, "", f"candidates by {rule.label}"):
-        scores = rule.scores(fronts)
-    scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
+    decision = rule.decide(fronts, task, progress=progress)
+    if decision.model is not None:
+        return choice_of(fronts, decision, task.runs, provenance=provenance)
+    library, relations, units = fronts[0].rows.library, task.relations, task.runs[0].units
+    scored = [front.with_scores(s) for front, s in zip(fronts, decision.scores, strict=True)]
     if relations:
         place = _least_sum(scored, relations)
         support = support_of(scored, place)
@@ -162,24 +158,6 @@ def choose(
     return Choice(scored, best, model, left=left)
 
 
-def choose_by_runs(
-    fronts: Sequence[ParetoFront],
-    rule: SystemSelection,
-    relations: Sequence[Relation] = (),
-    *,
-    library: Library,
-    runs: Sequence[Trajectory],
-    provenance: Mapping[str, str],
-    progress: Progress = SILENT,
-) -> Choice:
-    """Select among systems of candidates by a rule that integrates them and refines the winner.
-
-    Raises ValueError for relations that no combination has the terms for.
-    """
-    decision = rule.decide(fronts, library, runs, relations, progress=progress)
-    return choice_of(fronts, decision, runs, provenance=provenance)
-
-
 def choice_of(
     fronts: Sequence[ParetoFront],
     decision: Decision,
@@ -187,7 +165,8 @@ def choice_of(
     *,
     provenance: Mapping[str, str],
 ) -> Choice:
-    """The choice that a rule's decision makes, with its scores on the fronts."""
+    """The choice that the decision of a rule that runs systems makes, with its scores."""
+    assert decision.model is not None
     scored = [f.with_scores(s) for f, s in zip(fronts, decision.scores, strict=True)]
     model = replace(decision.model, units=runs[0].units, provenance=provenance)
     best = [front.best for front in scored]
@@ -364,7 +343,7 @@ def _whitened_terms(
     coef = np.zeros(len(terms))
     order = [problem.library.index(name) for name in candidate.terms]
     coef[order] = candidate.coef / scale[order]
-    rows = whitened_rows(problem, terms, coef, n_steps=n_steps, negligible=negligible, kept=terms)
+    rows = whiten_rows(problem, terms, coef, n_steps=n_steps, negligible=negligible, kept=terms)
     return rows.theta[:, order], rows.target, scale[order]
 
 

@@ -44,7 +44,6 @@ from ep2sindy.runtime.parallel import Once, at_once
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.embedding import (
     HARMONICS,
     AnyEmbedding,
@@ -279,7 +278,7 @@ class SignalSearch:
 
     def _found(self, chosen: Chosen, signal: str, seed: int, progress: Progress) -> Discovery:
         method, rule, known = self.method, self.method.selection, chosen.embedded
-        if isinstance(rule, SystemSelection):  # the measured signal is judged, not derived states
+        if rule.basis == "runs":  # the measured signal is judged, not derived states
             from ep2sindy.selection.free_run import (
                 FreeRunScore,  # loads torch, only for this rule
             )

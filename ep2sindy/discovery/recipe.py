@@ -9,7 +9,7 @@ from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.searches import Search
-from ep2sindy.selection.rule import Selection, SystemSelection
+from ep2sindy.selection.rule import Selection
 
 
 def regression_of(method: AnyMethod) -> Regression:
@@ -27,7 +27,7 @@ def method_of(
     formulation: Formulation,
     search: TrajectorySearch | Search,
     bootstraps: Bootstraps,
-    selection: SystemSelection | Selection,
+    selection: Selection,
     depth: int,
 ) -> AnyMethod:
     """The method for settings that are chosen one by one, such as the groups of a config.

@@ -17,7 +17,7 @@ from ep2sindy.estimation.flow import Flow
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, hessian
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 from ep2sindy.estimation.supports import PenalisedFit, best_support, penalise
-from ep2sindy.regression.least_squares import invert_gram
+from ep2sindy.regression.gram_kernels import invert_gram
 
 PAYS = 1.0  # least fall of squares plus prices, beyond the delays' own price
 SURE = 6.0  # standard errors of every delay: true ones of a sample show ten and more

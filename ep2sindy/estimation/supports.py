@@ -12,10 +12,9 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.likelihood import Gram, within_bounds
 from ep2sindy.estimation.problem import EstimationProblem
-from ep2sindy.regression.exchanges import exchanged_supports
-from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks
-from ep2sindy.regression.least_squares import invert_gram
-from ep2sindy.regression.searches import subsets_within
+from ep2sindy.regression.exchanges import exchange_terms
+from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, invert_gram
+from ep2sindy.regression.searches import search_subsets
 
 MAX_SWEEPS = 10  # over the equations; two or three usually suffice
 # Weight of the cost of choosing among terms. Below 0.5 there are more false terms than true ones
@@ -185,14 +184,14 @@ def _offer_supports(
     target = np.where(at_hand, xy / size, 0.0)
     problem_of_one = unit[None], (target / np.sqrt(yy))[None], np.ones(1)
     n_own = int(own.sum())
-    masks, proven = subsets_within(
+    masks, proven = search_subsets(
         *problem_of_one,
         max_terms=min(max_terms, PROVEN_TERMS, n_own),
         n_best=N_BEST,
         most_work=MOST_WORK,
     )
     if not proven or min(max_terms, n_own) > PROVEN_TERMS:
-        masks = exchanged_supports(*problem_of_one, max_terms=max_terms, n_best=N_BEST, known=masks)
+        masks = exchange_terms(*problem_of_one, max_terms=max_terms, n_best=N_BEST, known=masks)
     found = []
     for mask, gain in zip(masks, _gains(unit, target, masks), strict=True):
         support = kept.copy()

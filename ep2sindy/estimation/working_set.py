@@ -38,8 +38,8 @@ from ep2sindy.estimation.solver import (
     smoothed,
 )
 from ep2sindy.estimation.supports import N_BEST, term_prices
-from ep2sindy.regression.exchanges import exchanged_supports
-from ep2sindy.regression.least_squares import invert_gram
+from ep2sindy.regression.exchanges import exchange_terms
+from ep2sindy.regression.gram_kernels import invert_gram
 
 # rho of the first set: the state nearly free, or quite. One alone leaves out more true terms.
 WARM = (0.3, 3.0)
@@ -133,7 +133,7 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
             level = Level(start.noise, rho)
             quadratic, linear, offset = _own_squares(problem, start.paths, level, steps, block, own)
             size = np.sqrt(zero_to_one(np.diag(quadratic)))
-            masks = exchanged_supports(
+            masks = exchange_terms(
                 (quadratic / np.outer(size, size))[None],
                 (linear / size)[None],
                 np.array([offset]),

@@ -28,7 +28,7 @@ from ep2sindy.operating.shared_support import SharedDiscovery, SharedFront
 from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.least_squares import LeastSquares
-from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.regression.whitening import whiten_rows
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import words_of
 from ep2sindy.runtime.values import read_only
@@ -425,7 +425,7 @@ class _FreeFit:
         if problem.noisy is not None:
             coef = coef_matrix(problem.library, [candidate.coef_by_term])[:, 0] / scale
             mask = np.isin(problem.term_names, candidate.terms)
-            white = whitened_rows(problem, mask, coef, n_steps=N_STEPS)
+            white = whiten_rows(problem, mask, coef, n_steps=N_STEPS)
             theta, target = white.theta, white.target
         columns = [problem.library.index(name) for name in terms]
         theta = theta[:, columns]

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.library import Library
-from ep2sindy.regression.gram_kernels import independent_terms
-from ep2sindy.regression.least_squares import LeastSquares, invert_gram
+from ep2sindy.regression.gram_kernels import independent_terms, invert_gram
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
 
 # Bounds on one minus the cosine between two columns: at 1e-10 they differ by 1e-5 of their size.
@@ -76,14 +76,14 @@ def few_rows(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     return (Ambiguity((), message, True),)
 
 
-def simplest_first(library: Library) -> Int[np.ndarray, " terms"]:
+def order_by_degree(library: Library) -> Int[np.ndarray, " terms"]:
     """Terms by degree, and of one degree in the order of the library."""
     return np.argsort(library.degrees, kind="stable")
 
 
 def _distinct(library: Library, xx: Float[np.ndarray, "terms terms"]) -> Bool[np.ndarray, " terms"]:
     """Terms that are not zero and do not repeat a simpler one."""
-    order = simplest_first(library)
+    order = order_by_degree(library)
     distinct = np.diag(xx) > 0.0
     repeats = np.triu(np.abs(xx[np.ix_(order, order)]) > 1.0 - SAME, k=1)
     for first, second in order[np.argwhere(repeats)]:
@@ -116,7 +116,7 @@ def _all_usable(library: Library, xx: Float[np.ndarray, "terms terms"], same: fl
 
     same: 1 - |cosine| below which two terms are the same.
     """
-    squares, order = np.diag(xx), simplest_first(library)
+    squares, order = np.diag(xx), order_by_degree(library)
     if not (np.isfinite(xx).all() and (squares > 0.0).all()):
         return False
     apart = np.abs(xx - np.diag(squares)) <= 1.0 - same
@@ -133,7 +133,7 @@ def _zero(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambigu
 
 def _alike(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
     """Pairs of proportional terms, the simpler one first; a term left out is reported once."""
-    names, order = library.names, simplest_first(library)
+    names, order = library.names, order_by_degree(library)
     kept = _distinct(library, xx)
     cosines = np.abs(xx[np.ix_(order, order)])
     found = []
@@ -181,7 +181,7 @@ def _combinations(
     xx: Float[np.ndarray, "terms terms"],
 ) -> list[tuple[int, list[int]]]:
     """Distinct terms that depend on simpler ones, each with the indices of those terms."""
-    order = simplest_first(library)
+    order = order_by_degree(library)
     columns = order[_distinct(library, xx)[order]]
     independent = independent_terms(xx[np.ix_(columns, columns)])
     found = []

@@ -12,9 +12,10 @@ from jaxtyping import Float, Int
 from ep2sindy.library.relations import ROUNDING, Constraint, place_of
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.bootstraps import Resamples
-from ep2sindy.regression.least_squares import LeastSquares, invert_gram
+from ep2sindy.regression.gram_kernels import invert_gram
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.whitening import WhitenedRows, whitened_rows
+from ep2sindy.regression.whitening import WhitenedRows, whiten_rows
 
 # Lower bound on the residual, as a share of the target's RMS; it limits the weight of an equation
 # with an exact fit.
@@ -55,7 +56,7 @@ def constrained_fit(
         (place_of(library, names, state, term, f"the sign of {(state, term)}"), sign)
         for (state, term), sign in (signs or {}).items()
     ]
-    equations = weighted_equations(problems, constraint)
+    equations = weigh_equations(problems, constraint)
     coef, covariance = _solve(equations, constraint, _bounds(constraint, signed))
     for k, sign in signed:
         if sign * coef[k] <= ROUNDING * abs(constraint.d[k]):
@@ -76,7 +77,7 @@ def constrained_fit(
     )
 
 
-def constrained_draws(
+def fit_draws(
     problems: Sequence[RegressionRows], draws: Mapping[str, Resamples], constraint: Constraint
 ) -> Float[np.ndarray, "draws coefs"]:
     """Fit the free coefficients to all equations at once, in every bootstrap of their rows.
@@ -85,8 +86,9 @@ def constrained_draws(
     their residuals on all rows; the noise of samples is not corrected. A coefficient whose terms
     are zero in a draw is zero there. Returns all coefficients, in SI.
     """
-    normal, right = 0.0, 0.0
-    for equation in weighted_equations(problems, constraint):
+    n = len(constraint.free)
+    normal, right = np.zeros((1, n, n)), np.zeros((1, n, 1))
+    for equation in weigh_equations(problems, constraint):
         own, number = equation.terms, equation.number
         drawn = draws[equation.problem.equations[number]]
         scale = drawn.scale[:, own] * equation.problem.coef_scale(number)[own]
@@ -162,10 +164,10 @@ def _whiten(
 ) -> WhitenedRows:
     mask, full = np.zeros(len(problem.library), dtype=np.bool_), np.zeros(len(problem.library))
     mask[terms], full[terms] = True, coef
-    return whitened_rows(problem, mask, full, n_steps=n_steps, kept=mask)
+    return whiten_rows(problem, mask, full, n_steps=n_steps, kept=mask)
 
 
-def weighted_equations(
+def weigh_equations(
     problems: Sequence[RegressionRows], constraint: Constraint
 ) -> list[WeightedEquation]:
     """The constraint's equations that depend on at least one free coefficient."""
@@ -226,6 +228,6 @@ def _solve(
             names = [constraint.coefficients[k] for k in constraint.free[fit.dependent]]
             raise ValueError(f"coefficients must be independent to be fitted: {names} are not")
         coef = constraint.coef(fit.coef)
-    root, n_free = C @ fit.root, np.count_nonzero(~fit.held)
+    root, n_free = C @ fit.root, int((~fit.held).sum())
     variance = 1.0 if all(noisy) else fit.squares / max(len(target) - n_free, 1)
     return coef, root @ root.T * variance

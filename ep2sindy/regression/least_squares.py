@@ -1,8 +1,7 @@
 """Least squares on a support: coefficients, their covariance, and one rule of rank for all routes.
 
-A support is fitted from its rows (`LeastSquares`), from Gram matrices (`invert_gram`), or, many
-supports at once, by the compiled form of the same rule (`gram_kernels`) refined on the rows
-(`fit_masks_to_rows`).
+A support is fitted from its rows (`LeastSquares`), or many at once by the compiled form of the same
+rule, from Gram matrices (`gram_kernels`), and refined on the rows (`fit_masks_to_rows`).
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.numbers import column_norms, zero_to_one
-from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, independent_terms, solve_masks
+from ep2sindy.data.numbers import column_norms
+from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, solve_masks
 
 # Correction of coefficients, as a share of them, after which another one would be rounding.
 REFINED = 1e-9
@@ -117,25 +116,6 @@ def _within(
     solution = lsq_linear(upper, right, bounds=bounds, method="bvls", max_iter=10 * len(free) + 10)
     assert solution.success
     return solution.x, solution.active_mask != 0
-
-
-def invert_gram(xx: Float[np.ndarray, "*draws n n"]) -> Float[np.ndarray, "*draws n n"]:
-    """Inverses of Gram matrices under the rule of `LeastSquares`: what is dependent stays out.
-
-    A column of zeros has zeros in the inverse. xx: of columns in any units.
-    """
-    size = np.sqrt(zero_to_one(np.maximum(np.diagonal(xx, axis1=-2, axis2=-1), 0.0)))
-    sizes = size[..., :, None] * size[..., None, :]
-    unit = xx / sizes
-    inverse = np.empty_like(unit)
-    for index in np.ndindex(unit.shape[:-2]):
-        one = unit[index]
-        inverse[index] = (
-            np.linalg.inv(one)
-            if independent_terms(one).all()
-            else np.linalg.pinv(one, rcond=DEPENDENT, hermitian=True)
-        )
-    return inverse / sizes
 
 
 def fit_masks_to_rows(

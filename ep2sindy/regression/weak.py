@@ -21,7 +21,7 @@ from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
-from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.regression.whitening import whiten_rows
 from ep2sindy.regression.windows import Windows
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
@@ -217,13 +217,22 @@ def _noisy_rows(
 class WeightedWeak:
     """Weak rows that are whitened under the whole library: the best rows for a search in noise.
 
-    The rows of `weak` are weighted by their covariance, and linearised about samples corrected in
-    `n_steps` steps with all terms, so that no support is favoured. The residual of a support then
-    measures its likelihood, and the true support is the best of its size far more often
-    (docs/benchmark.md). The noise of the samples is assumed white, and the law in the library:
-    fast dynamics that no term describes would be taken for noise. Rows are in the unit of the
-    derivative, up to a factor.
+        r = L^-1 (y - X b), L L^T = C the covariance of y - X b by the noise of the samples
+
+    Here y and X are the rows of `weak`, and b the coefficients of all terms. They are weighted by
+    their covariance, and linearised about samples corrected in `n_steps` steps with all terms, so
+    that no support is favoured. The residual of a support then measures its likelihood, and the
+    true support is the best of its size far more often (docs/benchmark.md). The noise of the
+    samples is assumed white, and the law in the library: fast dynamics that no term describes would
+    be taken for noise. Rows are in the unit of the derivative, up to a factor.
     Raises ValueError for held-out rows, which the weights do not include.
+    Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance.
+
+    >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
+    >>> library, rng = ep.polynomial(["x", "y"], degree=2), np.random.default_rng(0)
+    >>> rows, _ = ep.WeightedWeak().assemble([run], library, rng=rng)
+    >>> ep.regression.fit_support(rows, "x", ["x", "x*y"]).coef.round(2).tolist()
+    [0.67, -1.0]
     """
 
     weak: Weak = field(default_factory=lambda: Weak(split=RandomSplit(0.0)))
@@ -255,7 +264,7 @@ class WeightedWeak:
         coef = np.zeros(len(problem.library))
         theta, target = problem.train_theta[:, everything], problem.train_target(0)
         coef[everything] = LeastSquares.of_rows(theta, target).coef
-        white = whitened_rows(problem, everything, coef, n_steps=self.n_steps)
+        white = whiten_rows(problem, everything, coef, n_steps=self.n_steps)
         # Whitened rows are in standard deviations; rescale to about the unit of the derivative.
         size = 1.0 / np.linalg.norm(white.target)
         return replace(
