@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import islice
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,7 +28,7 @@ from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.whitening import NEGLIGIBLE, whiten_rows
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.combinations import best_first, support_of
+from ep2sindy.selection.combinations import cheapest_first, support_of
 from ep2sindy.selection.rule import Decision, OtherSystem, Selection
 
 # Most combinations, of the fronts that relations tie together, to look at for one with the terms.
@@ -369,13 +368,8 @@ def _least_sum(
         tied = [k for k, front in enumerate(fronts) if front.equation in states]
         some = [fronts[k] for k in tied]
         own = [r for r in relations if any(state in states for _, state, _ in r.factors)]
-        order = [np.argsort(front.scores, kind="stable") for front in some]
-        ranked = best_first([f.scores[places] for f, places in zip(some, order, strict=True)])
-        tries = (
-            np.array([places[k] for places, k in zip(order, choice, strict=True)])
-            for choice in islice(ranked, MAX_COMBINATIONS)
-        )
-        best = next((t for t in tries if binding(own, support_of(some, t)) is not None), None)
+        scores = [front.scores for front in some]
+        best = next(cheapest_first(some, scores, own, most_tried=MAX_COMBINATIONS), None)
         if best is None:
             raise ValueError(
                 f"the relations {[r.text for r in own]} name terms that none of the best "

@@ -190,9 +190,9 @@ def _shared_front(
     # A term that repeats another at one point may stand for it there, if they differ elsewhere.
     usable = np.any([usable_terms(problem) for problem in problems.values()], axis=0)
     masks = search.shared_supports(
-        np.stack([gram.xx[0] * usable[:, None] * usable for gram in grams]),
-        np.stack([gram.xy[0, k] * usable for gram in grams]),
-        np.array([gram.yy[0, k] for gram in grams]),
+        np.stack([gram.xx * usable[:, None] * usable for gram in grams]),
+        np.stack([gram.xy[k] * usable for gram in grams]),
+        np.array([gram.yy[k] for gram in grams]),
     )
     fits = {
         p: fit_supports(each, equation, _keep_determined(each, masks))
@@ -220,7 +220,7 @@ def _keep_determined(
     found = masks.copy()
     for mask in found:
         columns = np.flatnonzero(mask)
-        mask[columns] = independent_terms(problem.train_gram.xx[0][np.ix_(columns, columns)])
+        mask[columns] = independent_terms(problem.train_gram.xx[np.ix_(columns, columns)])
     return found
 
 

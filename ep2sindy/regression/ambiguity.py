@@ -49,7 +49,7 @@ def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
 
     A term is simpler if its degree is lower, or if it is earlier in the library.
     """
-    xx = problem.train_gram.xx[0]
+    xx = problem.train_gram.xx
     if _all_usable(problem.library, xx, SAME):
         return np.ones(len(xx), dtype=np.bool_)
     usable = _distinct(problem.library, xx)
@@ -93,7 +93,7 @@ def _distinct(library: Library, xx: Float[np.ndarray, "terms terms"]) -> Bool[np
 
 def ambiguities(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     """All ambiguities between terms on the training rows."""
-    return find_ambiguities(problem.library, lambda: problem.train_theta, problem.train_gram.xx[0])
+    return find_ambiguities(problem.library, lambda: problem.train_theta, problem.train_gram.xx)
 
 
 def find_ambiguities(

@@ -246,8 +246,8 @@ def _rank(
     """
     equation, sizes = problem.equations.index(supports.equation), supports.masks.sum(axis=1)
     train, judge = problem.train_gram, _judging_gram(problem)
-    coef = fit_masks(train.xx[0], train.xy[0, equation], supports.masks)
-    explained = explained_squares(coef, judge.xx[0], judge.xy[0, equation])
+    coef = fit_masks(train.xx, train.xy[equation], supports.masks)
+    explained = explained_squares(coef, judge.xx, judge.xy[equation])
     order = np.lexsort((-explained, sizes))
     order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
     rank = np.arange(len(order)) - np.searchsorted(sizes[order], sizes[order])
@@ -268,7 +268,7 @@ def _cloud(
     """
     equation = problem.equations.index(supports.equation)
     spread = _squares_about_mean(problem, equation, test=bool(problem.test.any()))
-    errors = (_judging_gram(problem).yy[0, equation] - explained) / spread
+    errors = (_judging_gram(problem).yy[equation] - explained) / spread
     fitted = np.isfinite(errors)
     return Cloud(supports.masks.sum(axis=1)[fitted], errors[fitted])
 
@@ -282,7 +282,7 @@ def _fit(problem: RegressionRows, supports: Supports) -> list[Candidate]:
         left = np.zeros_like(coef)
         return _residual_squares(problem, equation, coef, test=False, products=left), left
 
-    coef, squares = fit_masks_to_rows(gram.xx[0], gram.xy[0, equation], masks, residuals)
+    coef, squares = fit_masks_to_rows(gram.xx, gram.xy[equation], masks, residuals)
     r2_train = r2_of(squares, spread=_squares_about_mean(problem, equation, test=False))
     r2_test = np.full(len(coef), np.nan)
     if problem.test.any():

@@ -135,19 +135,16 @@ class Weak:
         trajectories: Sequence[Trajectory],
     ) -> RegressionRows:
         name = runs[0].run.state_names[state]
-        parts = [run.rows(state) for run in runs]
-        test = np.concatenate([part.test for part in parts])
-        windows = Windows.joined([part.windows for part in parts])
-        n_segments = np.cumsum([0, *(run.segment[-1] + 1 for run in runs)])
+        parts, segments, tests = zip(*(run.rows(state) for run in runs), strict=True)
+        windows, test = Windows.joined(parts), np.concatenate(tests)
+        n_before = np.cumsum([0, *(run.segment[-1] + 1 for run in runs[:-1])])
         target = windows.slope @ np.concatenate([run.run.states[:, state] for run in runs])
         return RegressionRows(
             theta=windows.mean @ np.concatenate([run.terms for run in runs]),
             target=target[:, None],
             library=library,
             equations=(name,),
-            groups=np.concatenate(
-                [part.segment + n for part, n in zip(parts, n_segments[:-1], strict=True)]
-            ),
+            groups=np.concatenate([s + n for s, n in zip(segments, n_before, strict=True)]),
             test=test,
             trajectories=tuple(trajectories),
             noisy=_noisy_rows(name, runs, windows.taken(~test), target[~test])
@@ -173,27 +170,20 @@ class _Sampled:
     segment: Int[np.ndarray, " samples"]
     held_out: Bool[np.ndarray, " samples"]
 
-    def rows(self, state: int) -> _Rows:
-        """Windows that lie entirely in training segments, or entirely in held-out ones."""
+    def rows(
+        self, state: int
+    ) -> tuple[Windows, Int[np.ndarray, " rows"], Bool[np.ndarray, " rows"]]:
+        """Windows that lie entirely in training segments, or entirely in held-out ones.
+
+        With the segment of the middle of each, and which are held out.
+        """
         windows = self.windows[state]
         first, last = windows.first, windows.last
         n_held_out = np.append(0, np.cumsum(self.held_out))
         share = (n_held_out[last + 1] - n_held_out[first]) / (last + 1 - first)
         pure = (share == 0.0) | (share == 1.0)
-        return _Rows(
-            windows=windows.taken(pure),
-            segment=self.segment[(first + last) // 2][pure],
-            test=share[pure] == 1.0,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Rows of one state on one trajectory; segment: (rows,), that of the middle of the window."""
-
-    windows: Windows
-    segment: Int[np.ndarray, " rows"]
-    test: Bool[np.ndarray, " rows"]
+        segment = self.segment[(first + last) // 2]
+        return windows.taken(pure), segment[pure], share[pure] == 1.0
 
 
 def _noisy_rows(

@@ -33,15 +33,8 @@ def combinations(
     Memory grows with `most` alone, and at most TRIED times as many are looked at.
     Raises ValueError if none of these has the terms that the relations name.
     """
-    order = [_rank_candidates(front) for front in fronts]
-    ranks = best_first([np.arange(len(places), dtype=np.float64) for places in order])
-    kept = []
-    for choice in islice(ranks, TRIED * most):
-        place = np.array([places[rank] for places, rank in zip(order, choice, strict=True)])
-        if not relations or binding(relations, support_of(fronts, place)) is not None:
-            kept.append(place)
-        if len(kept) == most:
-            break
+    ranks = [_rank_candidates(front) for front in fronts]
+    kept = list(islice(cheapest_first(fronts, ranks, relations, most_tried=TRIED * most), most))
     if not kept:
         raise ValueError(
             f"the relations {[r.text for r in relations]} name terms that no combination of "
@@ -51,8 +44,24 @@ def combinations(
     return found[np.lexsort(found.T[::-1])]
 
 
-def _rank_candidates(front: ParetoFront) -> Int[np.ndarray, " _candidates"]:
-    """Places of the candidates of one front, the most promising first; by R2 if no rows were kept.
+def cheapest_first(
+    fronts: Fronts,
+    costs: Sequence[Float[np.ndarray, " _candidates"]],
+    relations: Sequence[Relation],
+    *,
+    most_tried: int,
+) -> Iterator[Int[np.ndarray, " fronts"]]:
+    """Choices with the terms that relations name, by the summed cost of their candidates."""
+    order = [np.argsort(cost, kind="stable") for cost in costs]
+    ranked = best_first([cost[places] for cost, places in zip(costs, order, strict=True)])
+    for choice in islice(ranked, most_tried):
+        place = np.array([places[rank] for places, rank in zip(order, choice, strict=True)])
+        if not relations or binding(relations, support_of(fronts, place)) is not None:
+            yield place
+
+
+def _rank_candidates(front: ParetoFront) -> Float[np.ndarray, " _candidates"]:
+    """Rank of each candidate in its front, the most promising first; by R2 if no rows were kept.
 
     Where rows are kept they are not ranked by R2: of rows that were fitted it rises with every
     term, so that the largest supports would come first.
@@ -60,7 +69,7 @@ def _rank_candidates(front: ParetoFront) -> Int[np.ndarray, " _candidates"]:
     costs = np.array([c.deviance for c in front.candidates], dtype=np.float64)
     if np.isnan(costs).any():  # of None: only a search of trajectories knows a deviance
         costs = front.errors if front.problem is None else EBIC().decide([front]).scores[0]
-    return np.argsort(costs, kind="stable")
+    return np.argsort(np.argsort(costs, kind="stable")).astype(np.float64)
 
 
 def best_first(costs: Sequence[Float[np.ndarray, " _"]]) -> Iterator[tuple[int, ...]]:
