@@ -20,9 +20,9 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.scores import r2
-from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.front import Candidate, fit_support, fit_supports, front_order
+from ep2sindy.regression.front import Candidate, fit_support, fit_supports, order_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, Search
 from ep2sindy.runtime.parallel import Loky
@@ -107,12 +107,12 @@ def counted(making: Making, number: int, noise: float) -> dict[str, float]:
     (problem,) = rows.assemble(runs, lorenz().model.library, rng=rng)
     bootstraps = Bootstraps(n=making.n_bootstraps)
     led, proposed = {}, []
-    for supports in pooled_supports(problem, making.search, bootstraps, rng=rng):
+    for supports in pool_supports(problem, making.search, bootstraps, rng=rng):
         truth = TRUTH[supports.equation]
         candidates = fit_supports(problem, supports.equation, supports.masks)
         sizes = supports.masks.sum(axis=1)
         right = [set(candidate.terms) == truth for candidate in candidates]
-        leading = front_order(sizes, errors(problem, candidates, making), depth=1)
+        leading = order_front(sizes, errors(problem, candidates, making), depth=1)
         led[f"{supports.equation}'"] = float(any(right[k] for k in leading))
         proposed.append(any(right))
     fitted = fit_support(problem, "y", sorted(TRUTH["y"])).coef_by_term["y"]

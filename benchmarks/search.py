@@ -32,7 +32,7 @@ from threadpoolctl import threadpool_limits
 import ep2sindy as ep
 from benchmarks.timing import cpu_s
 from ep2sindy.model.runge_kutta import step
-from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.front import ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
@@ -47,7 +47,7 @@ N_ALPHAS = {
 
 
 def ours(problem: RegressionRows, rng: np.random.Generator) -> list[ParetoFront]:
-    supports = pooled_supports(problem, AdaptiveLasso(), BOOTSTRAPS, rng=rng)
+    supports = pool_supports(problem, AdaptiveLasso(), BOOTSTRAPS, rng=rng)
     return [pareto_front(problem, found) for found in supports]
 
 

@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
-from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
 from ep2sindy.regression.front import ParetoFront, pareto_front
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.weak import WeightedWeak
@@ -45,7 +45,7 @@ def judged(number: int, *, name: str, noise: float, rules: Sequence[str]) -> dic
     fronts: list[ParetoFront] = [
         pareto_front(problem, found, depth=2)
         for problem in WeightedWeak().assemble(runs, system.model.library, rng=rng)
-        for found in pooled_supports(
+        for found in pool_supports(
             problem, BestSubset(max_terms=4, n_best=2), Bootstraps(n=0), rng=rng
         )
     ]
@@ -57,7 +57,7 @@ def judged(number: int, *, name: str, noise: float, rules: Sequence[str]) -> dic
     row = {"on the front": float(there)}
     for rule in rules if there else ():
         begin = time.process_time()
-        scores = RULES[rule].scores(fronts)
+        scores = RULES[rule].decide(fronts).scores
         row[f"{rule}, s"] = time.process_time() - begin
         chosen = [set(f.with_scores(s).best.terms) for f, s in zip(fronts, scores, strict=True)]
         row[rule] = float(chosen == truth)

@@ -13,7 +13,7 @@ from ep2sindy.library.relations import relations_of
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.weak import Weak, WeightedWeak
-from ep2sindy.selection.rule import best_first, combinations, left_out, support_of
+from ep2sindy.selection.combinations import best_first, combinations, describe_left_out, support_of
 from ep2sindy.systems.systems import lorenz
 
 
@@ -44,14 +44,14 @@ def test_the_first_of_eight_to_the_twelfth_choices_need_no_others() -> None:
     places = combinations(fronts, 13)
     assert places.sum() == 12
     note = "; the 13 most promising of 68719476736 combinations were tried"
-    assert left_out(fronts, 13, 13) == note
+    assert describe_left_out(fronts, 13, 13) == note
 
 
 def test_below_the_cap_every_combination_is_there_in_order() -> None:
     fronts = [front("x", [3.0, 0.0]), front("y", [0.0, 1.0, 2.0])]
     expected = [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2]]
     assert combinations(fronts, 6).tolist() == expected
-    assert not left_out(fronts, 6, 6)
+    assert not describe_left_out(fronts, 6, 6)
 
 
 def test_a_cap_keeps_the_best_by_deviance() -> None:

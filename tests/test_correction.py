@@ -13,7 +13,7 @@ from ep2sindy.library.relations import constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.correction import Corrected, refine_with_correction
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
-from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
 from ep2sindy.regression.front import Candidate, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
@@ -73,13 +73,13 @@ def named(found: Corrected, library: Library) -> list[Candidate]:
         groups=np.arange(len(states)),
         test=np.zeros(len(states), dtype=np.bool_),
     )
-    supports = pooled_supports(
+    supports = pool_supports(
         rows, BestSubset(max_terms=4), Bootstraps(n=0), rng=np.random.default_rng(0)
     )
     fronts = [pareto_front(rows, each) for each in supports]
     return [
         front.with_scores(score).best
-        for front, score in zip(fronts, Knee(scale="log").scores(fronts), strict=True)
+        for front, score in zip(fronts, Knee(scale="log").decide(fronts).scores, strict=True)
     ]
 
 

@@ -18,9 +18,9 @@ from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
 from ep2sindy.regression.weak import Weak, WeightedWeak
+from ep2sindy.selection.combinations import combinations
 from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.free_run import FreeRunScore
-from ep2sindy.selection.rule import combinations
 from ep2sindy.systems.systems import lotka_volterra
 from tests.rules import BySize
 

@@ -5,14 +5,14 @@ from benchmarks.intervals import held
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import reweight
 from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
 from ep2sindy.regression.front import Candidate, fit_support, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak, WeightedWeak
-from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.regression.whitening import whiten_rows
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, lorenz, lotka_volterra
 
@@ -37,7 +37,7 @@ def test_whitened_residuals_of_the_truth_are_white_with_unit_variance() -> None:
     squares, products = [], []
     for k, problem in enumerate(problems_of(system, noisy_runs(system, 0.02, n=6))):
         coef = system.model.coef[:, k] / problem.coef_scale(0)
-        rows = whitened_rows(problem, coef != 0.0, coef, n_steps=0)
+        rows = whiten_rows(problem, coef != 0.0, coef, n_steps=0)
         residual = rows.target - rows.theta @ coef
         squares.append(np.square(residual).mean())
         products.append((residual[1:] * residual[:-1]).mean())
@@ -125,7 +125,7 @@ def test_weighted_rows_let_the_truth_lead_its_size_in_noise() -> None:
         for name, formulation in (("plain", EVERY_ROW), ("weighted", WeightedWeak())):
             rng = np.random.default_rng(0)
             problem = formulation.assemble(runs, system.model.library, rng=rng)[0]
-            (found,) = pooled_supports(problem, BestSubset(), Bootstraps(n=0), rng=rng)
+            (found,) = pool_supports(problem, BestSubset(), Bootstraps(n=0), rng=rng)
             front = pareto_front(problem, found)
             led[name] += any(set(c.terms) == set(system.model.terms("x")) for c in front.candidates)
     assert led["plain"] <= 4

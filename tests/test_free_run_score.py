@@ -11,7 +11,7 @@ import ep2sindy as ep
 from ep2sindy.library.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.selection.free_run import Confirmed, Trial
-from ep2sindy.selection.systems import folds_of, living_among, others_of
+from ep2sindy.selection.systems import find_living, folds, list_others
 from tests.models import model_of
 
 PREY = replace(ep.lotka_volterra(), rate_Hz=5.0)  # 69 samples a period
@@ -170,7 +170,7 @@ def test_folds_share_no_sample_and_leave_none_out():
     run = record(8.0)
     for runs in ([run], [run] * 5):
         seen = []
-        for fold in folds_of(runs, 3):
+        for fold in folds(runs, 3):
             held = {(part.run, k) for part in fold.held for k in range(part.start, part.stop)}
             kept = {(part.run, k) for part in fold.fitted for k in range(part.start, part.stop)}
             assert not held & kept
@@ -178,7 +178,7 @@ def test_folds_share_no_sample_and_leave_none_out():
             seen += list(held)
         assert sorted(seen) == [(j, k) for j in range(len(runs)) for k in range(run.n_samples)]
     with pytest.raises(ValueError, match="runs must hold 30 samples to be parted in 3"):
-        folds_of([run.window(0, 20)], 3)
+        folds([run.window(0, 20)], 3)
 
 
 SHARED = "x: x*y == -1 * y: x*y"
@@ -281,7 +281,7 @@ def test_where_the_truth_is_in_the_library_no_other_counts_as_equal(least, names
         trial("a", loss=least), trial("b"), trial("c", waveform=0.04), trial("d", n_free=5),
         trial("e", loss=least, waveform=0.06), trial("f", error=1.1),
     ]  # fmt: skip
-    found = others_of(trials, living_among(trials), 0)
+    found = list_others(trials, find_living(trials), 0)
     assert [other.terms["x'"] for other in found] == [(name,) for name in names]
 
 

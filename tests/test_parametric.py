@@ -25,7 +25,7 @@ from ep2sindy.operating.quantities import (
 )
 from ep2sindy.operating.quantity_law import laws, power_law_r2, trends
 from ep2sindy.operating.records import OperatingRecord
-from ep2sindy.regression.bootstraps import moving_block_counts
+from ep2sindy.regression.bootstraps import count_block_draws
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.parallel import Serial
@@ -284,7 +284,7 @@ def test_draws_are_least_squares_on_repeated_rows() -> None:
         stacked.append((columns, target))
     expected = []
     for _ in range(7):
-        counts = moving_block_counts(n, n_drawn=n, block=40, rng=again)
+        counts = count_block_draws(n, n_drawn=n, block=40, rng=again)
         rows, targets = [], []
         for (columns, target), s, places in zip(stacked, std, ([0, 1], [2, 3]), strict=True):
             picked = np.repeat(np.arange(n), counts)

@@ -3,8 +3,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.model.scores import r2
-from ep2sindy.regression.bootstraps import Supports, pooled_supports
-from ep2sindy.regression.front import front_order, pareto_front
+from ep2sindy.regression.bootstraps import Supports, pool_supports
+from ep2sindy.regression.front import order_front, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
 from ep2sindy.systems.systems import System, damped_oscillator, van_der_pol
@@ -31,7 +31,7 @@ def exact_problem(system: System) -> RegressionRows:
 @pytest.mark.parametrize("system", SYSTEMS, ids=lambda s: s.name)
 def test_known_systems_come_back_from_exact_derivatives(system: System, search: Search) -> None:
     problem = exact_problem(system)
-    found = pooled_supports(problem, search, ep.Bootstraps(), rng=np.random.default_rng(1))
+    found = pool_supports(problem, search, ep.Bootstraps(), rng=np.random.default_rng(1))
     for supports in found:
         front = pareto_front(problem, supports)
         truth = system.model.terms(front.equation)
@@ -49,7 +49,7 @@ def test_depth_keeps_runners_up_behind_the_best_of_each_size() -> None:
         [run], system.model.library, rng=np.random.default_rng(1)
     )
     search = ep.BestSubset(max_terms=3, n_best=4)
-    supports = pooled_supports(problem, search, ep.Bootstraps(n=0), rng=np.random.default_rng(2))[1]
+    supports = pool_supports(problem, search, ep.Bootstraps(n=0), rng=np.random.default_rng(2))[1]
     front, deep = pareto_front(problem, supports), pareto_front(problem, supports, depth=3)
     assert front.leading.all()
     assert deep.sizes.tolist() == [0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
@@ -65,8 +65,8 @@ def test_depth_keeps_runners_up_behind_the_best_of_each_size() -> None:
 def test_a_size_whose_best_does_not_beat_smaller_ones_is_left_out() -> None:
     sizes = np.array([2, 1, 0, 1, 3, 2, 4])
     errors = np.array([0.4, 0.3, 1.0, 0.5, 0.2, 0.3, 0.2])
-    assert front_order(sizes, errors, depth=1) == [2, 1, 4]
-    assert front_order(sizes, errors, depth=2) == [2, 1, 3, 4]
+    assert order_front(sizes, errors, depth=1) == [2, 1, 4]
+    assert order_front(sizes, errors, depth=2) == [2, 1, 3, 4]
 
 
 def test_r2_takes_the_data_as_truth() -> None:
@@ -83,7 +83,7 @@ def test_r2_of_a_constant_is_refused() -> None:
 def test_a_front_scores_on_training_rows_when_none_are_held_out() -> None:
     problem = exact_problem(damped_oscillator())
     object.__setattr__(problem, "test", np.zeros(len(problem.theta), dtype=bool))
-    supports = pooled_supports(
+    supports = pool_supports(
         problem, ep.BestSubset(), ep.Bootstraps(n=0), rng=np.random.default_rng(0)
     )
     front = pareto_front(problem, supports[1])
@@ -93,7 +93,7 @@ def test_a_front_scores_on_training_rows_when_none_are_held_out() -> None:
 
 def test_candidate_scores_are_those_of_the_rows() -> None:
     problem = exact_problem(ep.lorenz())
-    supports = pooled_supports(
+    supports = pool_supports(
         problem, ep.AdaptiveLasso(), ep.Bootstraps(), rng=np.random.default_rng(1)
     )[1]
     for candidate in pareto_front(problem, supports).candidates:

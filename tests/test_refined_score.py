@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.model.many import Ensemble
+from ep2sindy.data.coerce import Task
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import unconstrained
 from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_batch
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.front import Candidate, ParetoFront
-from ep2sindy.selection import refined as refined_score
+from ep2sindy.selection import systems
+from ep2sindy.selection.combinations import MAX_ERROR
 from ep2sindy.selection.criteria import FLOOR
-from ep2sindy.selection.refined import _refined
-from ep2sindy.selection.rule import MAX_ERROR
+from ep2sindy.selection.refined import _refine
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, damped_oscillator
 from tests.models import plain_rows
@@ -52,7 +52,7 @@ def fronts_of(
 
 def scores_by(rule: ep.RefinedScore, fronts: list[ParetoFront]) -> list[np.ndarray]:
     rows = fronts[0].rows
-    return rule.scores(fronts, rows.library, rows.trajectories)
+    return list(rule.decide(fronts, Task(rows.trajectories, rows.library)).scores)
 
 
 def picked(rule: ep.RefinedScore, fronts: list[ParetoFront]) -> list[set[str]]:
@@ -162,7 +162,7 @@ def test_what_refines_does_not_judge(monkeypatch: pytest.MonkeyPatch) -> None:
         batches.append(runs)
         return cut_windows(runs, **settings)
 
-    monkeypatch.setattr(refined_score, "cut_windows", seen)
+    monkeypatch.setattr(systems, "cut_windows", seen)
     run = PREY.trajectory()
     # The last is too short for a pair.
     parts = [run.window(0, 450), run.window(600, 990), run.window(990, 1000)]
@@ -262,10 +262,9 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
 
     monkeypatch.setattr("ep2sindy.selection.refined.refine_batch", unfinished)
     batch = batch_of(PREY.trajectory())
-    both = Ensemble(PREY.model.library, ["x", "y"], np.repeat(off.coef[:, :, None], 2, axis=2))
-    found = _refined(both, batch, [unconstrained(off)] * 2, lambda n_more: None)
-    np.testing.assert_array_equal(found.coef[:, :, 0], PREY.model.coef)
-    np.testing.assert_array_equal(found.coef[:, :, 1], off.coef)
+    first, second = _refine([off, off], batch, [unconstrained(off)] * 2, lambda n_more: None)
+    np.testing.assert_array_equal(first.coef, PREY.model.coef)
+    np.testing.assert_array_equal(second.coef, off.coef)
 
 
 def test_what_cannot_be_judged_is_refused() -> None:
@@ -274,9 +273,6 @@ def test_what_cannot_be_judged_is_refused() -> None:
     fronts = fronts_of([run], PREY.model.library, choices)
     with pytest.raises(ValueError, match=r"every state needs one front: \['x'\] came"):
         scores_by(ep.RefinedScore(), fronts[:1])
-    alone = [replace(f, problem=replace(f.problem, trajectories=())) for f in fronts]
-    with pytest.raises(ValueError, match="to integrate, trajectories are needed: none came"):
-        scores_by(ep.RefinedScore(), alone)
     short = fronts_of([run.window(0, 9)], PREY.model.library, choices)
     with pytest.raises(ValueError, match="2 x 4 were asked of at most 9; .* longer records"):
         scores_by(ep.RefinedScore(), short)

@@ -3,13 +3,13 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.regression import bootstraps
-from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
+from ep2sindy.regression.bootstraps import Bootstraps, count_block_draws
 
 
 @pytest.mark.parametrize("block", [0, 31])
 def test_a_block_must_fit(block: int) -> None:
     with pytest.raises(ValueError, match=f"all 30 groups of training rows: {block} came"):
-        moving_block_counts(30, n_drawn=10, block=block, rng=np.random.default_rng(0))
+        count_block_draws(30, n_drawn=10, block=block, rng=np.random.default_rng(0))
 
 
 def test_bootstraps_draw_neighbours_together() -> None:

@@ -9,7 +9,7 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.data.coerce import Task
 from ep2sindy.library.roles import constraint_of, process_amounts
-from ep2sindy.selection.conserving import conserving_systems
+from ep2sindy.selection.conserving import search_conserving_systems
 from ep2sindy.selection.systems import TrialSystem
 
 STATES = ["n_i", "n_n"]
@@ -143,10 +143,10 @@ def test_a_search_by_mass_action_proposes_positive_processes_alone(record):
     assert found.model.terms("n_i") == pytest.approx({"n_i": -A, "n_n": S, "n_i*n_n": R}, rel=1e-3)
     rows = ep.Differential().assemble([record], LIBRARY, rng=np.random.default_rng(0))
     task = Task([record], LIBRARY, roles=MASS_ACTION)
-    systems = conserving_systems(rows, task, MASS_ACTION, method.search, depth=50).systems
+    systems = search_conserving_systems(rows, task, MASS_ACTION, method.search, depth=50).systems
     assert len(systems) > 4
     assert not any(system.broken(system.model) for system in systems)
-    free = conserving_systems(rows, task, ROLES, method.search, depth=50).systems
+    free = search_conserving_systems(rows, task, ROLES, method.search, depth=50).systems
     amounts = [amount for system in free for _, amount in amounts_of(system)]
     assert min(amounts) < 0.0  # without mass action some are negative
 

@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import ep2sindy as ep
-from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
 from ep2sindy.regression.front import ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
@@ -55,13 +55,13 @@ def rows(draw: st.DrawFn, noise: float = 0.0) -> Rows:
 
 
 def front_of(problem: RegressionRows, search: Search) -> ParetoFront:
-    (found,) = pooled_supports(problem, search, Bootstraps(n=0), rng=np.random.default_rng(0))
+    (found,) = pool_supports(problem, search, Bootstraps(n=0), rng=np.random.default_rng(0))
     return pareto_front(problem, found)
 
 
 def chosen(problem: RegressionRows, search: Search, rule: Any) -> dict[str, float]:
     front = front_of(problem, search)
-    (scores,) = rule.scores([front])
+    (scores,) = rule.decide([front]).scores
     assert scores.shape == (len(front.candidates),)
     assert not np.isnan(scores).any()
     return front.with_scores(scores).best.coef_by_term

@@ -5,8 +5,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.test_functions import even_grid, is_even, one_about_each
-from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.regression.test_functions import even_grid, is_even, keep_one_per_sample
+from ep2sindy.regression.whitening import whiten_rows
 from ep2sindy.systems.systems import System, van_der_pol
 
 EVERY_ROW = ep.Weak(split=ep.RandomSplit(0.0))
@@ -52,7 +52,7 @@ def test_straight_lines_pass_unequal_steps_unchanged() -> None:
 def test_no_two_windows_stand_about_one_sample() -> None:
     t = np.array([0.0, 1.0, 5.0, 6.0])
     middle = np.array([0.0, 1.0, 2.0, 3.5, 4.0, 5.0, 6.0])
-    assert one_about_each(t, middle).tolist() == [0, 1, 3, 6]
+    assert keep_one_per_sample(t, middle).tolist() == [0, 1, 3, 6]
     windows = ep.Bumps(half_width_s=3.0).windows(
         RANDOM, np.sin(RANDOM), rng=np.random.default_rng(0)
     )
@@ -85,7 +85,7 @@ def test_residuals_of_the_truth_are_white_where_samples_are_missing() -> None:
         mask = np.isin(problem.term_names, list(truth))
         coef = np.array([truth.get(name, 0.0) for name in problem.term_names])
         coef /= problem.coef_scale(0)
-        rows = whitened_rows(problem, mask, coef, n_steps=0)
+        rows = whiten_rows(problem, mask, coef, n_steps=0)
         residual = rows.target - rows.theta @ coef
         # About 2000 rows each: five standard errors of the mean square and of the product.
         assert np.square(residual).mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / 2000))

@@ -5,7 +5,7 @@ import pytest
 from sklearn.linear_model import Lasso
 
 from ep2sindy.library.library import named_terms
-from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.search_kernels import lasso_path
 from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, BestSubset, Search
@@ -154,10 +154,10 @@ def noisy_problem(scale: np.ndarray, *, order: np.ndarray | None = None) -> Regr
 @pytest.mark.parametrize("search", SEARCHES, ids=lambda s: type(s).__name__)
 def test_units_change_nothing_but_the_numbers(search: Search) -> None:
     settings = {"rng": np.random.default_rng(0)}
-    plain = pooled_supports(noisy_problem(np.ones(6)), search, Bootstraps(), **settings)[0]
+    plain = pool_supports(noisy_problem(np.ones(6)), search, Bootstraps(), **settings)[0]
     scale = np.array([1e18, 1e-14, 1.0, 1e36, 1e-5, 3.0])
     settings = {"rng": np.random.default_rng(0)}
-    scaled = pooled_supports(noisy_problem(scale), search, Bootstraps(), **settings)[0]
+    scaled = pool_supports(noisy_problem(scale), search, Bootstraps(), **settings)[0]
     assert np.array_equal(plain.masks, scaled.masks)
     assert np.array_equal(plain.share, scaled.share)
 
@@ -190,9 +190,9 @@ def test_culled_terms_are_missing_from_their_bootstrap_alone() -> None:
 
 def test_shares_count_bootstraps() -> None:
     search, boots = BestSubset(max_terms=6), Bootstraps(n=50, n_culled=1)
-    pooled = pooled_supports(
-        noisy_problem(np.ones(6)), search, boots, rng=np.random.default_rng(0)
-    )[0]
+    pooled = pool_supports(noisy_problem(np.ones(6)), search, boots, rng=np.random.default_rng(0))[
+        0
+    ]
     sizes = pooled.masks.sum(axis=1)
     assert pooled.share[sizes == 0].tolist() == [1.0]
     assert pooled.share[sizes == 2].sum() == pytest.approx(1.0)

@@ -8,10 +8,11 @@ import pytest
 from ep2sindy.regression.bootstraps import (
     Bootstraps,
     Resamples,
-    moving_block_counts,
+    count_block_draws,
     pool,
 )
-from ep2sindy.regression.gram_kernels import fit_masks, solve_masks
+from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, invert_gram, solve_masks
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.searches import STLSQ
 
 
@@ -42,7 +43,7 @@ def test_draws_are_those_of_plain_calls_of_the_generator(block: int) -> None:
         np.testing.assert_array_equal(count, np.bincount(rows, minlength=60))
         culled = rng.permutation([0, 1, 3, 4])[:2]
         assert own.tolist() == [t and k not in culled for k, t in enumerate(terms.tolist())]
-    one = moving_block_counts(60, n_drawn=13, block=block, rng=np.random.default_rng(5))
+    one = count_block_draws(60, n_drawn=13, block=block, rng=np.random.default_rng(5))
     first = np.random.default_rng(5).integers(60 - block + 1, size=-(-13 // block))
     rows = (first[:, None] + np.arange(block)).ravel()[:13]
     np.testing.assert_array_equal(one, np.bincount(rows, minlength=60))
@@ -57,6 +58,55 @@ def test_supports_in_any_order_are_fitted_alone() -> None:
             plain = np.zeros(6)
             plain[mask] = np.linalg.solve(xx[np.ix_(mask, mask)], right[mask])
             np.testing.assert_allclose(fit, plain, atol=1e-11)
+
+
+@pytest.mark.parametrize("share", [0.5, 2.0])
+def test_all_routes_of_least_squares_have_one_rule_of_rank(share: float) -> None:
+    """A column leaves half of the threshold, or twice; the rows, the Gram matrix and the kernel."""
+    basis = np.linalg.qr(np.random.default_rng(3).normal(size=(40, 5)))[0]
+    theta, target = basis[:, :4] * [1.0, 1e5, 1.0, 1e-7], basis @ np.arange(1.0, 6.0)
+    theta[:, 3] = (basis[:, :2] @ [0.6, 0.8] + np.sqrt(share * DEPENDENT) * basis[:, 3]) * 1e-7
+    xx, xy = theta.T @ theta, theta.T @ target
+    rows = LeastSquares.of_rows(theta, target)
+    (kernel,) = fit_masks(xx, xy, np.ones((1, 4), dtype=bool))
+    if share > 1.0:
+        assert rows.is_determined
+        assert rows.rank == 4
+        for coef in (kernel, invert_gram(xx) @ xy):  # the Gram matrix has 5 digits left
+            np.testing.assert_allclose(coef, rows.coef, rtol=1e-4)
+        assert rows.squares == pytest.approx(25.0)
+        return
+    assert np.isnan(kernel).all()
+    assert rows.rank == 3
+    assert rows.dependent.tolist() == [True, True, False, True]
+    np.testing.assert_allclose(theta @ invert_gram(xx) @ xy, theta @ rows.coef, atol=1e-4)
+    # Of equal fits the one of least norm in unit columns, which shares the two directions.
+    assert np.linalg.norm(rows.coef * rows.norms) < np.linalg.norm([1.0, 2.0, 3.0])
+
+
+def test_least_squares_on_rows_is_that_of_numpy() -> None:
+    rng = np.random.default_rng(5)
+    theta, target = rng.normal(size=(30, 3)) * [1e-12, 1.0, 1e9], rng.normal(size=30)
+    fit = LeastSquares.of_rows(theta, target)
+    plain, squares = np.linalg.lstsq(theta / fit.norms, target, rcond=None)[:2]
+    np.testing.assert_allclose(fit.coef, plain / fit.norms, rtol=1e-12)
+    np.testing.assert_allclose(fit.squares, squares, rtol=1e-12)
+    covariance = np.linalg.inv((theta / fit.norms).T @ (theta / fit.norms))
+    unit = fit.root * fit.norms[:, None]
+    np.testing.assert_allclose(unit @ unit.T, covariance, rtol=1e-10)
+
+
+def test_a_coefficient_at_its_bound_has_no_covariance() -> None:
+    rng = np.random.default_rng(6)
+    theta = rng.normal(size=(30, 3))
+    target = theta @ [1.0, -2.0, 3.0]
+    bounds = np.array([[-np.inf, 0.0, -np.inf], [np.inf] * 3])
+    fit = LeastSquares.of_rows(theta, target, bounds)
+    others = LeastSquares.of_rows(theta[:, [0, 2]], target)
+    assert fit.held.tolist() == [False, True, False]
+    np.testing.assert_allclose(fit.coef, [others.coef[0], 0.0, others.coef[1]], atol=1e-12)
+    assert not fit.root[1].any()
+    assert fit.squares == pytest.approx(others.squares)
 
 
 def plain_thresholding(xx: np.ndarray, xy: np.ndarray, start: np.ndarray, limit: float) -> list:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.regression.bootstraps import pooled_supports
+from ep2sindy.regression.bootstraps import pool_supports
 from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.selection.criteria import log_supports
@@ -34,14 +34,14 @@ def front_of(errors: list[float], n_library: int) -> ParetoFront:
 
 
 def n_selected(rule: Selection, front: ParetoFront) -> int:
-    (scores,) = rule.scores([front])
+    (scores,) = rule.decide([front]).scores
     return front.with_scores(scores).best.n_terms
 
 
 def test_knee_distance_is_equation_9_of_the_thesis() -> None:
     # Table I: R2 0.63 with two of six terms has d = 0.49 (0.498), 0.69 with three 0.59.
     front = front_of([1.0, 0.9, 0.37, 0.31], 6)
-    (distances,) = ep.Knee("library").scores([front])
+    (distances,) = ep.Knee("library").decide([front]).scores
     assert distances[2:] == pytest.approx([0.498, 0.588], abs=1e-3)
     assert n_selected(ep.Knee("library"), front) == 2
 
@@ -49,7 +49,7 @@ def test_knee_distance_is_equation_9_of_the_thesis() -> None:
 def test_knee_can_be_normalised_by_the_largest_candidate() -> None:
     # Table II: R2 0.92 with two terms has d = 0.41, 0.95 with three 0.60: n_norm is 5.
     front = front_of([1.0, 0.9, 0.08, 0.05, 0.04], 20)
-    (distances,) = ep.Knee("max_terms").scores([front])
+    (distances,) = ep.Knee("max_terms").decide([front]).scores
     assert distances[2:4] == pytest.approx([0.41, 0.60], abs=5e-3)
     assert n_selected(ep.Knee("library"), front) == 2
 
@@ -75,7 +75,7 @@ def test_the_log_knee_keeps_a_small_term_of_an_exact_law() -> None:
     front = front_of([1.0, 0.5, 0.01, 1e-5, 0.9e-5], 10)
     assert n_selected(ep.Knee(), front) == 2
     assert n_selected(LOG_KNEE, front) == 3
-    (scores,) = LOG_KNEE.scores([front])
+    (scores,) = LOG_KNEE.decide([front]).scores
     height = np.log([1e5, 0.5e5, 1e3, 1.0, 0.9]) - np.log(0.9)
     height[3:] = [np.log(1e-5 / 0.9e-5), 0.0]
     expected = np.hypot(height / np.log(1.0 / 0.9e-5), np.arange(5) / 10)
@@ -98,7 +98,7 @@ def noisy_front(n_rows: int = 200, *, seed: int = 0, scale: float = 1.0) -> Pare
 
 def fronts_from(problem: RegressionRows) -> list[ParetoFront]:
     rng = np.random.default_rng(0)
-    pooled = pooled_supports(problem, ep.BestSubset(max_terms=6), ep.Bootstraps(n=0), rng=rng)
+    pooled = pool_supports(problem, ep.BestSubset(max_terms=6), ep.Bootstraps(n=0), rng=rng)
     return [pareto_front(problem, supports) for supports in pooled]
 
 
@@ -121,7 +121,7 @@ def test_criteria_are_their_formulas() -> None:
         (BIC, k * np.log(60)),
         (ep.EBIC(gamma=0.5, coarsening=None), k * np.log(60) + ways),
     ):
-        (scores,) = rule.scores([front])
+        (scores,) = rule.decide([front]).scores
         expected = misfit(front) + penalty
         # Up to a constant, since scores are of scaled targets.
         assert np.diff(scores) == pytest.approx(np.diff(expected), rel=1e-9)
@@ -131,7 +131,7 @@ def test_coarsening_counts_fewer_rows() -> None:
     front = noisy_front(n_rows=60)
     n = 60 / (1 + 60 / 40)
     ways = np.array([log_supports(front.problem.library, c.terms) for c in front.candidates])
-    (scores,) = ep.EBIC(coarsening=40.0).scores([front])
+    (scores,) = ep.EBIC(coarsening=40.0).decide([front]).scores
     expected = n / 60 * misfit(front) + front.sizes * np.log(n) + 2 * ways
     assert np.diff(scores) == pytest.approx(np.diff(expected), rel=1e-9)
 
@@ -141,7 +141,7 @@ def test_criteria_find_two_true_terms_in_white_noise(rule: Selection) -> None:
     found = []
     for seed in range(40):
         front = noisy_front(seed=seed)
-        (scores,) = rule.scores([front])
+        (scores,) = rule.decide([front]).scores
         found.append(front.with_scores(scores).best.terms)
     assert all({"t0", "t1"} <= set(terms) for terms in found)
     # A needless term costs log 200 = 5.3 at the least, and chi-square exceeds that in 2.1 % of
@@ -163,22 +163,22 @@ def test_criteria_keep_no_term_that_explains_rounding(
     rule: Selection, exact_fronts: list[ParetoFront]
 ) -> None:
     truth = ep.lorenz().model
-    for front, scores in zip(exact_fronts, rule.scores(exact_fronts), strict=True):
+    for front, scores in zip(exact_fronts, rule.decide(exact_fronts).scores, strict=True):
         assert set(front.with_scores(scores).best.terms) == set(truth.terms(front.equation))
 
 
 @pytest.mark.parametrize("rule", RULES, ids=repr)
 def test_units_of_the_target_change_no_score(rule: Selection) -> None:
-    (plain,), (scaled,) = (rule.scores([noisy_front(scale=s)]) for s in (1.0, 1e20))
+    (plain,), (scaled,) = (rule.decide([noisy_front(scale=s)]).scores for s in (1.0, 1e20))
     assert scaled == pytest.approx(plain, rel=1e-9)
 
 
 @pytest.mark.parametrize("rule", RULES, ids=repr)
 def test_every_front_has_its_own_scores(rule: Selection) -> None:
     fronts = [noisy_front(seed=seed) for seed in range(2)]
-    both = rule.scores(fronts)
+    both = rule.decide(fronts).scores
     for front, scores in zip(fronts, both, strict=True):
-        assert np.array_equal(scores, rule.scores([front])[0])
+        assert np.array_equal(scores, rule.decide([front]).scores[0])
         assert len(scores) == len(front.candidates)
 
 

@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -13,8 +13,11 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import ep2sindy as ep
 from ep2sindy.app import main as program
-from ep2sindy.regression.front import ParetoFront
+from ep2sindy.data.coerce import Task
+from ep2sindy.regression.front import Fronts
+from ep2sindy.runtime.progress import Progress
 from ep2sindy.runtime.threads import NUMBERS, one_thread
+from ep2sindy.selection.rule import Basis, Decision
 
 PREY = ep.lotka_volterra()
 
@@ -41,11 +44,12 @@ def threads() -> tuple[int, int]:
 @dataclass(frozen=True)
 class WatchedChoice:
     label: ClassVar[str] = "EBIC"
+    basis: ClassVar[Basis] = "rows"
     seen: list[tuple[int, int]] = field(default_factory=list)
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[np.ndarray]:
+    def decide(self, fronts: Fronts, task: Task, *, progress: Progress) -> Decision:
         self.seen.append(threads())
-        return ep.EBIC().scores(fronts)
+        return ep.EBIC().decide(fronts, task, progress=progress)
 
 
 def test_on_one_thread_and_then_on_as_many_as_before() -> None:

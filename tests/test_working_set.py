@@ -16,10 +16,11 @@ from ep2sindy.estimation.explanation import explain
 from ep2sindy.estimation.likelihood import Gram, gram
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import COMPARED_AT, Solution, at_level, from_smooth
-from ep2sindy.estimation.supports import inverse_of, term_prices
+from ep2sindy.estimation.supports import term_prices
 from ep2sindy.estimation.working_set import first_set
 from ep2sindy.regression import searches
-from ep2sindy.regression.exchanges import exchanged_supports
+from ep2sindy.regression.exchanges import exchange_terms
+from ep2sindy.regression.gram_kernels import invert_gram
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System
 from tests.models import model_of
@@ -63,7 +64,7 @@ def test_exchanges_find_the_best_subsets(n_problems: int) -> None:
     """On columns that are far from dependent; the best of every size, of one problem or two."""
     xx, xy, yy = random_gram(12, n_problems)
     proven = ep.BestSubset(max_terms=5).shared_supports(xx, xy, yy)
-    found = exchanged_supports(xx, xy, yy, max_terms=5, n_best=1)
+    found = exchange_terms(xx, xy, yy, max_terms=5, n_best=1)
     assert np.array_equal(found, proven)
 
 
@@ -76,7 +77,7 @@ def test_no_support_is_worse_than_a_part_of_the_larger_one(seed: int) -> None:
     columns /= np.linalg.norm(columns, axis=0)
     target = columns[:, rng.choice(35, 3, replace=False)] @ rng.standard_normal(3)
     target += 0.001 * rng.standard_normal(200)
-    masks = exchanged_supports(
+    masks = exchange_terms(
         (columns.T @ columns)[None], (columns.T @ target)[None], np.array([target @ target]),
         max_terms=6, n_best=1,
     )  # fmt: skip
@@ -93,7 +94,7 @@ def test_no_support_is_worse_than_a_part_of_the_larger_one(seed: int) -> None:
 def test_exchanges_start_from_known_supports() -> None:
     xx, xy, yy = random_gram(12)
     best = ep.BestSubset(max_terms=4).shared_supports(xx, xy, yy)
-    known = exchanged_supports(xx, xy, yy, max_terms=4, n_best=3, known=best)
+    known = exchange_terms(xx, xy, yy, max_terms=4, n_best=3, known=best)
     assert all(any(np.array_equal(mask, each) for each in known) for mask in best)
 
 
@@ -103,7 +104,7 @@ def test_dependent_terms_are_not_exchanged() -> None:
     columns = rng.standard_normal((50, 4))
     columns[:, 2], columns[:, 3] = columns[:, 0], 0.0
     target = columns[:, 0] + columns[:, 1]
-    found = exchanged_supports(
+    found = exchange_terms(
         (columns.T @ columns)[None], (columns.T @ target)[None], np.array([target @ target]),
         max_terms=4, n_best=5,
     )  # fmt: skip
@@ -182,7 +183,7 @@ def test_small_libraries_are_weighed_whole() -> None:
 
 def exact_gains(pair: Gram, support: np.ndarray) -> np.ndarray:
     """Fall of the quadratic function of all coefficients by each one beside a support."""
-    inverse = inverse_of(pair.quadratic[np.ix_(support, support)])
+    inverse = invert_gram(pair.quadratic[np.ix_(support, support)])
     share = pair.quadratic[:, support] @ inverse
     own = np.diag(pair.quadratic) - np.einsum("js,js->j", share, pair.quadratic[:, support])
     score = pair.linear - share @ pair.linear[support]

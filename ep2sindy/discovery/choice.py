@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import islice
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory, spread_blocks
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library
@@ -22,19 +22,14 @@ from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.whitening import NEGLIGIBLE, whitened_rows
+from ep2sindy.regression.whitening import NEGLIGIBLE, whiten_rows
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.rule import (
-    Decision,
-    OtherSystem,
-    Selection,
-    SystemSelection,
-    best_first,
-    support_of,
-)
+from ep2sindy.selection.combinations import cheapest_first, support_of
+from ep2sindy.selection.rule import Decision, OtherSystem, Selection
 
 # Most combinations, of the fronts that relations tie together, to look at for one with the terms.
 MAX_COMBINATIONS = 100_000
@@ -126,23 +121,24 @@ class Choice:
 def choose(
     fronts: Sequence[ParetoFront],
     rule: Selection,
-    relations: Sequence[Relation] = (),
+    task: Task,
     *,
-    units: Mapping[str, str],
     provenance: Mapping[str, str],
     progress: Progress = SILENT,
 ) -> Choice:
     """Select from the candidates of a regression, and fit: constrained, weighted or unchanged.
 
-    Under relations, only combinations that have the terms of the relations count. The one of least
-    summed score wins, and all equations are fitted at once.
+    A rule that runs whole systems has fitted the winner. For any other, under relations, only
+    combinations that have the terms of the relations count. The one of least summed score wins,
+    and all equations are fitted at once.
     Raises ValueError for relations that no combination has the terms for, or that tie so many
     states to each other that their combinations exceed a million.
     """
-    library = fronts[0].rows.library
-    with progress.stage(None, "", f"candidates by {rule.label}"):
-        scores = rule.scores(fronts)
-    scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
+    decision = rule.decide(fronts, task, progress=progress)
+    if decision.model is not None:
+        return choice_of(fronts, decision, task.runs, provenance=provenance)
+    library, relations, units = fronts[0].rows.library, task.relations, task.runs[0].units
+    scored = [front.with_scores(s) for front, s in zip(fronts, decision.scores, strict=True)]
     if relations:
         place = _least_sum(scored, relations)
         support = support_of(scored, place)
@@ -161,24 +157,6 @@ def choose(
     return Choice(scored, best, model, left=left)
 
 
-def choose_by_runs(
-    fronts: Sequence[ParetoFront],
-    rule: SystemSelection,
-    relations: Sequence[Relation] = (),
-    *,
-    library: Library,
-    runs: Sequence[Trajectory],
-    provenance: Mapping[str, str],
-    progress: Progress = SILENT,
-) -> Choice:
-    """Select among systems of candidates by a rule that integrates them and refines the winner.
-
-    Raises ValueError for relations that no combination has the terms for.
-    """
-    decision = rule.decide(fronts, library, runs, relations, progress=progress)
-    return choice_of(fronts, decision, runs, provenance=provenance)
-
-
 def choice_of(
     fronts: Sequence[ParetoFront],
     decision: Decision,
@@ -186,7 +164,8 @@ def choice_of(
     *,
     provenance: Mapping[str, str],
 ) -> Choice:
-    """The choice that a rule's decision makes, with its scores on the fronts."""
+    """The choice that the decision of a rule that runs systems makes, with its scores."""
+    assert decision.model is not None
     scored = [f.with_scores(s) for f, s in zip(fronts, decision.scores, strict=True)]
     model = replace(decision.model, units=runs[0].units, provenance=provenance)
     best = [front.best for front in scored]
@@ -317,14 +296,13 @@ def reweight(
     the truth.
     """
     theta, target, scale = _whitened_terms(problem, candidate, n_steps=n_steps)
-    upper = np.linalg.qr(theta, mode="r")
-    root = np.linalg.inv(upper) * scale[:, None]
-    fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
-    left = _compare_with_noise(target - theta @ fitted, n_free=len(scale))
+    fit = LeastSquares.of_rows(theta, target)
+    root = fit.root * scale[:, None]
+    left = _compare_with_noise(target - theta @ fit.coef, n_free=len(scale))
     return EquationFit(
         equation=candidate.equation,
         terms=candidate.terms,
-        coef=fitted * scale,
+        coef=fit.coef * scale,
         covariance=root @ root.T if left.leaves_noise else None,
         left=left,
     )
@@ -333,7 +311,7 @@ def reweight(
 def _left_of_terms(problem: RegressionRows, fit: EquationFit) -> LeftOver:
     """Residuals of a fit's terms, fitted again with weights as by `reweight`."""
     theta, target, _ = _whitened_terms(problem, fit, negligible=NEGLIGIBLE)
-    fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
+    fitted = LeastSquares.of_rows(theta, target).coef
     return _compare_with_noise(target - theta @ fitted, n_free=len(fitted))
 
 
@@ -364,7 +342,7 @@ def _whitened_terms(
     coef = np.zeros(len(terms))
     order = [problem.library.index(name) for name in candidate.terms]
     coef[order] = candidate.coef / scale[order]
-    rows = whitened_rows(problem, terms, coef, n_steps=n_steps, negligible=negligible, kept=terms)
+    rows = whiten_rows(problem, terms, coef, n_steps=n_steps, negligible=negligible, kept=terms)
     return rows.theta[:, order], rows.target, scale[order]
 
 
@@ -390,13 +368,8 @@ def _least_sum(
         tied = [k for k, front in enumerate(fronts) if front.equation in states]
         some = [fronts[k] for k in tied]
         own = [r for r in relations if any(state in states for _, state, _ in r.factors)]
-        order = [np.argsort(front.scores, kind="stable") for front in some]
-        ranked = best_first([f.scores[places] for f, places in zip(some, order, strict=True)])
-        tries = (
-            np.array([places[k] for places, k in zip(order, choice, strict=True)])
-            for choice in islice(ranked, MAX_COMBINATIONS)
-        )
-        best = next((t for t in tries if binding(own, support_of(some, t)) is not None), None)
+        scores = [front.scores for front in some]
+        best = next(cheapest_first(some, scores, own, most_tried=MAX_COMBINATIONS), None)
         if best is None:
             raise ValueError(
                 f"the relations {[r.text for r in own]} name terms that none of the best "

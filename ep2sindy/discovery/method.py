@@ -19,7 +19,7 @@ from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import Choice, choice_of, choose, choose_by_runs
+from ep2sindy.discovery.choice import Choice, choice_of, choose
 from ep2sindy.estimation.cost import check_limit_s
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
@@ -33,7 +33,7 @@ from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.values import check_kind, set_counts
 from ep2sindy.selection.criteria import EBIC, Evidence
-from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
+from ep2sindy.selection.rule import Selection
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class DiscoveryMethod(Protocol):
     """
 
     @property
-    def selection(self) -> SystemSelection | Selection: ...
+    def selection(self) -> Selection: ...
 
     def identify(
         self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
@@ -111,7 +111,7 @@ class TrajectorySearch:
     max_terms: int | None = None
     align: bool = False
     limit_s: float | None = None
-    selection: SystemSelection | Selection = field(default_factory=Evidence)
+    selection: Selection = field(default_factory=Evidence)
     depth: int = 1
     courses: Mapping[str, str] | None = field(default=None, hash=False)
 
@@ -119,7 +119,7 @@ class TrajectorySearch:
         set_counts(self, {"depth": 1} | ({} if self.max_terms is None else {"max_terms": 1}))
         check_limit_s(self.limit_s)
         check_kind("selection", self.selection, Selection, "ep.Evidence()")
-        if not isinstance(self.selection, Evidence | SystemSelection):
+        if self.selection.basis == "rows":
             raise ValueError(
                 "a search of trajectories weighs models by their likelihood: selection must "
                 "be Evidence() (selection=evidence), or a rule that runs models, such as "
@@ -140,7 +140,7 @@ class TrajectorySearch:
         Ambiguities are terms whose values at the samples are alike. Raises ValueError for roles
         with a rule that runs models.
         """
-        if task.roles is not None and isinstance(self.selection, SystemSelection):
+        if task.roles is not None and self.selection.basis == "runs":
             raise ValueError(
                 "a search of trajectories keeps roles by likelihood: selection must be Evidence(), "
                 f"{self.selection!r} came; Regression(selection=FreeRunScore()) judges by runs"
@@ -166,14 +166,11 @@ class TrajectorySearch:
     def _choose(self, found: Estimate, task: Task, progress: Progress) -> Choice:
         """Candidates of every equation with their scores, and the model by the selection rule."""
         fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
-        if isinstance(self.selection, SystemSelection):
-            choice = choose_by_runs(
-                fronts, self.selection, task.relations, library=task.library, runs=task.runs,
-                provenance=found.model.provenance, progress=progress,
-            )  # fmt: skip
+        decision = self.selection.decide(fronts, task, progress=progress)
+        if decision.model is not None:
+            choice = choice_of(fronts, decision, task.runs, provenance=found.model.provenance)
             return replace(choice, model=replace(choice.model, courses=found.model.courses))
-        scores = self.selection.scores(fronts)
-        scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
+        scored = [front.with_scores(s) for front, s in zip(fronts, decision.scores, strict=True)]
         best = [front.best for front in scored]
         return Choice(scored, best, found.model, found.note, constraint=found.constraint)
 
@@ -262,7 +259,7 @@ class Regression:
 
     formulation: Formulation = field(default_factory=WeightedWeak)
     search: Search = field(default_factory=BestSubset)
-    selection: SystemSelection | Selection = field(default_factory=EBIC)
+    selection: Selection = field(default_factory=EBIC)
     bootstraps: Bootstraps = field(default_factory=lambda: Bootstraps(n=0))
     depth: int = 1
 
@@ -271,7 +268,7 @@ class Regression:
         check_kind("search", self.search, Search, "ep.BestSubset()")
         check_kind("bootstraps", self.bootstraps, Bootstraps, "ep.Bootstraps(n=0)")
         check_kind("selection", self.selection, Selection, "ep.EBIC()")
-        if isinstance(self.selection, Evidence):
+        if self.selection.basis == "likelihood":
             raise ValueError(
                 "Evidence weighs what a search of trajectories found, and a regression has rows: "
                 "take TrajectorySearch() (search=trajectory), or select by EBIC() (selection=ebic)"
@@ -320,7 +317,7 @@ class Regression:
         The search is made once, on all training rows: bootstraps weigh one equation at a time.
         """
         # These load torch, only for a search under roles.
-        from ep2sindy.selection.conserving import conserving_systems
+        from ep2sindy.selection.conserving import search_conserving_systems
         from ep2sindy.selection.free_run import FreeRunScore
         from ep2sindy.selection.refined import RefinedScore
 
@@ -332,7 +329,7 @@ class Regression:
         library = roles.with_known_terms(task.library, task.states)
         with progress.stage(None, "", "rows of the regression"):
             problems = self.formulation.assemble(task.runs, library, rng=rng)
-        systems = conserving_systems(problems, task, roles, self.search, depth=self.depth)
+        systems = search_conserving_systems(problems, task, roles, self.search, depth=self.depth)
         decision = self.selection.judge(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)
         choice = choice_of(systems.fronts, decision, task.runs, provenance=provenance)
@@ -364,15 +361,7 @@ class Regression:
     ) -> Choice:
         """Select a candidate from every front, and fit it."""
         provenance = self.provenance | _labels(task)
-        if isinstance(self.selection, SystemSelection):
-            return choose_by_runs(
-                fronts, self.selection, task.relations, library=task.library, runs=task.runs,
-                provenance=provenance, progress=progress,
-            )  # fmt: skip
-        return choose(
-            fronts, self.selection, task.relations, units=task.runs[0].units,
-            provenance=provenance, progress=progress,
-        )  # fmt: skip
+        return choose(fronts, self.selection, task, provenance=provenance, progress=progress)
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
@@ -380,7 +369,7 @@ class Regression:
         """Supports alone, as a benchmark counts them."""
         task = Task(runs, library)
         fronts = [e.front for e in self.search_equations(task, rng=rng)]
-        scores = score_candidates(self.selection, fronts, library, task.runs)
+        scores = self.selection.decide(fronts, task).scores
         chosen = [f.with_scores(s).best for f, s in zip(fronts, scores, strict=True)]
         return Finding(
             kept={f.equation: [frozenset(c.terms) for c in f.candidates] for f in fronts},
@@ -407,7 +396,7 @@ def method_of(
     formulation: Formulation,
     search: TrajectorySearch | Search,
     bootstraps: Bootstraps,
-    selection: SystemSelection | Selection,
+    selection: Selection,
     depth: int,
 ) -> AnyMethod:
     """The method for settings that are chosen one by one, such as the groups of a config.

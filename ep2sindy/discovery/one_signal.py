@@ -45,7 +45,6 @@ from ep2sindy.runtime.parallel import Once, at_once
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.embedding import (
     EMBEDDINGS,
     HARMONICS,
@@ -200,7 +199,7 @@ class SignalSearch:
             if say is not None:
                 say(NOT_EXPLAINED)
         pairs = [once(partial(self._smoothed, past, n, seed, progress)) for n in numbers]
-        return [self._attempt(past, *pair, progress) for pair in pairs]
+        return [self._attempt(past, chosen, found, progress) for chosen, found in pairs]
 
     def _numbers(self, signal: Trace) -> list[int]:
         """Numbers of states to try; a signal of two states either repeats itself or spirals."""
@@ -271,7 +270,7 @@ class SignalSearch:
 
     def _found(self, chosen: Chosen, signal: str, seed: int, progress: Progress) -> Discovery:
         method, rule, known = self.method, self.method.selection, chosen.embedded
-        if isinstance(rule, SystemSelection):  # the measured signal is judged, not derived states
+        if rule.basis == "runs":  # the measured signal is judged, not derived states
             from ep2sindy.selection.free_run import (
                 FreeRunScore,  # loads torch, only for this rule
             )

@@ -22,7 +22,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, constraint, relations_of
 from ep2sindy.library.units import unit_product
 from ep2sindy.model.scores import r2
-from ep2sindy.regression.constrained import constrained_draws
+from ep2sindy.regression.constrained import fit_draws
 from ep2sindy.runtime.parallel import Workers, run_alike
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.runtime.values import check_kind, check_list
@@ -319,7 +319,7 @@ def _constrained(
     """A point's results with draws and R2 of coefficients that obey the constraint."""
     problems = list(dict.fromkeys(equation.front.rows for equation in equations))
     draws = {equation.front.equation: equation.draws for equation in equations}
-    found = constrained_draws(problems, draws, held)
+    found = fit_draws(problems, draws, held)
     drawn, weights = np.zeros((2, *point["coef_draws"].shape))
     scores = np.full((2, len(equations)), np.nan)
     for row, equation in enumerate(equations):

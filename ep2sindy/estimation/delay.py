@@ -21,7 +21,8 @@ from jaxtyping import Bool, Float
 from ep2sindy.estimation.kernels import eliminate
 from ep2sindy.estimation.likelihood import Gram, TrajectoryFit, flow_by, linearise
 from ep2sindy.estimation.problem import EstimationProblem
-from ep2sindy.estimation.supports import PenalisedFit, best_support, inverse_of, penalise
+from ep2sindy.estimation.supports import PenalisedFit, best_support, penalise
+from ep2sindy.regression.gram_kernels import invert_gram
 
 PAYS = 1.0  # least fall of squares plus prices, beyond the delays' own price
 SURE = 6.0  # standard errors of every delay: true ones of a sample show ten and more
@@ -51,7 +52,7 @@ class DelayedGram:
     @property
     def freed(self) -> Gram:
         """The squares as a function of the coefficients, minimised over the delays."""
-        inverse = inverse_of(self.of_delays)
+        inverse = invert_gram(self.of_delays)
         share = self.of_both @ inverse
         return Gram(
             self.at_rest.quadratic - share @ self.of_both.T,
@@ -64,8 +65,8 @@ class DelayedGram:
     ) -> tuple[Float[np.ndarray, " delays"], Float[np.ndarray, " delays"]]:
         """Best delays jointly with the coefficients on a support, and their standard errors."""
         quadratic = self.at_rest.quadratic[np.ix_(support, support)]
-        share = self.of_both[support].T @ inverse_of(quadratic)
-        inverse = inverse_of(self.of_delays - share @ self.of_both[support])
+        share = self.of_both[support].T @ invert_gram(quadratic)
+        inverse = invert_gram(self.of_delays - share @ self.of_both[support])
         best = inverse @ (self.linear - share @ self.at_rest.linear[support])
         return best, np.sqrt(np.maximum(np.diag(inverse), 0.0))
 

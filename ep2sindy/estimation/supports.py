@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.estimation.likelihood import Gram, unit_sizes, within_bounds
+from ep2sindy.estimation.likelihood import Gram, within_bounds
 from ep2sindy.estimation.problem import EstimationProblem
-from ep2sindy.regression.exchanges import exchanged_supports
-from ep2sindy.regression.gram_kernels import fit_masks
-from ep2sindy.regression.searches import subsets_within
+from ep2sindy.regression.exchanges import exchange_terms
+from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, invert_gram
+from ep2sindy.regression.searches import search_subsets
 
 MAX_SWEEPS = 10  # over the equations; two or three usually suffice
 # Weight of the cost of choosing among terms. Below 0.5 there are more false terms than true ones
@@ -26,8 +26,6 @@ PROVEN_TERMS = 7  # of one equation; larger supports are the best that exchanges
 MOST_WORK = 3e6
 N_BEST = 4  # supports of each size of an equation, since terms of one size differ in price
 MAX_ALTERNATIVES = 24  # supports of one equation for which the others are searched again
-CUTOFF = 1e-11  # eigenvalues of a Gram matrix of unit diagonal, below which terms are dependent
-INDEPENDENT = 1e-9  # least square of a term that the others leave, for an inverse without cutoff
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +143,7 @@ def penalise(
     """Least squares on a support, and their score: the squares plus its terms' prices."""
     free = np.zeros(len(support))
     quadratic, linear = gram.quadratic[np.ix_(support, support)], gram.linear[support]
-    inverse = inverse_of(quadratic)
+    inverse = invert_gram(quadratic)
     free[support] = inverse @ linear
     # One step of iterative refinement; directions below the cutoff stay out.
     free[support] += inverse @ (linear - quadratic @ free[support])
@@ -170,7 +168,7 @@ def _offer_supports(
     """Best supports of one equation; the other equations' and required coefficients stay free."""
     kept = (chosen & ~own) | problem.required
     own = own & ~problem.required
-    inverse = inverse_of(gram.quadratic[np.ix_(kept, kept)])
+    inverse = invert_gram(gram.quadratic[np.ix_(kept, kept)])
     yy = max(gram.offset - gram.linear[kept] @ inverse @ gram.linear[kept], 1.0)
     if not own.any():
         return [Offered(kept, yy)]
@@ -179,21 +177,21 @@ def _offer_supports(
     xy = gram.linear[own] - share @ gram.linear[kept]
     # A column that the kept ones span leaves only rounding: it is not available.
     square = np.diag(xx).copy()
-    square[~(square > CUTOFF * np.abs(np.diag(gram.quadratic)[own]))] = 0.0
+    square[~(square > DEPENDENT * np.abs(np.diag(gram.quadratic)[own]))] = 0.0
     size = np.sqrt(zero_to_one(square))
     at_hand = square > 0.0
     unit = np.where(at_hand[:, None] & at_hand, xx / np.outer(size, size), 0.0)
     target = np.where(at_hand, xy / size, 0.0)
     problem_of_one = unit[None], (target / np.sqrt(yy))[None], np.ones(1)
     n_own = int(own.sum())
-    masks, proven = subsets_within(
+    masks, proven = search_subsets(
         *problem_of_one,
         max_terms=min(max_terms, PROVEN_TERMS, n_own),
         n_best=N_BEST,
         most_work=MOST_WORK,
     )
     if not proven or min(max_terms, n_own) > PROVEN_TERMS:
-        masks = exchanged_supports(*problem_of_one, max_terms=max_terms, n_best=N_BEST, known=masks)
+        masks = exchange_terms(*problem_of_one, max_terms=max_terms, n_best=N_BEST, known=masks)
     found = []
     for mask, gain in zip(masks, _gains(unit, target, masks), strict=True):
         support = kept.copy()
@@ -231,22 +229,5 @@ def _gains(
     gains = fit_masks(unit, target, masks) @ target
     for k in np.flatnonzero(np.isnan(gains)):  # dependent terms explain what is left without them
         y, mask = target[masks[k]], masks[k]
-        gains[k] = y @ inverse_of(unit[np.ix_(mask, mask)]) @ y
+        gains[k] = y @ invert_gram(unit[np.ix_(mask, mask)]) @ y
     return gains
-
-
-def inverse_of(quadratic: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Inverse of a Gram matrix; directions in which its terms depend on each other stay out."""
-    size = unit_sizes(quadratic)
-    unit = quadratic / np.outer(size, size)
-    try:
-        independent = np.square(np.diag(np.linalg.cholesky(unit))) > INDEPENDENT
-    except np.linalg.LinAlgError:
-        independent = np.zeros(len(unit), dtype=np.bool_)
-    # The eigenvalues cost ten times as much.
-    inverse = (
-        np.linalg.inv(unit)
-        if independent.all()
-        else np.linalg.pinv(unit, rcond=CUTOFF, hermitian=True)
-    )
-    return inverse / np.outer(size, size)

@@ -41,8 +41,9 @@ from ep2sindy.estimation.solver import (
     settle,
     smooth_states,
 )
-from ep2sindy.estimation.supports import N_BEST, inverse_of, term_prices
-from ep2sindy.regression.exchanges import exchanged_supports
+from ep2sindy.estimation.supports import N_BEST, term_prices
+from ep2sindy.regression.exchanges import exchange_terms
+from ep2sindy.regression.gram_kernels import invert_gram
 
 # Model errors of the first set: the state nearly free, or quite. One alone leaves out more true
 # terms.
@@ -135,7 +136,7 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
             fit = TrajectoryFit(problem, level, start.path, np.zeros(problem.n_free), kept)
             quadratic, linear, offset = _own_squares(fit, steps, block, own)
             size = np.sqrt(zero_to_one(np.diag(quadratic)))
-            masks = exchanged_supports(
+            masks = exchange_terms(
                 (quadratic / np.outer(size, size))[None],
                 (linear / size)[None],
                 np.array([offset]),
@@ -237,7 +238,7 @@ def _gains(problem: EstimationProblem, fit: TrajectoryFit) -> Float[np.ndarray, 
     terms, std = _integrals(problem, fit.path), fit.level.noise
     score = np.square(terms.T @ (about.defects / about.process))
     with_states, with_all = np.zeros_like(score), np.zeros_like(score)
-    rng, inverse = np.random.default_rng(0), inverse_of(quadratic)
+    rng, inverse = np.random.default_rng(0), invert_gram(quadratic)
     for _ in range(N_PROBES):
         noise = std * rng.standard_normal(std.shape)
         without = _weighted_defects(about, noise, np.zeros(len(inverse)))

@@ -16,7 +16,7 @@ from scipy.optimize import nnls
 from scipy.special import ndtri
 from scipy.stats import f as f_distribution
 
-from ep2sindy.data.numbers import column_norms, zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
@@ -27,7 +27,8 @@ from ep2sindy.operating.records import check_varying, point_label
 from ep2sindy.operating.shared_support import SharedDiscovery, SharedFront
 from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.regression.front import ParetoFront
-from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.regression.least_squares import LeastSquares
+from ep2sindy.regression.whitening import whiten_rows
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import words_of
 from ep2sindy.runtime.values import read_only
@@ -375,21 +376,18 @@ def _tied(
     fits = {
         p: _FreeFit.of(each, front.supports.index(terms), terms) for p, each in front.points.items()
     }
-    design = np.concatenate([np.kron(fit.theta, law_at[p][None]) for p, fit in fits.items()])
-    target = np.concatenate([fit.target for fit in fits.values()])
-    norms = column_norms(design)
-    columns = design / norms
-    solution, _, rank, _ = np.linalg.lstsq(columns, target)
-    if rank < len(norms):
+    design = np.concatenate([np.kron(own.theta, law_at[p][None]) for p, own in fits.items()])
+    target = np.concatenate([own.target for own in fits.values()])
+    fit = LeastSquares.of_rows(design, target)
+    if not fit.is_determined:
         raise ValueError(
             f"too few points show the terms {list(terms)} of {front.equation!r} to tie them by a "
             "law of this many terms; use a smaller law"
         )
-    coef = (solution / norms).reshape(len(terms), len(next(iter(law_at.values()))))
-    root = np.linalg.inv(np.linalg.qr(columns, mode="r")) / norms[:, None]
-    growth = np.square(target - columns @ solution).sum() - sum(f.squares for f in fits.values())
-    n_given_up = sum(fit.n_terms for fit in fits.values()) - coef.size
-    n_left = len(target) - sum(fit.n_terms for fit in fits.values())
+    coef = fit.coef.reshape(len(terms), len(next(iter(law_at.values()))))
+    growth = fit.squares - sum(each.squares for each in fits.values())
+    n_free = sum(own.n_terms for own in fits.values())
+    n_given_up, n_left = n_free - coef.size, len(target) - n_free
     F = max(float(growth), 0.0) / n_given_up if n_given_up > 0 else np.nan
     known = all(each.rows.noisy is not None for each in front.points.values())
     test = LawTest(
@@ -403,7 +401,7 @@ def _tied(
         F=F,
         p_value=float(f_distribution.sf(F, n_given_up, n_left)) if n_given_up > 0 else np.nan,
     )
-    return _Tied(terms, coef, root @ root.T if known else None, test)
+    return _Tied(terms, coef, fit.root @ fit.root.T if known else None, test)
 
 
 @dataclass(frozen=True, eq=False)
@@ -427,19 +425,19 @@ class _FreeFit:
         if problem.noisy is not None:
             coef = coef_matrix(problem.library, [candidate.coef_by_term])[:, 0] / scale
             mask = np.isin(problem.term_names, candidate.terms)
-            white = whitened_rows(problem, mask, coef, n_steps=N_STEPS)
+            white = whiten_rows(problem, mask, coef, n_steps=N_STEPS)
             theta, target = white.theta, white.target
         columns = [problem.library.index(name) for name in terms]
         theta = theta[:, columns]
-        left = target - theta @ np.linalg.lstsq(theta, target)[0]
+        left = LeastSquares.of_rows(theta, target).squares
         # For rows without noise the residuals are rounding, which is no scale to judge by.
-        squares = max(float(left @ left), FLOOR * float(target @ target))
+        squares = max(left, FLOOR * float(target @ target))
         spread = np.sqrt(squares / max(len(target) - candidate.n_terms, 1))
         return _FreeFit(
             theta=theta / scale[columns] / spread,
             target=target / spread,
             n_terms=candidate.n_terms,
-            squares=float(left @ left) / spread**2,
+            squares=left / spread**2,
         )
 
 

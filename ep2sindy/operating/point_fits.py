@@ -34,8 +34,9 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
-from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
-from ep2sindy.regression.constrained import WeightedEquation, constrained_fit, weighted_equations
+from ep2sindy.regression.bootstraps import Bootstraps, count_block_draws
+from ep2sindy.regression.constrained import WeightedEquation, constrained_fit, weigh_equations
+from ep2sindy.regression.gram_kernels import invert_gram
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Workers, collect
@@ -288,7 +289,7 @@ def resample_coefficients(
             "a bootstrap over time needs one trajectory, or blocks would cross from one to the "
             f"next: {len(problems[0].trajectories)} came"
         )
-    equations = weighted_equations(problems, constraint)
+    equations = weigh_equations(problems, constraint)
     coef = coefficients_of(model, constraint)
     rows = [_free_rows(equation, constraint, coef) for equation in equations]
     groups = [e.problem.groups[~e.problem.test] for e in equations]
@@ -301,13 +302,13 @@ def resample_coefficients(
         np.add.at(sums, np.searchsorted(numbers, group), unit[:, :, None] * unit[:, None, :])
     counts = np.array(
         [
-            moving_block_counts(len(numbers), n_drawn=len(numbers), block=block, rng=rng)
+            count_block_draws(len(numbers), n_drawn=len(numbers), block=block, rng=rng)
             for _ in range(n_draws)
         ],
         dtype=np.float64,
     )
     grams = np.tensordot(counts, sums, axes=1)
-    z = np.linalg.solve(grams[:, :-1, :-1], grams[:, :-1, -1:])[:, :, 0]
+    z = (invert_gram(grams[:, :-1, :-1]) @ grams[:, :-1, -1:])[:, :, 0]
     z *= scale[-1] / scale[:-1]
     return (z - z.mean(axis=0) + coef[constraint.free]) @ constraint.C.T + constraint.d
 

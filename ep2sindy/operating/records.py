@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.data.numbers import column_norms, zero_to_one
+from ep2sindy.data.numbers import column_norms, least_squares, zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
@@ -261,7 +261,7 @@ def _off_plane(
     weights = np.ones(len(values))
     left = target
     for _ in range(N_ROBUST):
-        coef = np.linalg.lstsq(columns * weights[:, None], target * weights)[0]
+        coef = least_squares(columns * weights[:, None], target * weights)
         left = target - columns @ coef
         weights = 1.0 / np.sqrt(np.maximum(np.abs(left), 1e-6))
     return left

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.discovery.choice import assemble_model, fit_last
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
-from ep2sindy.regression.front import ParetoFront, errors_of, fit_supports, front_order
+from ep2sindy.regression.front import ParetoFront, errors_of, fit_supports, order_front
 from ep2sindy.regression.gram_kernels import ROUNDING, independent_terms
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
@@ -22,7 +23,7 @@ from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_kind
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
+from ep2sindy.selection.rule import Selection
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +76,15 @@ def discover_shared(
     points: name -> trajectories. Points are assembled in the order of their names. method: None
     means Regression().
     Raises ValueError for a search that cannot serve several points, bootstraps (not available for
-    several points), no point, or points whose states, variables or units differ.
+    several points), no point, points whose states, variables or units differ, or runs of one point
+    that share samples.
     Source of the idea, for thresholding: Rudy et al. 2019, doi:10.1137/18M1191944.
     """
     method = method or Regression()
     check_kind("method", method, Regression, "ep.Regression(search=ep.BestSubset())")
     search = _search_of(method)
     _check_points(points, library)
+    tasks = {point: Task(runs, library) for point, runs in points.items()}
     rng = np.random.default_rng(seed)
     watch = as_progress(progress)
     problems = {
@@ -89,7 +92,7 @@ def discover_shared(
         for p in count_pieces(watch, sorted(points), "point", "rows of the regression")
     }
     fronts = _shared_fronts(problems, search, method.depth, watch)
-    scores = _summed_scores(list(fronts.values()), method.selection, library, points)
+    scores = _summed_scores(list(fronts.values()), method.selection, tasks)
     best = {state: int(np.argmin(each)) for state, each in zip(fronts, scores, strict=True)}
     provenance = method.provenance | {"joint": ", ".join(points)}
     del provenance["bootstraps"]
@@ -187,9 +190,9 @@ def _shared_front(
     # A term that repeats another at one point may stand for it there, if they differ elsewhere.
     usable = np.any([usable_terms(problem) for problem in problems.values()], axis=0)
     masks = search.shared_supports(
-        np.stack([gram.xx[0] * usable[:, None] * usable for gram in grams]),
-        np.stack([gram.xy[0, k] * usable for gram in grams]),
-        np.array([gram.yy[0, k] for gram in grams]),
+        np.stack([gram.xx * usable[:, None] * usable for gram in grams]),
+        np.stack([gram.xy[k] * usable for gram in grams]),
+        np.array([gram.yy[k] for gram in grams]),
     )
     fits = {
         p: fit_supports(each, equation, _keep_determined(each, masks))
@@ -197,7 +200,7 @@ def _shared_front(
     }
     by_point = [errors_of(fits[p]) for p in problems]
     errors = np.exp(np.log(np.maximum(by_point, ROUNDING)).mean(axis=0))
-    order = front_order(masks.sum(axis=1), errors, depth=depth)
+    order = order_front(masks.sum(axis=1), errors, depth=depth)
     names = np.array(any_problem.term_names)
     return SharedFront(
         equation=equation,
@@ -217,20 +220,17 @@ def _keep_determined(
     found = masks.copy()
     for mask in found:
         columns = np.flatnonzero(mask)
-        mask[columns] = independent_terms(problem.train_gram.xx[0][np.ix_(columns, columns)])
+        mask[columns] = independent_terms(problem.train_gram.xx[np.ix_(columns, columns)])
     return found
 
 
 def _summed_scores(
     fronts: Sequence[SharedFront],
-    selection: Selection | SystemSelection,
-    library: Library,
-    runs: Mapping[str, Sequence[Trajectory]],
+    selection: Selection,
+    tasks: Mapping[str, Task],
 ) -> list[Float[np.ndarray, " supports"]]:
-    points = list(fronts[0].points)
-    rule = selection.shared_by(len(points)) if isinstance(selection, EBIC) else selection
+    rule = selection.shared_by(len(tasks)) if isinstance(selection, EBIC) else selection
     by_point = [
-        score_candidates(rule, [front.points[p] for front in fronts], library, runs[p])
-        for p in points
+        rule.decide([front.points[p] for front in fronts], task).scores for p, task in tasks.items()
     ]
     return [np.sum(scores, axis=0) for scores in zip(*by_point, strict=True)]

@@ -7,4 +7,5 @@ from ep2sindy.library.relations import relations_from_matrix as relations_from_m
 from ep2sindy.regression.front import pareto_front as pareto_front
 from ep2sindy.regression.front import ParetoFront as ParetoFront
 from ep2sindy.regression.front import Candidate as Candidate
-from ep2sindy.regression.bootstraps import pooled_supports as pooled_supports
+from ep2sindy.regression.bootstraps import pool_supports as pool_supports
+from ep2sindy.regression.least_squares import LeastSquares as LeastSquares

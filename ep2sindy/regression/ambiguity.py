@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.library import Library
-from ep2sindy.regression.gram_kernels import independent_terms
+from ep2sindy.regression.gram_kernels import independent_terms, invert_gram
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
 
 # Bounds on one minus the cosine between two columns: at 1e-10 they differ by 1e-5 of their size.
@@ -48,7 +49,7 @@ def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
 
     A term is simpler if its degree is lower, or if it is earlier in the library.
     """
-    xx = problem.train_gram.xx[0]
+    xx = problem.train_gram.xx
     if _all_usable(problem.library, xx, SAME):
         return np.ones(len(xx), dtype=np.bool_)
     usable = _distinct(problem.library, xx)
@@ -75,14 +76,14 @@ def few_rows(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     return (Ambiguity((), message, True),)
 
 
-def simplest_first(library: Library) -> Int[np.ndarray, " terms"]:
+def order_by_degree(library: Library) -> Int[np.ndarray, " terms"]:
     """Terms by degree, and of one degree in the order of the library."""
     return np.argsort(library.degrees, kind="stable")
 
 
 def _distinct(library: Library, xx: Float[np.ndarray, "terms terms"]) -> Bool[np.ndarray, " terms"]:
     """Terms that are not zero and do not repeat a simpler one."""
-    order = simplest_first(library)
+    order = order_by_degree(library)
     distinct = np.diag(xx) > 0.0
     repeats = np.triu(np.abs(xx[np.ix_(order, order)]) > 1.0 - SAME, k=1)
     for first, second in order[np.argwhere(repeats)]:
@@ -92,7 +93,7 @@ def _distinct(library: Library, xx: Float[np.ndarray, "terms terms"]) -> Bool[np
 
 def ambiguities(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     """All ambiguities between terms on the training rows."""
-    return find_ambiguities(problem.library, lambda: problem.train_theta, problem.train_gram.xx[0])
+    return find_ambiguities(problem.library, lambda: problem.train_theta, problem.train_gram.xx)
 
 
 def find_ambiguities(
@@ -115,7 +116,7 @@ def _all_usable(library: Library, xx: Float[np.ndarray, "terms terms"], same: fl
 
     same: 1 - |cosine| below which two terms are the same.
     """
-    squares, order = np.diag(xx), simplest_first(library)
+    squares, order = np.diag(xx), order_by_degree(library)
     if not (np.isfinite(xx).all() and (squares > 0.0).all()):
         return False
     apart = np.abs(xx - np.diag(squares)) <= 1.0 - same
@@ -132,7 +133,7 @@ def _zero(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambigu
 
 def _alike(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
     """Pairs of proportional terms, the simpler one first; a term left out is reported once."""
-    names, order = library.names, simplest_first(library)
+    names, order = library.names, order_by_degree(library)
     kept = _distinct(library, xx)
     cosines = np.abs(xx[np.ix_(order, order)])
     found = []
@@ -180,16 +181,16 @@ def _combinations(
     xx: Float[np.ndarray, "terms terms"],
 ) -> list[tuple[int, list[int]]]:
     """Distinct terms that depend on simpler ones, each with the indices of those terms."""
-    order = simplest_first(library)
+    order = order_by_degree(library)
     columns = order[_distinct(library, xx)[order]]
     independent = independent_terms(xx[np.ix_(columns, columns)])
     found = []
     for rank in np.flatnonzero(~independent):
         basis = np.sort(columns[:rank][independent[:rank]])
-        weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, columns[rank]])
+        weights = invert_gram(xx[np.ix_(basis, basis)]) @ xx[basis, columns[rank]]
         if (np.abs(weights) > 1e-6).sum() > MAX_PARTS:
             # The Gram matrix has lost half the digits; a fit on the rows may need fewer parts.
             values = theta()
-            weights = np.linalg.lstsq(values[:, basis], values[:, columns[rank]], rcond=None)[0]
+            weights = LeastSquares.of_rows(values[:, basis], values[:, columns[rank]]).coef
         found.append((int(columns[rank]), basis[np.abs(weights) > 1e-6].tolist()))
     return found

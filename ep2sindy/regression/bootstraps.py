@@ -27,13 +27,22 @@ MOST_WEIGHTS = 2**24  # weights of rows, over the draws that are made at once
 class Bootstraps:
     """Repeated draws of rows and of a reduced library, so that no support depends on a few rows.
 
+        X^T W_k X and X^T W_k y of draw k, W_k the diagonal of how often each row was drawn
+
+    A search sees one pair per draw. Assumes that the groups of rows are exchangeable; with block
+    above 1, that rows farther apart than a block are uncorrelated.
     Each of the `n` draws takes, with replacement, a random share of the training groups
     between `smallest` and `largest`, and leaves out `n_culled` random terms.
     block: number of neighbouring training groups drawn together. 1 draws single groups, as in the
     thesis, and understates the scatter for a time series, whose neighbours are correlated. More
     than 1 is allowed for one trajectory only. A draw of fewer rows than there are scatters more
     than the whole record would. n = 0: one search on all training rows and terms.
-    Source: the thesis, II-C and II-H.
+    Source: the thesis, II-C and II-H; Kuensch 1989, doi:10.1214/aos/1176347265, for blocks.
+
+    >>> thesis = ep.Regression(ep.Differential(), ep.AdaptiveLasso(), ep.Knee(), ep.Bootstraps(50))
+    >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
+    >>> ep.discover(run, method=thesis, seed=0).chosen["x"].share  # of draws with these terms
+    0.64
     """
 
     n: int = 32
@@ -69,12 +78,8 @@ class Bootstraps:
             halves = [replace(self, n=n) for n in (self.n // 2, self.n - self.n // 2)]
             parts = [half.draw(problem, terms, rng) for half in halves]
             return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
-        group = problem.groups[~problem.test]
-        if (group[1:] > group[:-1]).all():  # each row alone, which is told at a tenth of the cost
-            counts, kept = self.draw_groups(len(group), terms, rng)
-            return problem.resampled_sums(counts), kept
-        _, group = np.unique(group, return_inverse=True)
-        counts, kept = self.draw_groups(int(group.max()) + 1, terms, rng)
+        numbers, group = np.unique(problem.groups[~problem.test], return_inverse=True)
+        counts, kept = self.draw_groups(len(numbers), terms, rng)
         return problem.resampled_sums(counts.take(group, axis=1)), kept
 
     def draw_groups(
@@ -91,7 +96,7 @@ class Bootstraps:
         for k in range(self.n):
             share = self.smallest + (self.largest - self.smallest) * rng.random()
             n_drawn = max(1, round(share * n_groups))
-            counts[k] = moving_block_counts(n_groups, n_drawn=n_drawn, block=self.block, rng=rng)
+            counts[k] = count_block_draws(n_groups, n_drawn=n_drawn, block=self.block, rng=rng)
             kept[k, rng.permutation(usable)[: self.n_culled]] = False
         return counts, kept
 
@@ -216,7 +221,7 @@ def draw_resamples(
     )
 
 
-def pooled_supports(
+def pool_supports(
     problem: RegressionRows,
     search: Search,
     bootstraps: Bootstraps,
@@ -238,19 +243,13 @@ def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ te
     for size in np.unique(sizes):
         own = sizes == size
         held[size] = (in_draw[:, own].astype(np.float64) @ masks[own] > 0.0).sum(axis=0)
-    supports = Supports(
+    # One search on all rows does not tell how often another search would agree.
+    unknown = 0.0 if draws.counted else np.nan
+    return Supports(
         equation=draws.equations[equation],
         masks=masks,
-        share=in_draw.mean(axis=0),
-        inclusion=held / draws.n_kept,
-    )
-    if draws.counted:
-        return supports
-    # One search on all rows does not tell how often another search would agree.
-    return replace(
-        supports,
-        share=np.full_like(supports.share, np.nan),
-        inclusion=np.full_like(supports.inclusion, np.nan),
+        share=in_draw.mean(axis=0) + unknown,
+        inclusion=held / draws.n_kept + unknown,
     )
 
 
@@ -265,7 +264,7 @@ def _distinct(
     return masks[first], which
 
 
-def moving_block_counts(
+def count_block_draws(
     n_rows: int, *, n_drawn: int, block: int, rng: np.random.Generator
 ) -> Int[np.ndarray, " rows"]:
     """Number of times each row occurs in a draw of `n_drawn` rows, made of runs of `block` rows.

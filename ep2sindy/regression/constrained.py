@@ -9,12 +9,13 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.relations import ROUNDING, Constraint, place_of
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.bootstraps import Resamples
+from ep2sindy.regression.gram_kernels import invert_gram
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.whitening import WhitenedRows, whitened_rows
+from ep2sindy.regression.whitening import WhitenedRows, whiten_rows
 
 # Lower bound on the residual, as a share of the target's RMS; it limits the weight of an equation
 # with an exact fit.
@@ -55,7 +56,7 @@ def constrained_fit(
         (place_of(library, names, state, term, f"the sign of {(state, term)}"), sign)
         for (state, term), sign in (signs or {}).items()
     ]
-    equations = weighted_equations(problems, constraint)
+    equations = weigh_equations(problems, constraint)
     coef, covariance = _solve(equations, constraint, _bounds(constraint, signed))
     for k, sign in signed:
         if sign * coef[k] <= ROUNDING * abs(constraint.d[k]):
@@ -76,7 +77,7 @@ def constrained_fit(
     )
 
 
-def constrained_draws(
+def fit_draws(
     problems: Sequence[RegressionRows], draws: Mapping[str, Resamples], constraint: Constraint
 ) -> Float[np.ndarray, "draws coefs"]:
     """Fit the free coefficients to all equations at once, in every bootstrap of their rows.
@@ -85,8 +86,9 @@ def constrained_draws(
     their residuals on all rows; the noise of samples is not corrected. A coefficient whose terms
     are zero in a draw is zero there. Returns all coefficients, in SI.
     """
-    normal, right = 0.0, 0.0
-    for equation in weighted_equations(problems, constraint):
+    n = len(constraint.free)
+    normal, right = np.zeros((1, n, n)), np.zeros((1, n, 1))
+    for equation in weigh_equations(problems, constraint):
         own, number = equation.terms, equation.number
         drawn = draws[equation.problem.equations[number]]
         scale = drawn.scale[:, own] * equation.problem.coef_scale(number)[own]
@@ -95,10 +97,7 @@ def constrained_draws(
         weighted = (inverse * constraint.C[equation.at]).transpose(0, 2, 1) / equation.std**2
         normal = normal + weighted @ gram @ (inverse * constraint.C[equation.at])
         right = right + weighted @ (drawn.xy[:, number, own, None] - gram @ known)
-    size = np.sqrt(np.diagonal(normal, axis1=1, axis2=2))[:, :, None]
-    size = np.where(size > 0.0, size, 1.0)
-    inverted = np.linalg.pinv(normal / size / size.transpose(0, 2, 1), hermitian=True)
-    free = inverted @ (right / size) / size
+    free = invert_gram(normal) @ right
     return free[:, :, 0] @ constraint.C.T + constraint.d
 
 
@@ -165,10 +164,10 @@ def _whiten(
 ) -> WhitenedRows:
     mask, full = np.zeros(len(problem.library), dtype=np.bool_), np.zeros(len(problem.library))
     mask[terms], full[terms] = True, coef
-    return whitened_rows(problem, mask, full, n_steps=n_steps, kept=mask)
+    return whiten_rows(problem, mask, full, n_steps=n_steps, kept=mask)
 
 
-def weighted_equations(
+def weigh_equations(
     problems: Sequence[RegressionRows], constraint: Constraint
 ) -> list[WeightedEquation]:
     """The constraint's equations that depend on at least one free coefficient."""
@@ -190,19 +189,19 @@ def _fit_alone(
     problem: RegressionRows, number: int, at: np.ndarray, terms: np.ndarray
 ) -> WeightedEquation:
     theta, target = problem.train_theta[:, terms], problem.train_target(number)
-    start = np.linalg.lstsq(theta, target, rcond=None)[0]
-    variance = np.square(target - theta @ start).sum() / max(len(target) - len(terms), 1)
+    fit = LeastSquares.of_rows(theta, target)
+    variance = fit.squares / max(len(target) - len(terms), 1)
     least = MIN_RESIDUAL**2 * np.square(target).mean()
     if problem.noisy is not None:
-        white = _whiten(problem, terms, start, n_steps=8)
+        white = _whiten(problem, terms, fit.coef, n_steps=8)
         problem = replace(problem, noisy=replace(problem.noisy, smoothed=white.corrected))
-        start = np.linalg.lstsq(white.theta[:, terms], white.target, rcond=None)[0]
+        fit = LeastSquares.of_rows(white.theta[:, terms], white.target)
     return WeightedEquation(
         problem=problem,
         number=number,
         at=at,
         terms=terms,
-        start=start * problem.coef_scale(number)[terms],
+        start=fit.coef * problem.coef_scale(number)[terms],
         std=float(np.sqrt(max(variance, least))) or 1.0,
     )
 
@@ -224,45 +223,11 @@ def _solve(
             terms, slope = equation.rows(coef[equation.at])
             theta = np.concatenate([theta, terms @ C[equation.at]])
             target = np.concatenate([target, slope - terms @ d[equation.at]])
-        names = [constraint.coefficients[k] for k in constraint.free]
-        z, root, variance = _least_squares(theta, target, bounds, names)
-        coef = constraint.coef(z)
-    return coef, C @ root @ (C @ root).T * (1.0 if all(noisy) else variance)
-
-
-def _least_squares(
-    theta: Float[np.ndarray, "rows free"],
-    target: Float[np.ndarray, " rows"],
-    bounds: Float[np.ndarray, "2 free"],
-    names: Sequence[tuple[str, str]],
-) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"], float]:
-    """Coefficients, a root of their covariance for rows of variance 1, and the rows' variance."""
-    from scipy.optimize import lsq_linear  # import takes 0.5 s; most searches do not need it
-
-    n = theta.shape[1]
-    if not n:  # nothing is free
-        return np.zeros(0), np.zeros((0, 0)), float(target @ target / max(len(target), 1))
-    norms, size = column_norms(theta), np.linalg.norm(target) or 1.0
-    columns = np.column_stack([theta / norms, target / size])
-    triangle = np.asarray(np.linalg.qr(columns, mode="r"))
-    upper = triangle[:n, :n]
-    _, singular, directions = np.linalg.svd(upper)
-    vanishing = directions[singular <= ROUNDING * singular.max(initial=0.0)]
-    if len(vanishing):
-        part = (np.abs(vanishing) > 1e-3).any(axis=0)
-        joined = [name for name, is_part in zip(names, part, strict=True) if is_part]
-        raise ValueError(f"coefficients must be independent to be fitted: {joined} are not")
-    solution = lsq_linear(
-        upper,
-        triangle[:n, n],
-        bounds=bounds * norms / size,
-        method="bvls",
-        max_iter=10 * n + 10,
-    )
-    assert solution.success
-    loose = solution.active_mask == 0
-    root = np.zeros((n, n))
-    root[loose] = np.linalg.pinv(upper[:, loose])
-    squares = np.square(triangle[n:, n]).sum() + np.square(solution.fun).sum()
-    variance = squares * size**2 / max(len(target) - loose.sum(), 1)
-    return solution.x * size / norms, root / norms[:, None], float(variance)
+        fit = LeastSquares.of_rows(theta, target, bounds)
+        if not fit.is_determined:
+            names = [constraint.coefficients[k] for k in constraint.free[fit.dependent]]
+            raise ValueError(f"coefficients must be independent to be fitted: {names} are not")
+        coef = constraint.coef(fit.coef)
+    root, n_free = C @ fit.root, int((~fit.held).sum())
+    variance = 1.0 if all(noisy) else fit.squares / max(len(target) - n_free, 1)
+    return coef, root @ root.T * variance

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.regression.gram_kernels import DEPENDENT, invert_gram
 
-DEPENDENT = 1e-10  # share of a column's square that the chosen terms leave, if it depends on them
 ROUNDING = 1e-14  # of the target's square: a smaller residual is rounding
 MAX_EXCHANGES = 50  # at one size; a handful is usual
 
 
-def exchanged_supports(
+def exchange_terms(
     xx: Float[np.ndarray, "problems terms terms"],
     xy: Float[np.ndarray, "problems terms"],
     yy: Float[np.ndarray, " problems"],
@@ -42,15 +42,15 @@ def exchanged_supports(
     by_size: list[dict[frozenset[int], float]] = []
     best = frozenset[int]()
     for size in range(1, min(max_terms, n_terms) + 1):
-        grown = _best_with_one_more(xx, xy, yy, best)
+        grown = _add_best(xx, xy, yy, best)
         if grown is None:
             break
-        seen = {support: _residual(xx, xy, yy, support) for support in starts.get(size, [])}
+        seen = {support: _measure(xx, xy, yy, support) for support in starts.get(size, [])}
         seen |= _descend(xx, xy, yy, min([*seen.items(), grown], key=lambda each: each[1]))
         best = min(seen, key=lambda support: seen[support])
         by_size.append(seen)
     for fewer, more in reversed([*pairwise(by_size)]):
-        shrunk = _best_with_one_less(xx, xy, yy, min(more, key=lambda support: more[support]))
+        shrunk = _drop_least(xx, xy, yy, min(more, key=lambda support: more[support]))
         if shrunk[1] < min(fewer.values()):
             fewer |= _descend(xx, xy, yy, shrunk)
     found = [frozenset[int]()]
@@ -71,7 +71,7 @@ def _descend(
         near = {best: least}
         for term in best:
             kept = best - {term}
-            residuals = _residuals_with(xx, xy, yy, sorted(kept))
+            residuals = _try_each(xx, xy, yy, sorted(kept))
             for other in np.argsort(residuals)[: len(best) + 1].tolist():
                 if np.isfinite(residuals[other]):
                     near.setdefault(kept | {other}, float(residuals[other]))
@@ -82,35 +82,35 @@ def _descend(
     return near
 
 
-def _best_with_one_more(
+def _add_best(
     xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, support: frozenset[int]
 ) -> tuple[frozenset[int], float] | None:
     """The support with its best further term, and the residual; None if no term adds anything."""
-    residuals = _residuals_with(xx, xy, yy, sorted(support))
+    residuals = _try_each(xx, xy, yy, sorted(support))
     term = int(np.argmin(residuals))
     return (support | {term}, float(residuals[term])) if np.isfinite(residuals[term]) else None
 
 
-def _best_with_one_less(
+def _drop_least(
     xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, support: frozenset[int]
 ) -> tuple[frozenset[int], float]:
     """The support without the term whose loss costs least, and the residual."""
     terms = sorted(support)
-    inverse = np.linalg.pinv(xx[:, terms][:, :, terms], rcond=DEPENDENT, hermitian=True)
+    inverse = invert_gram(xx[:, terms][:, :, terms])
     coef = np.einsum("pst,pt->ps", inverse, xy[:, terms])
     losses = np.square(coef) / zero_to_one(np.einsum("pss->ps", inverse))
     left = yy - np.einsum("ps,ps->p", coef, xy[:, terms])
     residuals = np.log(np.maximum(left[:, None] + losses, ROUNDING * yy[:, None])).sum(axis=0)
     smaller = support - {terms[int(np.argmin(residuals))]}
-    return smaller, _residual(xx, xy, yy, smaller)
+    return smaller, _measure(xx, xy, yy, smaller)
 
 
-def _residual(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, support: frozenset[int]) -> float:
+def _measure(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, support: frozenset[int]) -> float:
     first, *others = sorted(support)
-    return float(_residuals_with(xx, xy, yy, others)[first])
+    return float(_try_each(xx, xy, yy, others)[first])
 
 
-def _residuals_with(
+def _try_each(
     xx: Float[np.ndarray, "problems terms terms"],
     xy: Float[np.ndarray, "problems terms"],
     yy: Float[np.ndarray, " problems"],
@@ -121,7 +121,7 @@ def _residuals_with(
     Of several problems it is the sum of the residuals' logarithms.
     """
     columns, target = xx[:, :, chosen], xy[:, chosen]
-    inverse = np.linalg.pinv(columns[:, chosen], rcond=DEPENDENT, hermitian=True)
+    inverse = invert_gram(columns[:, chosen])
     share = columns @ inverse
     square = np.einsum("pjj->pj", xx)
     own = square - np.einsum("pjs,pjs->pj", share, columns)

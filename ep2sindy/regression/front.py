@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,13 +12,11 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
-from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, solve_masks
-from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
+from ep2sindy.regression.least_squares import fit_masks_to_rows
+from ep2sindy.regression.rows import Grams, RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
-
-# Correction of coefficients, as a share of them, after which another one would be rounding.
-REFINED = 1e-9
 
 ROWS_AT_ONCE = 4096  # rows whose residuals, of all fits, are held at once
 
@@ -149,30 +146,28 @@ class ParetoFront:
         return np.diff(self.sizes, prepend=-1.0) > 0
 
     def __repr__(self) -> str:
-        rows = [
-            [str(c.n_terms), text, equation_text(self.equation, c.coef_by_term)]
-            for c, text in zip(self.candidates, self._figures, strict=True)
-        ]
-        head = f"ParetoFront of {self.equation}, {len(rows)} candidates"
-        return one_screen([head, *text_table(["terms", self._figure, "equation"], rows)])
+        head = f"ParetoFront of {self.equation}, {len(self.candidates)} candidates"
+        return one_screen([head, *text_table(*self._table(equation_text))])
 
     def _repr_html_(self) -> str:
+        return html_table(*self._table(equation_html))
+
+    def _table(self, written: Callable[..., str]) -> tuple[list[str], list[list[str]]]:
+        """Headings and rows; written: how an equation is."""
         rows = [
-            [str(c.n_terms), text, equation_html(self.equation, c.coef_by_term)]
+            [str(c.n_terms), text, written(self.equation, c.coef_by_term)]
             for c, text in zip(self.candidates, self._figures, strict=True)
         ]
-        return html_table(["terms", self._figure, "equation"], rows)
-
-    @property
-    def _figure(self) -> str:
-        """Heading of the figure of merit in tables."""
-        return "R2" if self.has_errors else "deviance"
+        return ["terms", "R2" if self.has_errors else "deviance", "equation"], rows
 
     @property
     def _figures(self) -> list[str]:
         if self.has_errors:
             return [f"{c.r2:.6f}" for c in self.candidates]
         return ["" if c.deviance is None else f"{c.deviance:.6g}" for c in self.candidates]
+
+
+Fronts = Sequence[ParetoFront]
 
 
 def errors_of(candidates: Sequence[Candidate]) -> Float[np.ndarray, " candidates"]:
@@ -197,12 +192,9 @@ def fit_supports(
     problem: RegressionRows, equation: str, masks: Bool[np.ndarray, "supports terms"]
 ) -> list[Candidate]:
     """Fit given supports as in `fit_support`; coefficients of dependent terms are NaN."""
-    number = problem.equations.index(equation)
     unknown = np.full(len(masks), np.nan)
     nothing = np.full((len(problem.library) + 1, len(problem.library)), np.nan)
-    supports = Supports(equation, masks, unknown, nothing)
-    fits = _fit(problem, number, masks, _spread(problem, number))
-    return _candidates(problem, supports, fits, range(len(masks)))
+    return _fit(problem, Supports(equation, masks, unknown, nothing))
 
 
 def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1) -> ParetoFront:
@@ -213,9 +205,8 @@ def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1)
     with linearly dependent terms. With noise in the library a wrong support can score slightly
     better than the true one of the same size; a depth of 3 keeps both for a later selection.
     """
-    depth, equation = check_count("depth", depth), problem.equations.index(supports.equation)
-    sizes = supports.masks.sum(axis=1)
-    explained, best = _rank(problem, equation, supports.masks, depth)
+    depth, sizes = check_count("depth", depth), supports.masks.sum(axis=1)
+    explained, best = _rank(problem, supports, depth)
     empty = np.zeros((1, len(problem.library)), dtype=np.bool_)
     chosen = Supports(
         equation=supports.equation,
@@ -223,15 +214,13 @@ def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1)
         share=np.append(supports.share[sizes == 0].sum(), supports.share[best]),
         inclusion=supports.inclusion,
     )
-    about_mean = _spread(problem, equation)
-    fits = _fit(problem, equation, chosen.masks, about_mean)
-    order = front_order(np.append(0, sizes[best]), -fits.r2, depth=depth)
-    candidates = _candidates(problem, chosen, fits, order)
-    cloud = _cloud(problem, equation, about_mean, sizes, explained)
-    return ParetoFront(supports.equation, candidates, problem, cloud)
+    found = _fit(problem, chosen)
+    order = order_front(np.append(0, sizes[best]), errors_of(found), depth=depth)
+    cloud = _cloud(problem, supports, explained)
+    return ParetoFront(supports.equation, [found[k] for k in order], problem, cloud)
 
 
-def front_order(
+def order_front(
     sizes: Int[np.ndarray, " candidates"], errors: Float[np.ndarray, " candidates"], *, depth: int
 ) -> list[int]:
     """Indices of the front: the `depth` best of each size whose best beats all smaller sizes."""
@@ -247,142 +236,79 @@ def front_order(
     return front
 
 
-class Spread(NamedTuple):
-    """Sums of squares of a scaled target about its mean; that of held-out rows is NaN for none."""
-
-    train: float
-    test: float
-
-
-class RowFits(NamedTuple):
-    """Least-squares fits of supports to the training rows, in scaled columns, and their scores."""
-
-    coef: Float[np.ndarray, "supports terms"]
-    r2_train: Float[np.ndarray, " supports"]
-    r2_test: Float[np.ndarray, " supports"]
-
-    @property
-    def r2(self) -> Float[np.ndarray, " supports"]:
-        """R2 on held-out rows, or on the training rows if none are held out."""
-        return np.where(np.isnan(self.r2_test), self.r2_train, self.r2_test)
-
-
-def _spread(problem: RegressionRows, equation: int) -> Spread:
-    held_out = problem.test_target(equation)
-    return Spread(
-        train=_squares_about_mean(problem.train_target(equation)),
-        test=_squares_about_mean(held_out) if len(held_out) else float("nan"),
-    )
-
-
-def _squares_about_mean(values: Float[np.ndarray, " rows"]) -> float:
-    """Sum of squares about the mean, exactly zero for a constant."""
-    values = values - values[0]
-    values -= values.mean()
-    return float(values @ values)
-
-
-def _candidates(
-    problem: RegressionRows, supports: Supports, fits: RowFits, chosen: Iterable[int]
-) -> list[Candidate]:
-    """Candidates of the chosen supports."""
-    equation = problem.equations.index(supports.equation)
-    coef_SI = problem.coef_SI(fits.coef, equation)
-    sizes = supports.masks.sum(axis=1)
-    of, columns = np.nonzero(supports.masks)
-    coef, inclusion = coef_SI[of, columns], supports.inclusion[sizes[of], columns]
-    of_terms = problem.term_names
-    names, ends = [of_terms[j] for j in columns.tolist()], np.cumsum(sizes).tolist()
-    r2_train, r2_test, share = (
-        fits.r2_train.tolist(),
-        fits.r2_test.tolist(),
-        supports.share.tolist(),
-    )
-    found = []
-    for k in chosen:
-        own = slice(ends[k - 1] if k else 0, ends[k])
-        found.append(
-            Candidate(
-                equation=supports.equation,
-                terms=tuple(names[own]),
-                coef=coef[own],
-                r2_train=r2_train[k],
-                r2_test=r2_test[k],
-                share=share[k],
-                inclusion=inclusion[own],
-            )
-        )
-    return found
-
-
 def _rank(
-    problem: RegressionRows, equation: int, masks: Bool[np.ndarray, "supports terms"], depth: int
+    problem: RegressionRows, supports: Supports, depth: int
 ) -> tuple[Float[np.ndarray, " supports"], Int[np.ndarray, " best"]]:
     """Reduction of the target's sum of squares by each support, on the rows used for scoring.
 
     Computed from Gram matrices only; NaN for linearly dependent terms. And the indices of the
     `depth` supports that reduce it most of each size, ordered by size.
     """
-    train = problem.train_gram
-    judge = problem.test_gram if problem.test.any() else train
-    coef = fit_masks(train.xx[0], train.xy[0, equation], masks)
-    explained, sizes = (
-        explained_squares(coef, judge.xx[0], judge.xy[0, equation]),
-        masks.sum(axis=1),
-    )
+    equation, sizes = problem.equations.index(supports.equation), supports.masks.sum(axis=1)
+    train, judge = problem.train_gram, _judging_gram(problem)
+    coef = fit_masks(train.xx, train.xy[equation], supports.masks)
+    explained = explained_squares(coef, judge.xx, judge.xy[equation])
     order = np.lexsort((-explained, sizes))
     order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
     rank = np.arange(len(order)) - np.searchsorted(sizes[order], sizes[order])
     return explained, order[rank < depth]
 
 
+def _judging_gram(problem: RegressionRows) -> Grams:
+    """Gram matrices of the held-out rows, or of the training rows if none are held out."""
+    return problem.test_gram if problem.test.any() else problem.train_gram
+
+
 def _cloud(
-    problem: RegressionRows,
-    equation: int,
-    about_mean: Spread,
-    sizes: Int[np.ndarray, " supports"],
-    explained: Float[np.ndarray, " supports"],
+    problem: RegressionRows, supports: Supports, explained: Float[np.ndarray, " supports"]
 ) -> Cloud:
     """Sizes and errors of all supports.
 
     The sum of squares about the mean is not zero here: `r2_of` would have raised before.
     """
-    held_out = problem.test.any()
-    gram = problem.test_gram if held_out else problem.train_gram
-    errors = (gram.yy[0, equation] - explained) / (
-        about_mean.test if held_out else about_mean.train
-    )
+    equation = problem.equations.index(supports.equation)
+    spread = _squares_about_mean(problem, equation, test=bool(problem.test.any()))
+    errors = (_judging_gram(problem).yy[equation] - explained) / spread
     fitted = np.isfinite(errors)
-    return Cloud(sizes[fitted], errors[fitted])
+    return Cloud(supports.masks.sum(axis=1)[fitted], errors[fitted])
 
 
-def _fit(
-    problem: RegressionRows,
-    equation: int,
-    masks: Bool[np.ndarray, "supports terms"],
-    about_mean: Spread,
-) -> RowFits:
-    """Fit every support to the training rows, and score it on both training and held-out rows.
-
-    The Gram matrix squares the condition number of the rows, so its solution is refined with the
-    residuals of the rows themselves (Bjorck 1996, Numerical Methods for Least Squares, 2.9.3).
-    """
+def _fit(problem: RegressionRows, supports: Supports) -> list[Candidate]:
+    """Fit every support to the training rows, and score it on both training and held-out rows."""
+    equation, masks = problem.equations.index(supports.equation), supports.masks
     gram = problem.train_gram
-    xx = gram.xx[0]
-    coef = fit_masks(xx, gram.xy[0, equation], masks)
-    for _ in range(2):
+
+    def residuals(coef: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         left = np.zeros_like(coef)
-        squares = _residual_squares(problem, equation, coef, test=False, products=left)
-        step = solve_masks(xx, left, masks)
-        coef += step
-        squares -= (step * (2.0 * left - step @ xx)).sum(axis=1)  # what the step explains
-        if not (np.abs(step) > REFINED * np.abs(coef).max(axis=1, keepdims=True)).any():
-            break  # the next step would be as much smaller again
-    r2_train = r2_of(squares, spread=about_mean.train)
-    if np.isnan(about_mean.test):
-        return RowFits(coef, r2_train, np.full(len(coef), np.nan))
-    squares = _residual_squares(problem, equation, coef, test=True)
-    return RowFits(coef, r2_train, r2_of(squares, spread=about_mean.test))
+        return _residual_squares(problem, equation, coef, test=False, products=left), left
+
+    coef, squares = fit_masks_to_rows(gram.xx, gram.xy[equation], masks, residuals)
+    r2_train = r2_of(squares, spread=_squares_about_mean(problem, equation, test=False))
+    r2_test = np.full(len(coef), np.nan)
+    if problem.test.any():
+        squares = _residual_squares(problem, equation, coef, test=True)
+        r2_test = r2_of(squares, spread=_squares_about_mean(problem, equation, test=True))
+    names, coef_SI = np.array(problem.term_names), problem.coef_SI(coef, equation)
+    return [
+        Candidate(
+            equation=supports.equation,
+            terms=tuple(names[mask].tolist()),
+            coef=coef_SI[k, mask],
+            r2_train=float(r2_train[k]),
+            r2_test=float(r2_test[k]),
+            share=float(supports.share[k]),
+            inclusion=supports.inclusion[np.count_nonzero(mask), mask],
+        )
+        for k, mask in enumerate(masks)
+    ]
+
+
+def _squares_about_mean(problem: RegressionRows, equation: int, *, test: bool) -> float:
+    """Sum of squares of a scaled target about its mean, exactly zero for a constant."""
+    values = problem.test_target(equation) if test else problem.train_target(equation)
+    values = values - values[0]
+    values -= values.mean()
+    return float(values @ values)
 
 
 def _residual_squares(

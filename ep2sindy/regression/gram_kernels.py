@@ -1,4 +1,6 @@
-"""Least squares on supports, from Gram matrices only; the loops are compiled.
+"""Least squares on supports, from Gram matrices only; the loops over supports are compiled.
+
+The rule of rank is that of `least_squares.LeastSquares`: DEPENDENT serves both.
 
 xx: (terms, terms) is a Gram matrix of columns in comparable units; a mask: (terms,) of bool is a
 support.
@@ -6,6 +8,7 @@ support.
 
 import numpy as np
 
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.runtime.compilation import LOOPS, compiled
 
 WITHIN = {**LOOPS, "no_cpython_wrapper": True}  # for kernels that only kernels call
@@ -24,6 +27,8 @@ def append_term(xx, active, n_active, term, lower):
     Returns false if the term depends on them. The diagonal of a factor holds reciprocals, since a
     division takes longer than the rest of an inner loop.
     """
+    # Row of L in L L^T = G: L[n, i] = (G[n, i] - sum_k L[n, k] L[i, k]) / L[i, i], and
+    # L[n, n]^2 = G[n, n] - sum_i L[n, i]^2, the square that the active terms leave of the new one.
     rest = xx[term, term]
     for i in range(n_active):
         total = xx[term, active[i]]
@@ -40,11 +45,13 @@ def append_term(xx, active, n_active, term, lower):
 @compiled(**WITHIN)
 def substitute(lower, rhs, active, n_active, out):
     """Solve xx[active][:, active] out = rhs[active] by the Cholesky factor of the active terms."""
+    # Forward: L u = rhs.
     for i in range(n_active):
         total = rhs[active[i]]
         for k in range(i):
             total -= lower[i, k] * out[k]
         out[i] = total * lower[i, i]
+    # Backward: L^T out = u, column by column, since rows of L lie together in memory.
     for i in range(n_active - 1, -1, -1):
         out[i] *= lower[i, i]
         for k in range(i):
@@ -110,6 +117,7 @@ def fill_solutions(xx, rhs, masks, coef, lower, solution, active):
     """
     n_active = np.int64(0)
     for m in range(len(masks)):
+        # L L^T = G_S for the support S, then G_S b_S = rhs_S; b = 0 elsewhere.
         n_active, solved = _extend(xx, masks[m], active, n_active, lower)
         for j in range(coef.shape[1]):
             coef[m, j] = 0.0 if solved else np.nan
@@ -130,3 +138,22 @@ def fit_masks(xx, xy, masks):
 def explained_squares(coef, xx, xy):
     """Reduction of the target's sum of squares by each row of coef, on the rows of xx and xy."""
     return (coef * (2.0 * xy - coef @ xx)).sum(axis=1)
+
+
+def invert_gram(xx):
+    """Inverses of Gram matrices under the rule of `LeastSquares`: what is dependent stays out.
+
+    xx: (..., terms, terms), of columns in any units. A column of zeros has zeros in the inverse.
+    """
+    size = np.sqrt(zero_to_one(np.maximum(np.diagonal(xx, axis1=-2, axis2=-1), 0.0)))
+    sizes = size[..., :, None] * size[..., None, :]
+    unit = xx / sizes
+    inverse = np.empty_like(unit)
+    for index in np.ndindex(unit.shape[:-2]):
+        one = unit[index]
+        inverse[index] = (
+            np.linalg.inv(one)
+            if independent_terms(one).all()
+            else np.linalg.pinv(one, rcond=DEPENDENT, hermitian=True)
+        )
+    return inverse / sizes

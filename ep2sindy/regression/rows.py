@@ -28,15 +28,14 @@ ROW_BLOCK = 512  # rows whose pair products are held at once, few enough to fit 
 
 @dataclass(frozen=True, eq=False)
 class Grams:
-    """Gram matrices: weighted sums of products of scaled columns, all that least squares needs.
+    """Sums of products of scaled columns over some rows, all that least squares needs of them.
 
-    There is one set per draw of row weights. xx: (draws, terms, terms), xy: (draws, equations,
-    terms), yy: (draws, equations).
+    xx: of the terms, xy: of the terms and the target of each equation, yy: squares of the targets.
     """
 
-    xx: Float[np.ndarray, "draws terms terms"]
-    xy: Float[np.ndarray, "draws equations terms"]
-    yy: Float[np.ndarray, "draws equations"]
+    xx: Float[np.ndarray, "terms terms"]
+    xy: Float[np.ndarray, "equations terms"]
+    yy: Float[np.ndarray, " equations"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,9 +236,9 @@ class RegressionRows:
     def _grams(self, products: Float[np.ndarray, "columns columns"]) -> Grams:
         n = len(self.library)
         return Grams(
-            xx=products[None, :n, :n].copy(),  # views would be compiled for anew
-            xy=products[None, n:, :n].copy(),
-            yy=products.diagonal()[None, n:],
+            xx=products[:n, :n].copy(),  # views would be compiled for anew
+            xy=products[n:, :n].copy(),
+            yy=products.diagonal()[n:],
         )
 
     def _scaled_target(self, equation: int, *, test: bool) -> Float[np.ndarray, " _"]:

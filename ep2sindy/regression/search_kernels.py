@@ -28,6 +28,7 @@ ACTIVE, LEFT_POSITIVE, LEFT_NEGATIVE = 1, 2, 3
 def _next_event(coef, slope, correlation, drift, level, active, n_active, closed):
     """Next knot of the lasso path below the penalty `level`: step, term, and whether it joins."""
     step, term, joins = level, -1, False
+    # A coefficient reaches zero, b_j + step slope_j = 0, and its term leaves.
     for i in range(n_active):
         j = active[i]
         if coef[j] * slope[i] < 0.0 and -coef[j] / slope[i] < step:
@@ -35,7 +36,7 @@ def _next_event(coef, slope, correlation, drift, level, active, n_active, closed
     for j in range(len(coef)):
         if closed[j] == ACTIVE:
             continue
-        # The correlation meets plus the level, or minus the level.
+        # A correlation meets plus or minus the level, c_j - step drift_j = +-(level - step).
         if closed[j] != LEFT_POSITIVE and 1.0 - drift[j] > 1e-12:
             distance = max((level - correlation[j]) / (1.0 - drift[j]), 0.0)
             if distance < step:
@@ -73,12 +74,14 @@ def _lasso_path(xx, xy, max_terms, lower, vectors, places, masks):
     closed = places[1]  # 0 for terms that can join
     n_active = np.int64(0)  # as a bare 0 it would have callees compiled twice
     left, level = -1, 0.0
+    # At b = 0 the correlations are c = X^T y; above the largest of them no term is active.
     for j in range(n_terms):
         coef[j], correlation[j], closed[j] = 0.0, xy[j], 0
         level = max(level, abs(xy[j]))
     floor = 1e-13 * level
     n_masks = _write_support(active, n_active, masks, np.int64(0))
     while level > floor and n_masks < len(masks):
+        # Between two knots b_A and c are linear in the level: d b_A = slope, d c = -drift.
         _fill_drift(xx, slope, active, n_active, drift)
         if left >= 0:  # with the sign it had, it would rejoin at this same knot
             closed[left] = LEFT_POSITIVE if correlation[left] > 0.0 else LEFT_NEGATIVE
@@ -102,6 +105,7 @@ def _lasso_path(xx, xy, max_terms, lower, vectors, places, masks):
         else:
             n_active = _leave(xx, active, n_active, term, lower)
             coef[term], closed[term], left = 0.0, 0, term
+        # c_A = level sign(c_A) holds on the next segment: G_A slope = sign(c_A).
         substitute(lower, signs, active, n_active, slope)
         if n_active > max_terms:
             break
@@ -132,6 +136,7 @@ def _move(step, coef, slope, active, n_active, correlation, drift, signs):
 @compiled(**WITHIN)
 def _fill_drift(xx, slope, active, n_active, drift):
     """Write the rate at which each term's correlation decreases along the path."""
+    # drift = G[:, A] slope
     for j in range(len(drift)):
         drift[j] = 0.0
     for i in range(n_active):
@@ -160,6 +165,8 @@ PLAIN_INNER = {**PLAIN, "no_cpython_wrapper": True}
 @compiled(**PLAIN_INNER)
 def _sweep(source, target, j, size):
     """Eliminate column j: remove its contribution from the rows and columns after j."""
+    # Schur complement: G[a, b] <- G[a, b] - G[a, j] G[j, b] / G[j, j]; last, of the target's
+    # square, the residual squares.
     for a in range(j + 1, size):
         ratio = source[a, j] / source[j, j]
         for b in range(a, size):
@@ -212,6 +219,7 @@ def _offer(residual, chosen, n_chosen, best, best_masks):
 def _begin(xx, xy, yy, levels, smallest, best, best_masks):
     """Write the first level, the bounds for zero, and the empty support as all that is known."""
     n_problems, n_terms = xy.shape
+    # levels[0, p] = [X y]^T [X y] of problem p: the residual squares stand in the last place.
     for p in range(n_problems):
         for i in range(n_terms):
             for j in range(n_terms):
@@ -229,11 +237,12 @@ def _begin(xx, xy, yy, levels, smallest, best, best_masks):
 
 
 @compiled(inline="always")
-def _with_column(levels, level, j, smallest):
+def _try_column(levels, level, j, smallest):
     """Product of residuals if column j is chosen as well, and whether it changes any."""
     n_problems, n_terms = levels.shape[1], levels.shape[2] - 1
     residual, adds = 0.0, False
     for p in range(n_problems):  # indexed directly: views would cost more than the arithmetic
+        # RSS - (x_j^T r)^2 / x_j^T x_j, of what the chosen columns leave of x_j and y
         left, pivot = levels[level, p, n_terms, n_terms], levels[level, p, j, j]
         if pivot > smallest[p, j]:
             left -= levels[level, p, j, n_terms] ** 2 / pivot
@@ -300,7 +309,7 @@ def _search_subsets(
             level -= 1
             continue
         following[level] = j + 1
-        residual, adds = _with_column(levels, level, j, smallest)
+        residual, adds = _try_column(levels, level, j, smallest)
         if not adds:
             continue
         chosen[level] = j
@@ -308,6 +317,7 @@ def _search_subsets(
         if level + 1 == depth or j + 1 == n_terms:
             continue
         _eliminate(levels, level, j, smallest)
+        # A branch is cut if even all its columns together leave more than the best of its size.
         worth_bounding = n_terms - j > 6 and depth - level > 2
         left = float(n_terms - j)
         work += n_problems * left * left * (1.0 + (left / 6.0 if worth_bounding else 0.0))

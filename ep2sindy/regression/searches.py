@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.regression.exchanges import exchanged_supports
+from ep2sindy.regression.exchanges import exchange_terms
 from ep2sindy.regression.gram_kernels import fit_masks, independent_terms
 from ep2sindy.regression.search_kernels import best_subsets, lasso_path
 from ep2sindy.runtime.values import set_counts
@@ -27,6 +27,7 @@ Masks = Bool[np.ndarray, "supports terms"]
 class Search(Protocol):
     """Interface that turns the Gram matrix of one equation into candidate supports.
 
+    One of your own in twenty lines is in docs/architecture.md.
     xx: (terms, terms) and xy: (terms,) of columns with unit norm; yy: squared norm of the target.
     A column of zeros is a term that is not available, and must not appear in a support.
     """
@@ -38,10 +39,18 @@ class Search(Protocol):
 class AdaptiveLasso:
     """All supports on the exact path of the adaptive lasso.
 
-    Each coefficient is penalised by |b_ols|^-gamma. The path is piecewise linear and needs only
-    the Gram matrix; it does not depend on the units of the columns.
+        minimise |y - X b|^2 + penalty * sum_j |b_j| / |b_ols_j|^gamma, as the penalty falls to zero
+
+    Assumes that least squares b_ols of all terms are consistent: large where a term is true, small
+    where it is not. Noise in the terms and columns nearly dependent break this. The path is
+    piecewise linear and needs only the Gram matrix; it does not depend on the units of the columns.
     max_terms: number of terms at which the path stops; None for all terms.
-    Source: Zou 2006, doi:10.1198/016214506000000735; the thesis, Eq. 8.
+    Source: Zou 2006, doi:10.1198/016214506000000735; the thesis, Eq. 8; for the path see
+    `search_kernels.lasso_path`.
+
+    >>> xx, xy = np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([0.9, 0.3])
+    >>> ep.AdaptiveLasso().supports(xx, xy, 1.0).tolist()
+    [[False, False], [True, False], [True, True]]
     """
 
     gamma: float = 1.0
@@ -64,9 +73,19 @@ class AdaptiveLasso:
 class STLSQ:
     """Sequentially thresholded least squares, over a sweep of thresholds.
 
+        S <- {j in S: |b_j| > threshold}, b = least squares of y on X_S, until S stays
+
+    Its fixed points are local minima of |y - X b|^2 + threshold^2 |S|. Assumes that the terms are
+    nearly orthogonal, so that a false one has a small coefficient from the first fit on: what is
+    once dropped does not come back.
     Thresholds are fractions of the norm of the target, for columns of unit norm, spaced evenly in
-    the logarithm. Each is iterated until no coefficient is below it.
-    Source: Brunton, Proctor & Kutz 2016, doi:10.1073/pnas.1517384113.
+    the logarithm.
+    Source: Brunton, Proctor & Kutz 2016, doi:10.1073/pnas.1517384113; Zhang & Schaeffer 2019,
+    doi:10.1137/18M1189828, for the objective.
+
+    >>> xx, xy = np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([0.9, 0.3])
+    >>> ep.STLSQ(lowest=0.1, highest=0.5, n_thresholds=3).supports(xx, xy, 1.0).tolist()
+    [[True, True], [True, True], [True, False]]
     """
 
     lowest: float = 1e-4
@@ -83,13 +102,15 @@ class STLSQ:
         set_counts(self, {"n_thresholds": 2} | _where_set(self.max_terms))
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
-        thresholds = np.sqrt(yy) * self._shares[:, None]
-        masks = np.repeat(independent_terms(xx)[None], self.n_thresholds, axis=0)
-        while True:
-            kept = masks & (np.abs(fit_masks(xx, xy, masks)) > thresholds)
-            if np.array_equal(kept, masks):
-                break
-            masks = kept
+        thresholds, start = np.sqrt(yy) * self._shares[:, None], independent_terms(xx)
+        # The first fit, of all terms, is the same at every threshold.
+        masks = start & (np.abs(fit_masks(xx, xy, start[None])) > thresholds)
+        changed = (masks != start).any(axis=1)
+        while changed.any():
+            before = masks[changed]
+            kept = before & (np.abs(fit_masks(xx, xy, before)) > thresholds[changed])
+            masks[changed] = kept
+            changed[changed] = (kept != before).any(axis=1)
         return masks[masks.sum(axis=1) <= (self.max_terms or len(xy))]
 
     @cached_property
@@ -105,11 +126,20 @@ class Unproven(UserWarning):
 class BestSubset:
     """The supports of least residual of every size, proven best by branch and bound.
 
-    The work grows with the number of subsets of up to max_terms terms: a library of 10 terms
-    takes a tenth of a millisecond, 20 terms with all sizes a tenth of a second. If a proof would
-    take more than a few seconds, as with more than about sixty terms, the search goes on from the
-    best supports found by exchanges of terms, and warns with `Unproven`.
+        minimise |y - X_S b|^2 over b and over all supports S of k terms, for k = 0 ... max_terms
+
+    Assumes Gaussian residuals that are independent from row to row, of one variance; then the best
+    support of a size is the likeliest. Which size is left to the selection rule. The work grows
+    with the number of subsets of up to max_terms terms: a library of 10 terms takes a tenth of a
+    millisecond, 20 terms with all sizes a tenth of a second. If a proof would take more than a few
+    seconds, as with more than about sixty terms, the search goes on from the best supports found by
+    exchanges of terms, and warns with `Unproven`.
     n_best: number of supports of each size.
+    Source: Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231.
+
+    >>> xx, xy = np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([0.9, 0.3])
+    >>> ep.BestSubset(max_terms=1, n_best=2).supports(xx, xy, 1.0).tolist()
+    [[False, False], [True, False], [False, True]]
     """
 
     max_terms: int = 6
@@ -133,7 +163,7 @@ class BestSubset:
         of its own variance and the same number of rows, this maximises the likelihood. No
         weights are needed, since the scale of one problem multiplies all products alike.
         """
-        found, proven = subsets_within(
+        found, proven = search_subsets(
             xx, xy, yy, max_terms=self.max_terms, n_best=self.n_best, most_work=MOST_WORK
         )
         if proven:
@@ -145,12 +175,10 @@ class BestSubset:
             Unproven,
             stacklevel=2,
         )
-        return exchanged_supports(
-            xx, xy, yy, max_terms=self.max_terms, n_best=self.n_best, known=found
-        )
+        return exchange_terms(xx, xy, yy, max_terms=self.max_terms, n_best=self.n_best, known=found)
 
 
-def subsets_within(
+def search_subsets(
     xx: Float[np.ndarray, "problems terms terms"],
     xy: Float[np.ndarray, "problems terms"],
     yy: Float[np.ndarray, " problems"],

@@ -28,9 +28,7 @@ class RandomSplit:
         _check_fraction(self.test_fraction)
 
     def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
-        held_out = np.zeros(n_groups, dtype=np.bool_)
-        held_out[rng.permutation(n_groups)[: round(self.test_fraction * n_groups)]] = True
-        return held_out
+        return BlockSplit(self.test_fraction, max(n_groups, 1)).held_out(n_groups, rng)
 
 
 @dataclass(frozen=True)

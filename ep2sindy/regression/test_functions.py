@@ -126,7 +126,7 @@ class Bumps:
         grid, lines = even_grid(t)
         windows = self._even_windows(lines @ x, grid[1] - grid[0])
         middle = grid[(windows.first + windows.last) // 2]
-        kept = windows.taken(one_about_each(t, middle))
+        kept = windows.taken(keep_one_per_sample(t, middle))
         mean, slope = kept.mean @ lines, kept.slope @ lines
         mean.sort_indices()
         slope.sort_indices()
@@ -250,7 +250,7 @@ def even_grid(
     return grid, lines
 
 
-def one_about_each(
+def keep_one_per_sample(
     t: Float[np.ndarray, " samples"], middle: Float[np.ndarray, " windows"]
 ) -> Int[np.ndarray, " kept"]:
     """Indices of windows to keep: the first of all windows nearest to the same sample.

@@ -17,10 +17,11 @@ from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.model.inputs import plausible_courses
 from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
-from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.regression.whitening import whiten_rows
 from ep2sindy.regression.windows import Windows
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
@@ -134,19 +135,16 @@ class Weak:
         trajectories: Sequence[Trajectory],
     ) -> RegressionRows:
         name = runs[0].run.state_names[state]
-        parts = [run.rows(state) for run in runs]
-        test = np.concatenate([part.test for part in parts])
-        windows = Windows.joined([part.windows for part in parts])
-        n_segments = np.cumsum([0, *(run.segment[-1] + 1 for run in runs)])
+        parts, segments, tests = zip(*(run.rows(state) for run in runs), strict=True)
+        windows, test = Windows.joined(parts), np.concatenate(tests)
+        n_before = np.cumsum([0, *(run.segment[-1] + 1 for run in runs[:-1])])
         target = windows.slope @ np.concatenate([run.run.states[:, state] for run in runs])
         return RegressionRows(
             theta=windows.mean @ np.concatenate([run.terms for run in runs]),
             target=target[:, None],
             library=library,
             equations=(name,),
-            groups=np.concatenate(
-                [part.segment + n for part, n in zip(parts, n_segments[:-1], strict=True)]
-            ),
+            groups=np.concatenate([s + n for s, n in zip(segments, n_before, strict=True)]),
             test=test,
             trajectories=tuple(trajectories),
             noisy=_noisy_rows(name, runs, windows.taken(~test), target[~test])
@@ -172,27 +170,20 @@ class _Sampled:
     segment: Int[np.ndarray, " samples"]
     held_out: Bool[np.ndarray, " samples"]
 
-    def rows(self, state: int) -> _Rows:
-        """Windows that lie entirely in training segments, or entirely in held-out ones."""
+    def rows(
+        self, state: int
+    ) -> tuple[Windows, Int[np.ndarray, " rows"], Bool[np.ndarray, " rows"]]:
+        """Windows that lie entirely in training segments, or entirely in held-out ones.
+
+        With the segment of the middle of each, and which are held out.
+        """
         windows = self.windows[state]
         first, last = windows.first, windows.last
         n_held_out = np.append(0, np.cumsum(self.held_out))
         share = (n_held_out[last + 1] - n_held_out[first]) / (last + 1 - first)
         pure = (share == 0.0) | (share == 1.0)
-        return _Rows(
-            windows=windows.taken(pure),
-            segment=self.segment[(first + last) // 2][pure],
-            test=share[pure] == 1.0,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Rows of one state on one trajectory; segment: (rows,), that of the middle of the window."""
-
-    windows: Windows
-    segment: Int[np.ndarray, " rows"]
-    test: Bool[np.ndarray, " rows"]
+        segment = self.segment[(first + last) // 2]
+        return windows.taken(pure), segment[pure], share[pure] == 1.0
 
 
 def _noisy_rows(
@@ -216,13 +207,22 @@ def _noisy_rows(
 class WeightedWeak:
     """Weak rows that are whitened under the whole library: the best rows for a search in noise.
 
-    The rows of `weak` are weighted by their covariance, and linearised about samples corrected in
-    `n_steps` steps with all terms, so that no support is favoured. The residual of a support then
-    measures its likelihood, and the true support is the best of its size far more often
-    (docs/benchmark.md). The noise of the samples is assumed white, and the law in the library:
-    fast dynamics that no term describes would be taken for noise. Rows are in the unit of the
-    derivative, up to a factor.
+        r = L^-1 (y - X b), L L^T = C the covariance of y - X b by the noise of the samples
+
+    Here y and X are the rows of `weak`, and b the coefficients of all terms. They are weighted by
+    their covariance, and linearised about samples corrected in `n_steps` steps with all terms, so
+    that no support is favoured. The residual of a support then measures its likelihood, and the
+    true support is the best of its size far more often (docs/benchmark.md). The noise of the
+    samples is assumed white, and the law in the library: fast dynamics that no term describes would
+    be taken for noise. Rows are in the unit of the derivative, up to a factor.
     Raises ValueError for held-out rows, which the weights do not include.
+    Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance.
+
+    >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
+    >>> library, rng = ep.polynomial(["x", "y"], degree=2), np.random.default_rng(0)
+    >>> rows, _ = ep.WeightedWeak().assemble([run], library, rng=rng)
+    >>> ep.regression.fit_support(rows, "x", ["x", "x*y"]).coef.round(2).tolist()
+    [0.67, -1.0]
     """
 
     weak: Weak = field(default_factory=lambda: Weak(split=RandomSplit(0.0)))
@@ -253,8 +253,8 @@ class WeightedWeak:
         everything = usable_terms(problem)
         coef = np.zeros(len(problem.library))
         theta, target = problem.train_theta[:, everything], problem.train_target(0)
-        coef[everything] = np.linalg.lstsq(theta, target)[0]
-        white = whitened_rows(problem, everything, coef, n_steps=self.n_steps)
+        coef[everything] = LeastSquares.of_rows(theta, target).coef
+        white = whiten_rows(problem, everything, coef, n_steps=self.n_steps)
         # Whitened rows are in standard deviations; rescale to about the unit of the derivative.
         size = 1.0 / np.linalg.norm(white.target)
         return replace(

@@ -56,7 +56,7 @@ class WhitenedRows:
     corrected: Float[np.ndarray, "samples variables"]
 
 
-def whitened_rows(
+def whiten_rows(
     problem: RegressionRows,
     terms: Bool[np.ndarray, " terms"],
     coef: Float[np.ndarray, " terms"],
@@ -85,13 +85,13 @@ def whitened_rows(
     least = rows.misfit
     for _ in range(n_steps):
         before, coef = rows.coef, rows.fit(terms)
-        if _near(before, coef, negligible):
+        if _is_near(before, coef, negligible):
             break
-        following = _following(problem, sums, rows, coef, limit=least + RISE * len(rows.target))
+        following = _step(problem, sums, rows, coef, limit=least + RISE * len(rows.target))
         if following is None:
             break
         rows, least = following, min(least, following.misfit)
-        if _near(before, rows.coef, SETTLED):
+        if _is_near(before, rows.coef, SETTLED):
             break
     theta = np.zeros((len(rows.target), len(kept)))
     theta[:, kept] = rows.theta
@@ -102,7 +102,7 @@ def whitened_rows(
     )
 
 
-def _near(
+def _is_near(
     before: Float[np.ndarray, " terms"], after: Float[np.ndarray, " terms"], share: float
 ) -> bool:
     """Whether coefficients differ by less than a share of the latter; never for a share of 0."""
@@ -110,7 +110,7 @@ def _near(
     return bool(change @ change < share**2 * (after @ after))
 
 
-def _following(
+def _step(
     problem: RegressionRows,
     sums: _Sums,
     rows: _Linearised,

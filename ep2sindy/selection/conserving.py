@@ -17,61 +17,61 @@ from ep2sindy.refinement.refine import with_coef
 from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.gram_kernels import fit_masks
+from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
-from ep2sindy.selection.systems import Systems, TrialSystem, broken_demands
+from ep2sindy.selection.systems import Systems, TrialSystem, find_broken_demands
 
 Support = tuple[np.ndarray, np.ndarray]  # indices of processes, and their coefficients
 
 
-def conserving_systems(
+def search_conserving_systems(
     problems: Sequence[RegressionRows], task: Task, roles: Roles, search: Search, *, depth: int
 ) -> Systems:
     """The systems that a search proposes for all equations at once, smallest first.
 
-    One regression over the training rows of all equations, each weighted by its residuals, has one
-    column per process; so a search proposes processes, and what they move is conserved exactly. Of
-    every size, the `depth` best systems are kept in which every role is played by a process, and
-    those that must be positive are: least squares with these bounds would put another to zero,
-    which is a smaller system. problems: rows of the task's library with the terms of known
-    equations, `with_known_terms`.
+        minimise sum over equations e of |y_e - X_e (A_e z + d_e)|^2 / s_e^2 over supports of z
+
+    z holds one amount per process, and column p of A_e its share in every term of equation e, d_e
+    what is known. So a search proposes processes, and what they move is conserved exactly. s_e is
+    the standard deviation of what the whole library leaves of y_e; assumes residuals that are
+    independent between rows and equations. Of every size, the `depth` best systems are kept in
+    which every role is played by a process, and those that must be positive are: least squares
+    with these bounds would put another to zero, which is a smaller system. problems: rows of the
+    task's library with the terms of known equations, `with_known_terms`.
     Raises ValueError for roles that do not fit the task, or if no system plays them all.
+    Called by `ep.discover(run, roles=roles, method=ep.Regression(selection=ep.FreeRunScore()))`;
+    docs/roles.md shows what comes of it.
     """
     processes = roles.processes(task.library, task.states)
     task = replace(task, library=problems[0].library)
-    columns, target = _joint_rows(problems, task, processes, roles.known)
+    columns, target = _join_rows(problems, task, processes, roles.known)
     norms = column_norms(columns)
     unit = columns / norms
     masks = search.supports(unit.T @ unit, unit.T @ target, float(target @ target))
-    whole = _ranked(_complete(masks, processes, roles.names), unit, target)
-    means = _means(task, processes) if roles.forward else None
-    admissible = [
-        (chosen, values)
-        for chosen, values in whole
-        if not broken_demands(
-            [processes[k] for k in chosen],
-            values / norms[chosen],
-            None if means is None else means[chosen],
-        )
-    ]
-    found = []
-    for chosen, values in _first_of_each_size(admissible or whole, depth):
-        ours = [processes[k] for k in chosen]
-        system = _system(task, ours, values / norms[chosen], roles)
-        if system is not None and means is not None:
-            system = replace(system, means=means[chosen])
-        if system is not None:
-            found.append(system)
+    whole = _rank_supports(_keep_complete(masks, processes, roles.names), unit, target)
+    means = _average_terms(task, processes) if roles.forward else None
+
+    def build(support: Support) -> tuple[list[Process], np.ndarray, np.ndarray | None]:
+        """Processes of a support, their coefficients, and the means of their terms."""
+        chosen, values = support
+        own_means = None if means is None else means[chosen]
+        return [processes[k] for k in chosen], values / norms[chosen], own_means
+
+    admissible = [support for support in whole if not find_broken_demands(*build(support))]
+    kept = _keep_first(admissible or whole, depth)
+    systems = [_build_system(task, roles, *build(support)) for support in kept]
+    found = [system for system in systems if system is not None]
     if not found:
         raise ValueError(
             f"no system of up to {masks.sum(axis=1).max(initial=0)} terms plays all of the roles "
             f"{list(dict.fromkeys(process.role for process in processes))}: raise the search's "
             "max_terms or n_best, or give fewer roles"
         )
-    return _with_fronts(found, problems, task)
+    return _add_fronts(found, problems, task)
 
 
-def _joint_rows(
+def _join_rows(
     problems: Sequence[RegressionRows],
     task: Task,
     processes: Sequence[Process],
@@ -93,7 +93,7 @@ def _joint_rows(
             fixed = np.array([known.get((state, term), 0.0) for term in library.names])
             target = problem.train_target(k)
             theta = problem.train_theta
-            left = target - theta @ np.linalg.lstsq(theta, target, rcond=None)[0]
+            left = target - theta @ LeastSquares.of_rows(theta, target).coef
             std = max(float(left.std()), MIN_RESIDUAL * float(np.sqrt(np.square(target).mean())))
             theta = theta / problem.coef_scale(k) / std
             columns.append(theta @ shares)
@@ -101,7 +101,7 @@ def _joint_rows(
     return np.concatenate(columns), np.concatenate(targets)
 
 
-def _complete(
+def _keep_complete(
     masks: Bool[np.ndarray, "supports processes"], processes: Sequence[Process], given: set[str]
 ) -> Bool[np.ndarray, "_ processes"]:
     """The supports in which every role that is given is played, and no equation is empty."""
@@ -111,7 +111,7 @@ def _complete(
     return masks[np.all(played, axis=0)]
 
 
-def _ranked(
+def _rank_supports(
     masks: Bool[np.ndarray, "supports processes"],
     columns: Float[np.ndarray, "rows processes"],
     target: Float[np.ndarray, " rows"],
@@ -124,16 +124,17 @@ def _ranked(
     return [(np.flatnonzero(masks[k]), coef[k, masks[k]]) for k in independent]
 
 
-def _first_of_each_size(supports: Sequence[Support], depth: int) -> list[Support]:
+def _keep_first(supports: Sequence[Support], depth: int) -> list[Support]:
     sizes = [len(chosen) for chosen, _ in supports]
     return [each for k, each in enumerate(supports) if k - sizes.index(sizes[k]) < depth]
 
 
-def _system(
+def _build_system(
     task: Task,
+    roles: Roles,
     processes: Sequence[Process],
     values: Float[np.ndarray, " processes"],
-    roles: Roles,
+    means: Float[np.ndarray, " processes"] | None,
 ) -> TrialSystem | None:
     """The system of these processes; None if its coefficients do not tell them apart."""
     held = constraint_of(task.library, task.states, processes, roles.told)
@@ -144,10 +145,10 @@ def _system(
     known = roles.known
     told = np.array([known.get(held.coefficients[k], 0.0) for k in held.free])
     coef = held.coef(shares_of(held) @ values + told)
-    return TrialSystem(with_coef(model, held, coef)[0], held)
+    return TrialSystem(with_coef(model, held, coef)[0], held, means)
 
 
-def _means(task: Task, processes: Sequence[Process]) -> Float[np.ndarray, " processes"]:
+def _average_terms(task: Task, processes: Sequence[Process]) -> Float[np.ndarray, " processes"]:
     """Mean of the term of every process over the records."""
     library = task.library
     values = [noise_inside(library, run.columns(library.variables)) for run in task.runs]
@@ -155,7 +156,7 @@ def _means(task: Task, processes: Sequence[Process]) -> Float[np.ndarray, " proc
     return mean[[library.index(process.term) for process in processes]]
 
 
-def _with_fronts(
+def _add_fronts(
     systems: Sequence[TrialSystem], problems: Sequence[RegressionRows], task: Task
 ) -> Systems:
     """The systems with a front per equation, which holds each of their supports once."""

@@ -10,9 +10,13 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.library.library import Library
-from ep2sindy.regression.front import ParetoFront
-from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.regression.front import Fronts, ParetoFront
+from ep2sindy.regression.least_squares import LeastSquares, fit_masks_to_rows
+from ep2sindy.regression.whitening import whiten_rows
+from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.selection.rule import Basis, Decision
 
 # Least residual squares, as a share of the target's squares: below this value a criterion would
 # select terms that fit the discretisation error of noise-free data.
@@ -44,6 +48,7 @@ class EBIC:
 
     gamma: float = 1.0
     coarsening: float | None = 60.0
+    basis: ClassVar[Basis] = "rows"
 
     def __post_init__(self) -> None:
         if not self.gamma >= 0.0:
@@ -62,8 +67,11 @@ class EBIC:
         """The rule at one of n points with a common support: together they pay for it once."""
         return replace(self, gamma=self.gamma / n_points)
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        return [self._score(front) for front in fronts]
+    def decide(
+        self, fronts: Fronts, task: Task | None = None, *, progress: Progress = SILENT
+    ) -> Decision:
+        with progress.stage(None, "", f"candidates by {self.label}"):
+            return Decision([self._score(front) for front in fronts])
 
     def _score(self, front: ParetoFront) -> Float[np.ndarray, " candidates"]:
         """Scores of all candidates, with rows that are weighted where their noise is known.
@@ -83,13 +91,13 @@ class EBIC:
             [self._penalty(c.terms, n_effective, problem.library) for c in front.candidates]
         )
         for _ in range(MAX_ROUNDS):
-            squares, coef = _fits(theta, target, masks)
+            squares, coef = _fit_all(theta, target, masks)
             squares = np.maximum(squares, FLOOR * (target @ target))
             scores = n_effective * np.log(squares / n_rows) + penalties
             if problem.noisy is None or int(np.argmin(scores)) == leader:
                 break
             leader = int(np.argmin(scores))
-            white = whitened_rows(problem, masks[leader], coef[leader])
+            white = whiten_rows(problem, masks[leader], coef[leader])
             theta, target = white.theta, white.target
         return scores
 
@@ -104,7 +112,7 @@ def log_supports(library: Library, terms: Sequence[str]) -> float:
     return log(comb(int((degrees <= highest).sum()), len(terms)))
 
 
-def _fits(
+def _fit_all(
     theta: Float[np.ndarray, "rows terms"],
     target: Float[np.ndarray, " rows"],
     masks: Bool[np.ndarray, "candidates terms"],
@@ -113,33 +121,40 @@ def _fits(
     # R of the QR factors holds all that least squares needs, without squaring the condition number.
     triangle = np.asarray(np.linalg.qr(np.column_stack([theta, target]), mode="r"))
     columns, right = triangle[:, :-1], triangle[:, -1]
-    coef = np.zeros(masks.shape)
-    for fit, mask in zip(coef, masks, strict=True):
-        fit[mask] = np.linalg.lstsq(columns[:, mask], right)[0]
-    return np.square(right - coef @ columns.T).sum(axis=1), coef
+
+    def residuals(coef: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        left = right - coef @ columns.T
+        return np.square(left).sum(axis=1), left @ columns
+
+    coef, squares = fit_masks_to_rows(columns.T @ columns, columns.T @ right, masks, residuals)
+    for k in np.flatnonzero(np.isnan(squares)):  # weights have made its terms dependent
+        fit = LeastSquares.of_rows(columns[:, masks[k]], right)
+        coef[k], squares[k] = 0.0, fit.squares
+        coef[k, masks[k]] = fit.coef
+    return squares, coef
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Select by -2 log likelihood of the trajectories plus the prices of the terms.
+    """Select by -2 log likelihood of the trajectories plus a complexity penalty.
 
     A `TrajectorySearch` ranks its own candidates by this value. Fronts of regressions do not have
     it.
     """
 
     label: ClassVar[str] = "deviance"
+    basis: ClassVar[Basis] = "likelihood"
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        for front in fronts:
-            if any(candidate.deviance is None for candidate in front.candidates):
-                raise ValueError(
-                    "Evidence weighs what a search of trajectories found: these fronts come from "
-                    "rows; take TrajectorySearch() (search=trajectory), or select by EBIC"
-                )
-        return [
-            np.array([candidate.deviance for candidate in front.candidates], dtype=np.float64)
-            for front in fronts
-        ]
+    def decide(
+        self, fronts: Fronts, task: Task | None = None, *, progress: Progress = SILENT
+    ) -> Decision:
+        deviances = [[candidate.deviance for candidate in front.candidates] for front in fronts]
+        if any(None in values for values in deviances):
+            raise ValueError(
+                "Evidence weighs what a search of trajectories found: these fronts come from "
+                "rows; take TrajectorySearch() (search=trajectory), or select by EBIC"
+            )
+        return Decision([np.array(values, dtype=np.float64) for values in deviances])
 
 
 @dataclass(frozen=True)
@@ -154,10 +169,17 @@ class Knee:
     score = sqrt(((log e - log e_min) / (log e_max - log e_min))^2 + (n_terms / n_norm)^2). That
     assumes that errors span orders of magnitude: the largest fall sets the scale, and a true term
     that lowers the error by less than one step of it is dropped.
+    Source: the thesis, Eq. 9; a corner of the curve of error and size, as Hansen 1992,
+    doi:10.1137/1034115, takes it for regularisation.
+
+    >>> rule, run = ep.Regression(selection=ep.Knee()), ep.lotka_volterra().trajectory()
+    >>> list(ep.discover(run, method=rule).model.terms("x"))
+    ['x', 'x*y']
     """
 
     n_norm: str = "library"
     scale: str = "linear"
+    basis: ClassVar[Basis] = "rows"
 
     def __post_init__(self) -> None:
         if self.n_norm not in ("library", "max_terms"):
@@ -169,8 +191,11 @@ class Knee:
     def label(self) -> str:
         return "d_log" if self.scale == "log" else "d_pareto"
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        return [self._score(front) for front in fronts]
+    def decide(
+        self, fronts: Fronts, task: Task | None = None, *, progress: Progress = SILENT
+    ) -> Decision:
+        with progress.stage(None, "", f"candidates by {self.label}"):
+            return Decision([self._score(front) for front in fronts])
 
     def _score(self, front: ParetoFront) -> Float[np.ndarray, " candidates"]:
         errors, sizes, library = front.errors, front.sizes, front.rows.library

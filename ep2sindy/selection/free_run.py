@@ -9,10 +9,9 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Relation
 from ep2sindy.model.comparison import (
     FreeRunBounds,
     Verdict,
@@ -26,11 +25,12 @@ from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LEAST_WAIT, limit_cycle, share_reaching
 from ep2sindy.refinement.refine import refine_batch
-from ep2sindy.regression.front import ParetoFront
+from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
+from ep2sindy.selection.combinations import MAX_ERROR, score_combinations
 from ep2sindy.selection.refined import RefinedScore
-from ep2sindy.selection.rule import MAX_ERROR, Decision, combination_scores
+from ep2sindy.selection.rule import Basis, Decision
 from ep2sindy.selection.systems import (
     Fold,
     Records,
@@ -38,14 +38,15 @@ from ep2sindy.selection.systems import (
     Systems,
     Trial,
     TrialSystem,
-    budget,
-    combined,
-    demands_note,
-    folds_of,
-    living_among,
-    others_of,
-    records_of,
-    simplest_of_equals,
+    combine,
+    cut_stretches,
+    describe_demands,
+    find_living,
+    folds,
+    list_others,
+    order_equals,
+    plan_refinement,
+    smooth_records,
 )
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.spectrum import samples_in_periods, steps_in
@@ -138,7 +139,7 @@ class Confirmed:
         elif self.share and not self.run.model.inputs:
             how = f"{how}, {100.0 * self.share:.0f} % of starts reach it"
         found = f"{how}; {n_living or 'none'} of {n_systems} systems live where not fitted"
-        return demands_note(found, self.broken)
+        return describe_demands(found, self.broken)
 
 
 @dataclass(frozen=True)
@@ -187,6 +188,7 @@ class FreeRunScore:
     judged: Sequence[str] | None = None
     n_starts: int = 1
     label: ClassVar[str] = "free-run error"
+    basis: ClassVar[Basis] = "runs"
 
     def __post_init__(self) -> None:
         check_kind("bounds", self.bounds, FreeRunBounds, "ep.FreeRunBounds()")
@@ -198,36 +200,22 @@ class FreeRunScore:
             raise ValueError(f"margin must lie between 0 and 1: {self.margin} came")
         check_list("judged", self.judged)
 
-    def scores(
-        self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
-    ) -> list[Float[np.ndarray, " _candidates"]]:
-        """The scores that `decide` returns."""
-        return list(self.decide(fronts, library, runs).scores)
+    def decide(self, fronts: Fronts, task: Task, *, progress: Progress = SILENT) -> Decision:
+        """Score candidates by the deviations of their combinations, and refine the winner.
 
-    def decide(
-        self,
-        fronts: Sequence[ParetoFront],
-        library: Library,
-        runs: Sequence[Trajectory],
-        relations: Sequence[Relation] = (),
-        *,
-        progress: Progress = SILENT,
-    ) -> Decision:
-        """Score the candidates, and refine the winning system on all data.
-
-        Raises ValueError for no runs, a state without a front, or relations that no combination
-        has the terms for.
+        Raises ValueError for a state without a front, or relations that
+        no combination has the terms for.
         """
-        found = combined(fronts, library, runs, relations, most=self.max_combinations)
-        return self.judge(found, runs, progress=progress)
+        systems = combine(fronts, task, most=self.max_combinations)
+        return self.judge(systems, task.runs, progress=progress)
 
     def judge(
         self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT
     ) -> Decision:
         """Decide among given systems, as `decide` does among the combinations of candidates."""
         fronts, places, systems = found.fronts, found.places, found.systems
-        records = records_of(fronts, runs)
-        cycles = cycles_of(records, [front.equation for front in fronts])
+        records = smooth_records(fronts, runs)
+        cycles = find_cycles(records, [front.equation for front in fronts])
         if isinstance(cycles, str):
             rule = RefinedScore(max_combinations=self.max_combinations)
             decision = rule.judge(found, runs, progress=progress)
@@ -236,12 +224,12 @@ class FreeRunScore:
             )
         trials = self._trials(records, cycles, systems, progress)
         errors = np.array([trial.error for trial in trials])
-        living = living_among(trials)
+        living = find_living(trials)
         winner, model, note = self._winner(records, cycles, trials, living, progress)
         limit = max(1.0, float(errors[winner]))
-        scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
+        scores = score_combinations(fronts, places, errors, limit=limit, winner=winner)
         note = f"{note}{found.left_out}"
-        others = others_of(trials, living, winner)
+        others = list_others(trials, living, winner)
         return Decision(scores, model, note, systems[winner].constraint, others)
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
@@ -264,8 +252,10 @@ class FreeRunScore:
         if not whole:
             return trials
         some = [systems[k] for k in whole]
-        folds = folds_of(records.runs, self.n_folds)
-        tried = [self._try_fold(records, cycles, some, f, progress) for f in folds]
+        tried = [
+            self._try_fold(records, cycles, some, fold, progress)
+            for fold in folds(records.runs, self.n_folds)
+        ]
         for k, worst in zip(whole, np.max(tried, axis=0), strict=True):
             trials[k] = Trial(systems[k], *worst.tolist())
         return trials
@@ -280,15 +270,15 @@ class FreeRunScore:
     ) -> Float[np.ndarray, "systems 5"]:
         """The figures of a `Trial` of every system in one fold."""
         first = systems[0].model
-        batch = fold.windows(
+        batch = cut_stretches(
             records.runs,
-            first.states,
-            first.inputs,
+            fold.fitted,
+            first,
             window=self._window(records, cycles),
             n_windows=self.n_windows,
-            rng=np.random.default_rng(self.seed),
+            seed=self.seed,
         )
-        method, together = budget(batch, first.library)
+        method, together = plan_refinement(batch, first.library)
         with progress.stage(len(systems), "system", "refined without a fold") as advance:
             refined = refine_batch(
                 [system.model for system in systems],
@@ -303,7 +293,7 @@ class FreeRunScore:
         ensemble = Ensemble(first.library, first.states, coef)
         judged, densities = [], densities_of(records.runs[0], first.states)
         with progress.stage(None, "run", "free runs over the fold") as advance:
-            for t, paths, cycle in paths_over(ensemble, fold.held, records, cycles, self.n_starts):
+            for t, paths, cycle in run_over(ensemble, fold.held, records, cycles, self.n_starts):
                 judged.append(self._judge(t, paths, cycle, first.states, densities))
                 advance(len(paths))
         worst = np.column_stack([np.max(judged, axis=0), refined.loss])
@@ -343,7 +333,7 @@ class FreeRunScore:
     ) -> tuple[int, SparseModel, str]:
         """Index of the winning system, the system refined on all data, and how it won."""
         ranked = sorted(living, key=lambda k: self._rank(trials[k]))
-        ranked = simplest_of_equals(ranked, trials)
+        ranked = order_equals(ranked, trials)
         by_error = sorted(range(len(trials)), key=lambda k: (trials[k].error, trials[k].loss))
         window = self._window(records, cycles)
         found: list[Confirmed] = []
@@ -352,7 +342,7 @@ class FreeRunScore:
             attracting = [each for each in found if each.share]
             if attracting and trials[k].system.n_free > attracting[0].trial.system.n_free + DEARER:
                 break
-            model = trials[k].system.refined_on_all(
+            model = trials[k].system.refine_on_all(
                 records.runs,
                 window=window,
                 n_windows=max(MIN_WINDOWS, self.n_windows),
@@ -411,7 +401,7 @@ def _attraction(run: FreeRun, cycles: Sequence[Cycle]) -> tuple[float, bool]:
     return max(share, 0.5 / N_REACHING), False
 
 
-def cycles_of(records: Records, states: Sequence[str]) -> list[Cycle] | str:
+def find_cycles(records: Records, states: Sequence[str]) -> list[Cycle] | str:
     """The cycle of every record, or the reason why a record has none."""
     found = []
     for run in records.runs:
@@ -439,7 +429,7 @@ def _spirals(cycle: Cycle, states: Float[np.ndarray, "samples n_states"]) -> boo
     return bool(grows.all() or decays.all())
 
 
-def paths_over(
+def run_over(
     ensemble: Ensemble,
     held: Sequence[Stretch],
     records: Records,

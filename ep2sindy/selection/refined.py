@@ -3,40 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.gaps import mean_step
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Constraint, Relation
-from ep2sindy.model.many import Ensemble
+from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.refine import refine_batch, smooth_batch
-from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
-from ep2sindy.regression.front import ParetoFront
+from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, dominant_window
+from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.runtime.values import set_counts
+from ep2sindy.selection.combinations import MAX_ERROR, find_smallest, score_combinations
 from ep2sindy.selection.criteria import FLOOR
-from ep2sindy.selection.rule import (
-    MAX_ERROR,
-    Decision,
-    combination_scores,
-    combinations,
-    smallest,
-)
+from ep2sindy.selection.rule import Basis, Decision
 from ep2sindy.selection.systems import (
     Records,
+    Stretch,
     Systems,
     TrialSystem,
-    budget,
-    combined,
-    demands_note,
-    records_of,
-    systems_of,
+    combine,
+    cut_stretches,
+    deal,
+    describe_demands,
+    plan_refinement,
+    smooth_records,
 )
 
 # Fewest pairs of windows to cut the records into if window_s is not set.
@@ -81,6 +77,7 @@ class RefinedScore:
     n_windows: int = 20
     max_combinations: int = 4096
     label: ClassVar[str] = "refined error"
+    basis: ClassVar[Basis] = "runs"
 
     def __post_init__(self) -> None:
         if self.window_s is not None and not self.window_s > 0.0:
@@ -89,34 +86,14 @@ class RefinedScore:
             )
         set_counts(self, {"n_windows": 2, "max_combinations": 1})
 
-    def scores(
-        self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
-    ) -> list[Float[np.ndarray, " _candidates"]]:
-        """Scores of every candidate by the errors of its combinations.
+    def decide(self, fronts: Fronts, task: Task, *, progress: Progress = SILENT) -> Decision:
+        """Score candidates by the errors of their combinations, and refine the winner on all data.
 
-        Raises ValueError for no runs, a state without a front, or records too short for two
-        windows.
+        Raises ValueError for a state without a front, records too short for two
+        windows, or relations that no combination has the terms for.
         """
-        places = combinations(fronts, self.max_combinations)
-        systems = systems_of(fronts, places, library, runs)
-        errors, limit = self._judge(systems, records_of(fronts, runs), SILENT)
-        return combination_scores(fronts, places, errors, limit=limit)
-
-    def decide(
-        self,
-        fronts: Sequence[ParetoFront],
-        library: Library,
-        runs: Sequence[Trajectory],
-        relations: Sequence[Relation] = (),
-        *,
-        progress: Progress = SILENT,
-    ) -> Decision:
-        """Score the candidates as `scores` does, and refine the winner on windows of all the data.
-
-        Also raises ValueError for relations that no combination has the terms for.
-        """
-        found = combined(fronts, library, runs, relations, most=self.max_combinations)
-        return self.judge(found, runs, progress=progress)
+        systems = combine(fronts, task, most=self.max_combinations)
+        return self.judge(systems, task.runs, progress=progress)
 
     def judge(
         self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT
@@ -126,77 +103,61 @@ class RefinedScore:
         A winner whose refined coefficients do not meet the demands on them is passed over.
         """
         fronts, places, systems = found.fronts, found.places, found.systems
-        errors, limit = self._judge(systems, records_of(fronts, runs), progress)
+        errors, limit = self._judge(systems, smooth_records(fronts, runs), progress)
         broken: list[str] = []
         for _ in systems:
-            winner = smallest(fronts, places, errors, limit=limit)
+            winner = find_smallest(fronts, places, errors, limit=limit)
             with progress.stage(None, "", "the best system refined on all data"):
-                model = systems[winner].refined_on_all(runs)
+                model = systems[winner].refine_on_all(runs)
             broken = systems[winner].broken(model)
             if not broken:
                 break
             errors[winner] = np.inf
-        scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
-        note = demands_note(self.label, broken) + found.left_out
+        scores = score_combinations(fronts, places, errors, limit=limit, winner=winner)
+        note = describe_demands(self.label, broken) + found.left_out
         return Decision(scores, model, note, systems[winner].constraint)
 
     def _judge(
         self, systems: Sequence[TrialSystem], records: Records, progress: Progress
     ) -> tuple[Float[np.ndarray, " combinations"], float]:
         """Error of every combination on windows it was not refined on, and the winner's limit."""
-        coef = np.stack([system.model.coef for system in systems], axis=2)
-        model = systems[0].model
-        ensemble = Ensemble(model.library, model.states, coef)
+        models = [system.model for system in systems]
         constraints = [system.constraint for system in systems]
         spread = np.concatenate(records.smoothed).std(axis=0)
-        folds = self._folds(records.runs, ensemble)
+        folds = self._folds(records.runs, models[0])
         parts = []
-        n_fits = 2 * len(folds) * len(_by_size(ensemble))
+        n_fits = 2 * len(folds) * len(_order_by_size(models))
         with progress.stage(n_fits, "fit", "systems and window starts") as advance:
             for fitted, held in folds:
-                refined = _refined(ensemble, fitted, constraints, advance)
+                refined = _refine(models, fitted, constraints, advance)
                 scale = held.scale[: len(spread)] / spread
                 parts.append(_residuals(refined, held, advance) * scale)
         return _errors_and_limit(np.concatenate(parts, axis=1))
 
     def _folds(
-        self, runs: Sequence[Trajectory], ensemble: Ensemble
+        self, runs: Sequence[Trajectory], model: SparseModel
     ) -> list[tuple[WindowBatch, WindowBatch]]:
         """Pairs of windows to refine on and windows to judge on; every window judges once."""
         runs = [piece for run in runs for piece in run.stretches(2 * MIN_SAMPLES)]
-        pieces = self._pieces(runs, self._window(runs, ensemble.states))
-        n_folds = min(N_FOLDS, len(pieces))
-        nothing_left_to_chance = np.random.default_rng(0)  # one window per trajectory
+        window = self._window(runs, model.states)
 
-        def batch(chosen: list[Trajectory]) -> WindowBatch:
-            return cut_windows(
-                chosen,
-                states=ensemble.states,
-                inputs=ensemble.inputs,
-                n_windows=len(chosen),
-                window=chosen[0].n_samples,
-                rng=nothing_left_to_chance,
-            )
+        def cut(stretches: Sequence[Stretch]) -> WindowBatch:
+            return cut_stretches(runs, stretches, model, window=window, n_windows=len(stretches))
 
-        return [
-            (
-                batch([each for k, each in enumerate(pieces) if k % n_folds != fold]),
-                batch(pieces[fold::n_folds]),
-            )
-            for fold in range(n_folds)
-        ]
+        dealt = deal(self._spread_windows(runs, window), N_FOLDS)
+        return [(cut(fold.fitted), cut(fold.held)) for fold in dealt]
 
-    def _pieces(self, runs: Sequence[Trajectory], window: int) -> list[Trajectory]:
+    def _spread_windows(self, runs: Sequence[Trajectory], window: int) -> list[Stretch]:
         """Pairs of neighbouring windows, spread over every record that is long enough."""
         n_samples = sum(run.n_samples for run in runs)
-        pieces = []
-        for run in runs:
+        found = []
+        for number, run in enumerate(runs):
             n_pairs = max(1, round(self.n_windows / 2 * run.n_samples / n_samples))
             n_pairs = min(n_pairs, run.n_samples // (2 * window))
             last = max(run.n_samples - 2 * window, 0)
             for start in np.linspace(0, last, n_pairs).round().astype(np.int64).tolist():
-                pieces += [run.window(k, k + window) for k in (start, start + window)]
-        return pieces
+                found += [Stretch(number, k, k + window) for k in (start, start + window)]
+        return found
 
     def _window(self, runs: Sequence[Trajectory], states: Sequence[str]) -> int:
         """Number of samples in each window."""
@@ -217,62 +178,58 @@ class RefinedScore:
         return window
 
 
-def _models(ensemble: Ensemble, places: Int[np.ndarray, " models"]) -> list[SparseModel]:
-    states = list(ensemble.states)
-    return [SparseModel(ensemble.library, states, ensemble.coef[:, :, k]) for k in places]
-
-
-def _by_size(ensemble: Ensemble) -> Int[np.ndarray, " models"]:
+def _order_by_size(models: Sequence[SparseModel]) -> Int[np.ndarray, " models"]:
     """Indices of the models with terms, the smallest first, so that a batch costs alike."""
-    n_terms = (ensemble.coef != 0.0).sum(axis=(0, 1))
+    n_terms = np.array([np.count_nonzero(model.coef) for model in models], dtype=np.int64)
     order = np.argsort(n_terms, kind="stable")
     return order[n_terms[order] > 0]
 
 
-def _refined(
-    ensemble: Ensemble,
+def _refine(
+    models: Sequence[SparseModel],
     batch: WindowBatch,
     constraints: Sequence[Constraint],
     advance: Advance,
-) -> Ensemble:
-    """Every model refined on the same windows; models without terms stay as they are."""
-    order = _by_size(ensemble)
+) -> list[SparseModel]:
+    """Every model refined on the same windows; models without terms stay as they are.
+
+    One that did not converge, and follows its own windows no better, stays as it is, too.
+    """
+    order, refined = _order_by_size(models), list(models)
     if not order.size:
-        return ensemble
-    method, together = budget(batch, ensemble.library)
+        return refined
+    method, together = plan_refinement(batch, models[0].library)
     found = refine_batch(
-        _models(ensemble, order),
+        [models[k] for k in order],
         batch,
         method=method,
         constraints=[constraints[k] for k in order],
         points_per_batch=together,
         advance=advance,
     )
-    coef = ensemble.coef.copy()
-    coef[:, :, order] = np.stack([model.coef for model in found.models], axis=2)
-    refined = replace(ensemble, coef=coef)
+    for k, model in zip(order, found.models, strict=True):
+        refined[k] = model
     doubtful = order[~found.finished]
     before, after = (
-        _bounded_squares(_residuals(replace(each, coef=each.coef[:, :, doubtful]), batch))
-        for each in (ensemble, refined)
+        _bounded_squares(_residuals([each[k] for k in doubtful], batch)).mean(axis=(1, 2))
+        for each in (models, refined)
     )
-    worse = doubtful[after.mean(axis=(1, 2)) >= before.mean(axis=(1, 2))]
-    coef[:, :, worse] = ensemble.coef[:, :, worse]
+    for k in doubtful[after >= before]:
+        refined[k] = models[k]
     return refined
 
 
 def _residuals(
-    ensemble: Ensemble, batch: WindowBatch, advance: Advance = nothing
+    models: Sequence[SparseModel], batch: WindowBatch, advance: Advance = nothing
 ) -> Float[np.ndarray, "models windows samples n_states"]:
     """Distances of the best trajectories to the samples, in the batch's scale; NaN if none."""
     # Without terms a state is constant, and its best constant is the mean.
     still = batch.data.mean(axis=1, keepdims=True) - batch.data
-    found = np.repeat(still[None], ensemble.coef.shape[2], axis=0)
-    order = _by_size(ensemble)
+    found, order = np.repeat(still[None], len(models), axis=0), _order_by_size(models)
     if order.size:
-        method, together = budget(batch, ensemble.library)
+        method, together = plan_refinement(batch, models[0].library)
         paths = smooth_batch(
-            _models(ensemble, order),
+            [models[k] for k in order],
             batch,
             method=method,
             points_per_batch=together,

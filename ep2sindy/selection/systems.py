@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Constraint, Process, Relation, binding, constraint
+from ep2sindy.library.relations import Constraint, Process, binding, constraint
 from ep2sindy.library.roles import process_amounts
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
 from ep2sindy.refinement.steps import fastest_step
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
-from ep2sindy.regression.front import ParetoFront
+from ep2sindy.regression.front import Fronts
+from ep2sindy.selection.combinations import combinations, describe_left_out, support_of
 from ep2sindy.selection.criteria import FLOOR
-from ep2sindy.selection.rule import OtherSystem, combinations, left_out, support_of
+from ep2sindy.selection.rule import OtherSystem
 from ep2sindy.signals.kalman import KalmanSmoother
 
 # Most time steps, over windows and systems, of one refinement batch: more would not fit the cache.
@@ -71,9 +73,9 @@ class TrialSystem:
             return []
         amounts = process_amounts(self.constraint, {s: model.terms(s) for s in model.states})
         values = np.array([amount for _, amount in amounts[: len(processes)]])
-        return broken_demands(processes, values, self.means)
+        return find_broken_demands(processes, values, self.means)
 
-    def refined_on_all(
+    def refine_on_all(
         self,
         runs: Sequence[Trajectory],
         *,
@@ -128,30 +130,36 @@ class Systems:
     are, as the end of a note; empty if they are all.
     """
 
-    fronts: Sequence[ParetoFront]
+    fronts: Fronts
     places: Int[np.ndarray, "systems fronts"]
     systems: Sequence[TrialSystem]
     left_out: str = ""
 
 
-def combined(
-    fronts: Sequence[ParetoFront],
-    library: Library,
-    runs: Sequence[Trajectory],
-    relations: Sequence[Relation],
-    *,
-    most: int,
-) -> Systems:
+def combine(fronts: Fronts, task: Task, *, most: int) -> Systems:
     """The combinations of candidates as systems, the most promising if there are more than `most`.
 
     Raises ValueError for relations that no combination has the terms for.
     """
-    places = combinations(fronts, most, relations)
-    systems = systems_of(fronts, places, library, runs, relations)
-    return Systems(fronts, places, systems, left_out(fronts, len(places), most))
+    places = combinations(fronts, most, task.relations)
+    systems = [_combine_one(fronts, choice, task) for choice in places]
+    return Systems(fronts, places, systems, describe_left_out(fronts, len(places), most))
 
 
-def broken_demands(
+def _combine_one(fronts: Fronts, choice: Int[np.ndarray, " fronts"], task: Task) -> TrialSystem:
+    """System of one combination: free coefficients as found, the others by the relations."""
+    library, states = task.library, [front.equation for front in fronts]
+    chosen = [front.candidates[k] for front, k in zip(fronts, choice, strict=True)]
+    coef = coef_matrix(library, [candidate.coef_by_term for candidate in chosen])
+    model = SparseModel(library, states, coef, task.runs[0].units)
+    support = support_of(fronts, choice)
+    held = constraint(library, support, binding(task.relations, support) or ())
+    places = [(library.index(term), states.index(state)) for state, term in held.coefficients]
+    free = np.array([coef[places[k]] for k in held.free])
+    return TrialSystem(with_coef(model, held, held.coef(free))[0], held)
+
+
+def find_broken_demands(
     processes: Sequence[Process],
     values: Float[np.ndarray, " processes"],
     means: Float[np.ndarray, " processes"] | None,
@@ -168,43 +176,12 @@ def broken_demands(
     return found + [f"{role} > 0 in the mean" for role in back]
 
 
-def demands_note(note: str, broken: Sequence[str]) -> str:
+def describe_demands(note: str, broken: Sequence[str]) -> str:
     """A rule's note, with the demands that its winner does not meet."""
     return f"{note}; no system meets all demands: {', '.join(broken)}" if broken else note
 
 
-def systems_of(
-    fronts: Sequence[ParetoFront],
-    places: Int[np.ndarray, "combinations fronts"],
-    library: Library,
-    runs: Sequence[Trajectory],
-    relations: Sequence[Relation] = (),
-) -> list[TrialSystem]:
-    """Every combination as a system, with the units of the runs."""
-    units = runs[0].units if runs else {}
-    return [_system(fronts, choice, library, units, relations) for choice in places]
-
-
-def _system(
-    fronts: Sequence[ParetoFront],
-    choice: Int[np.ndarray, " fronts"],
-    library: Library,
-    units: Mapping[str, str],
-    relations: Sequence[Relation],
-) -> TrialSystem:
-    """System of one combination: free coefficients as found, the others by the relations."""
-    states = [front.equation for front in fronts]
-    chosen = [front.candidates[k] for front, k in zip(fronts, choice, strict=True)]
-    coef = coef_matrix(library, [candidate.coef_by_term for candidate in chosen])
-    model = SparseModel(library, states, coef, units)
-    support = support_of(fronts, choice)
-    held = constraint(library, support, binding(relations, support) or ())
-    places = [(model.library.index(term), states.index(state)) for state, term in held.coefficients]
-    free = np.array([coef[places[k]] for k in held.free])
-    return TrialSystem(with_coef(model, held, held.coef(free))[0], held)
-
-
-def budget(batch: WindowBatch, library: Library) -> tuple[MultipleShooting, int]:
+def plan_refinement(batch: WindowBatch, library: Library) -> tuple[MultipleShooting, int]:
     """Refinement method for systems to be judged, and how many to refine together.
 
     The regression's coefficients are close, so whole windows are fitted at once in few iterations.
@@ -224,13 +201,11 @@ class Records:
     smoothed: Sequence[Float[np.ndarray, "_ n_states"]]
 
 
-def records_of(fronts: Sequence[ParetoFront], runs: Sequence[Trajectory]) -> Records:
+def smooth_records(fronts: Fronts, runs: Sequence[Trajectory]) -> Records:
     """The runs with smoothed states, the states in the order of the fronts.
 
-    Raises ValueError for no runs, or a state without a front.
+    Raises ValueError for a state without a front.
     """
-    if not runs:
-        raise ValueError("to integrate, trajectories are needed: none came; pass them as runs")
     equations = [front.equation for front in fronts]
     if sorted(equations) != sorted(runs[0].state_names):
         raise ValueError(
@@ -251,46 +226,30 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """The held-out parts of the runs, and the remaining pieces, which are fitted."""
+    """The held-out stretches of the runs, and the others, which are fitted."""
 
     held: Sequence[Stretch]
     fitted: Sequence[Stretch]
 
-    def windows(
-        self,
-        runs: Sequence[Trajectory],
-        states: Sequence[str],
-        inputs: Sequence[str],
-        *,
-        window: int,
-        n_windows: int,
-        rng: np.random.Generator,
-    ) -> WindowBatch:
-        """Windows of the pieces that are fitted, no longer than the longest piece."""
-        pieces = [runs[part.run].window(part.start, part.stop) for part in self.fitted]
-        longest = max(piece.n_samples for piece in pieces)
-        return cut_windows(
-            pieces,
-            states=states,
-            inputs=inputs,
-            n_windows=n_windows,
-            window=min(window, longest),
-            rng=rng,
-        )
+
+def deal(stretches: Sequence[Stretch], n_folds: int) -> list[Fold]:
+    """Deal stretches out in turn, so that each is held out in one fold and fitted in the others."""
+    n_folds = min(n_folds, len(stretches))
+    return [
+        Fold(stretches[k::n_folds], [s for i, s in enumerate(stretches) if i % n_folds != k])
+        for k in range(n_folds)
+    ]
 
 
-def folds_of(runs: Sequence[Trajectory], n_folds: int) -> list[Fold]:
+def folds(runs: Sequence[Trajectory], n_folds: int) -> list[Fold]:
     """Fold by whole runs if there are enough; otherwise cut every run into blocks.
 
+    Blocks on either side of a held-out one are fitted as one stretch each.
     Raises ValueError for runs too short to be cut.
     """
     lengths = [run.n_samples for run in runs]
     if len(runs) >= n_folds:
-        whole = [Stretch(k, 0, length) for k, length in enumerate(lengths)]
-        return [
-            Fold(whole[k::n_folds], [part for part in whole if part.run % n_folds != k])
-            for k in range(n_folds)
-        ]
+        return deal([Stretch(k, 0, length) for k, length in enumerate(lengths)], n_folds)
     if max(lengths) < 2 * MIN_SAMPLES * n_folds:
         raise ValueError(
             f"runs must hold {2 * MIN_SAMPLES * n_folds} samples to be parted in {n_folds}: at "
@@ -298,16 +257,37 @@ def folds_of(runs: Sequence[Trajectory], n_folds: int) -> list[Fold]:
         )
     found = []
     for k in range(n_folds):
-        held, fitted = [], []
-        for run, length in enumerate(lengths):
-            first, last = k * length // n_folds, (k + 1) * length // n_folds
-            held.append(Stretch(run, first, last))
-            fitted += [Stretch(run, 0, first), Stretch(run, last, length)]
-        found.append(Fold(held, [part for part in fitted if part.stop - part.start >= MIN_SAMPLES]))
+        held = [
+            Stretch(run, k * n // n_folds, (k + 1) * n // n_folds) for run, n in enumerate(lengths)
+        ]
+        sides = [(s.run, *ends) for s in held for ends in ((0, s.start), (s.stop, lengths[s.run]))]
+        fitted = [Stretch(run, a, b) for run, a, b in sides if b - a >= MIN_SAMPLES]
+        found.append(Fold(held, fitted))
     return found
 
 
-def living_among(trials: Sequence[Trial]) -> list[int]:
+def cut_stretches(
+    runs: Sequence[Trajectory],
+    stretches: Sequence[Stretch],
+    model: SparseModel,
+    *,
+    window: int,
+    n_windows: int,
+    seed: int = 0,
+) -> WindowBatch:
+    """Windows of stretches of the runs, no longer than the longest stretch."""
+    pieces = [runs[part.run].window(part.start, part.stop) for part in stretches]
+    return cut_windows(
+        pieces,
+        states=model.states,
+        inputs=model.inputs,
+        n_windows=n_windows,
+        window=min(window, max(piece.n_samples for piece in pieces)),
+        rng=np.random.default_rng(seed),
+    )
+
+
+def find_living(trials: Sequence[Trial]) -> list[int]:
     """The systems that live in every fold.
 
     If some follow the windows to rounding, because the truth is in the library, these alone.
@@ -316,7 +296,7 @@ def living_among(trials: Sequence[Trial]) -> list[int]:
     return [k for k, t in enumerate(trials) if t.error <= 1.0 and (t.loss < FLOOR or not exact)]
 
 
-def others_of(trials: Sequence[Trial], living: Sequence[int], winner: int) -> list[OtherSystem]:
+def list_others(trials: Sequence[Trial], living: Sequence[int], winner: int) -> list[OtherSystem]:
     """The other living systems of the winner's size, the best waveform first."""
     size = trials[winner].system.n_free
     alike = [trials[k] for k in living if k != winner and trials[k].system.n_free == size]
@@ -326,7 +306,7 @@ def others_of(trials: Sequence[Trial], living: Sequence[int], winner: int) -> li
     ]
 
 
-def simplest_of_equals(ranked: Sequence[int], trials: Sequence[Trial]) -> list[int]:
+def order_equals(ranked: Sequence[int], trials: Sequence[Trial]) -> list[int]:
     """The ranked systems; of those as good as the best one left, the lowest order comes first."""
     left, found = list(ranked), []
     while left:

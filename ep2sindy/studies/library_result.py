@@ -25,7 +25,6 @@ from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
-from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.balance import ModelBalance
 from ep2sindy.studies.living import Living
@@ -91,7 +90,7 @@ class LibraryResult:
     @property
     def by_runs(self) -> bool:
         """Whether the selection runs or refines whole models, rather than scoring candidates."""
-        return isinstance(self.discovery.method.selection, SystemSelection)
+        return self.discovery.method.selection.basis == "runs"
 
     @property
     def how(self) -> str:

@@ -34,7 +34,7 @@ from ep2sindy.regression.searches import Search
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.rule import OtherSystem, SystemSelection
+from ep2sindy.selection.rule import OtherSystem, Selection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.spectrum import samples_in_periods
@@ -83,10 +83,17 @@ class LivingSearch:
 
     search: Search
     depth: Count
-    selection: SystemSelection
+    selection: Selection
     roles: Roles | None = None
     degree: Count | None = None
     noise_limit: Positive | None = None
+
+    def __post_init__(self) -> None:
+        if self.selection.basis != "runs":
+            raise ValueError(
+                "a model lives or not when it runs: selection must be a rule that runs models, "
+                f"such as FreeRunScore(), {self.selection!r} came"
+            )
 
     def found(
         self,

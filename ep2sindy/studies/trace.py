@@ -47,7 +47,6 @@ from ep2sindy.report.document import (
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Once
-from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen, Delays, LogRate, Rate
 from ep2sindy.signals.trace import Trace, prepare_signal
@@ -226,7 +225,7 @@ class Outcome:
     @property
     def by_runs(self) -> bool:
         """Whether whole models were run freely, rather than weighed by their likelihood."""
-        return isinstance(self.found.method.selection, SystemSelection)
+        return self.found.method.selection.basis == "runs"
 
     @property
     def run(self) -> FreeRun:
