@@ -264,8 +264,8 @@ def _with_likely_noise(
     paths = [path for _, path in found]
     n = tracker.n_substeps
     fit = _as_fit(tracker.problem, paths, tracker.free, samples, process, n_substeps=n)
-    level, _ = likely_errors(fit)
-    noise = _noise_of(tracker.problem, level.noise[0], level.process_noise)
+    errors = likely_errors(fit)
+    noise = _noise_of(tracker.problem, errors.noise, errors.process)
     return replace(tracker, noise=noise), paths
 
 
