@@ -237,7 +237,7 @@ def estimate_states(
 ) -> Trajectory:
     """All states of a model along a record, those included that nobody measured.
 
-    The states follow the model but for random pushes, and the samples but for noise; the sizes of
+    The states follow the model but for process noise, and the samples but for noise; the sizes of
     both are the likeliest ones for this record (Kalman smoothing, iterated).
     run: has the inputs and some states of the model. measured: as for `track`.
     Raises ValueError for a run without any state of the model, or a state that the model cannot
