@@ -29,8 +29,8 @@ from ep2sindy.estimation.likelihood import (
     innovations,
 )
 from ep2sindy.estimation.noise import _shown_by_samples
+from ep2sindy.estimation.observation import LackOfFit, Solution
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solution import LackOfFit, Solution
 from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states, squares_of_steps
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation

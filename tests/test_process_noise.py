@@ -112,8 +112,8 @@ def test_the_likeliest_errors_of_a_random_walk_are_exact() -> None:
     problem = scale_problem([run], ep.polynomial(["x"], degree=1))
     none, guess = np.zeros(2), np.array([0.1])
     level = Level(np.ones((n, 1)), 1.0).with_errors(guess, guess)
-    found, _ = likely_errors(
+    found = likely_errors(
         TrajectoryFit(problem, level, problem.records[0].samples, none, none > 0.0)
     )
-    assert found.noise[0] * problem.scale == pytest.approx([0.5], rel=0.05)
-    assert found.process_noise * problem.scale == pytest.approx([0.3], rel=0.05)
+    assert found.noise * problem.scale == pytest.approx([0.5], rel=0.05)
+    assert found.process * problem.scale == pytest.approx([0.3], rel=0.05)

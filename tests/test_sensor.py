@@ -15,8 +15,8 @@ import ep2sindy as ep
 from benchmarks.spoilt import spoilt
 from ep2sindy.data.coerce import check_repeats
 from ep2sindy.data.sensor import bounds_of
-from ep2sindy.estimation.delay import delayed_gram, shift_channels
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, between, gram, observe
+from ep2sindy.estimation.observation import delayed_gram, shift_channels
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.systems.systems import System
 

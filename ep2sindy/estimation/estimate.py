@@ -20,9 +20,9 @@ from ep2sindy.estimation.cost import SearchMonitor, check_limit_s, check_size, g
 from ep2sindy.estimation.explanation import Explanation, explain
 from ep2sindy.estimation.hidden import Entrance, with_guesses
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
+from ep2sindy.estimation.noise import remark
+from ep2sindy.estimation.observation import Solution
 from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem, by_run, scale_problem
-from ep2sindy.estimation.remarks import remark
-from ep2sindy.estimation.solution import Solution
 from ep2sindy.estimation.solver import SAMPLES_PER_TERM, enough_samples
 from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library, polynomial
@@ -164,15 +164,9 @@ def estimate(
     known = trajectories_of(runs, partial=True)
     task = Task(known, library, relations_of(relations), terms or {}, roles, hidden, exclude or {})
     return estimate_task(
-        task,
-        max_terms=max_terms,
-        align=align,
-        courses=courses,
-        units=units,
-        provenance=provenance,
-        limit_s=limit_s,
-        progress=as_progress(progress),
-    )
+        task, max_terms=max_terms, align=align, courses=courses, units=units,
+        provenance=provenance, limit_s=limit_s, progress=as_progress(progress),
+    )  # fmt: skip
 
 
 def estimate_task(

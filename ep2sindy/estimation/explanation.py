@@ -16,9 +16,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.estimation.cost import OutOfTimeError
-from ep2sindy.estimation.delay import (
+from ep2sindy.estimation.likelihood import TrajectoryFit
+from ep2sindy.estimation.observation import (
     PAYS,
     SURE,
+    Solution,
     delay_misfit,
     delay_price,
     delay_words,
@@ -26,10 +28,8 @@ from ep2sindy.estimation.delay import (
     shift_channels,
     suspect_delays,
 )
-from ep2sindy.estimation.likelihood import TrajectoryFit
 from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem
 from ep2sindy.estimation.process_noise import process_noise_words, solve_with_process_noise
-from ep2sindy.estimation.solution import Solution
 from ep2sindy.estimation.solver import (
     ENOUGH_SAMPLES,
     OTHER_STARTS,

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby, product
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.coerce import Task
@@ -234,16 +234,11 @@ def _insert_states(run: Trajectory, known: Columns, units: Mapping[str, str]) ->
     )
 
 
-def _with(library: Library, name: str) -> Bool[np.ndarray, " terms"]:
-    """Terms that hold a variable."""
-    own = [library.variables.index(name), *_functions_of(library, name)]
-    return np.asarray(library.exponents[:, own].any(axis=1))
-
-
-def _functions_of(library: Library, name: str) -> list[int]:
-    """Columns of a library's exponents that are functions of a variable."""
-    n = len(library.variables)
-    return [n + k for k, function in enumerate(library.functions) if function.variable == name]
+def _powers_of(library: Library, name: str) -> Int[np.ndarray, " terms"]:
+    """How often each term holds a variable, alone or within a function."""
+    n, own = len(library.variables), [library.variables.index(name)]
+    own += [n + k for k, function in enumerate(library.functions) if function.variable == name]
+    return np.asarray(library.exponents[:, own].sum(axis=1))
 
 
 def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.ndarray, " terms"]:
@@ -251,10 +246,10 @@ def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.nd
     found = np.ones(len(library), dtype=np.bool_)
     for variable in library.variables:
         if variable not in (name, *others):
-            found &= ~_with(library, variable)
+            found &= _powers_of(library, variable) == 0
     if name:
         found &= library.exponents[:, library.variables.index(name)] == 1
-        found &= ~library.exponents[:, _functions_of(library, name)].any(axis=1)
+        found &= _powers_of(library, name) == 1
     return found
 
 

@@ -12,13 +12,14 @@ The likelihood is that of the innovations (Schweppe 1965, doi:10.1109/TIT.1965.1
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.kernels import eliminate, filtered
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit, linearise
+from ep2sindy.estimation.likelihood import TrajectoryFit, linearise
 from ep2sindy.estimation.noise import (
     MORE_DEGREES,
     autocorrelations,
@@ -26,8 +27,8 @@ from ep2sindy.estimation.noise import (
     noise_beside,
     powers_of,
 )
+from ep2sindy.estimation.observation import LackOfFit, Observation, Solution
 from ep2sindy.estimation.problem import EstimationProblem
-from ep2sindy.estimation.solution import LackOfFit, Observation, Solution
 from ep2sindy.estimation.solver import (
     EXACT,
     at_level,
@@ -51,8 +52,16 @@ MAX_DEFECT = 3.0
 SETTLING = 5  # samples from whose start on innovations count
 
 
-def likely_errors(fit: TrajectoryFit) -> tuple[Level, float]:
-    """The likeliest noise and process noise about the path of a fit, and their -2 log likelihood.
+class Errors(NamedTuple):
+    """Standard deviations of noise and process noise, by state; deviance: -2 log likelihood."""
+
+    noise: Float[np.ndarray, " d"]
+    process: Float[np.ndarray, " d"]
+    deviance: float
+
+
+def likely_errors(fit: TrajectoryFit) -> Errors:
+    """The likeliest noise and process noise about the path of a fit.
 
     The search for them starts from those of the fit's level.
     """
@@ -62,14 +71,15 @@ def likely_errors(fit: TrajectoryFit) -> tuple[Level, float]:
     n, d = int(measured.sum()), len(measured)
     low = np.log(np.repeat([LEAST_NOISE, LEAST_PROCESS], [n, d]))
 
-    def level_of(logs: np.ndarray) -> Level:
+    def sizes(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         held = np.exp(np.clip(logs, low, np.log(MOST)))
         own = np.ones(d)
         own[measured] = held[:n]
-        return level.with_errors(own, held[n:])
+        return own, held[n:]
 
     def unlikely(logs: np.ndarray) -> float:
-        tried, bounded = replace(fit, level=level_of(logs)), np.clip(logs, low, np.log(MOST))
+        tried = replace(fit, level=level.with_errors(*sizes(logs)))
+        bounded = np.clip(logs, low, np.log(MOST))
         variance = np.square(tried.level.noise)
         case = about._replace(variance=variance, process=tried.process)
         return float(np.square(logs - bounded).sum() + sum(eliminate(*case)[2:]))
@@ -87,7 +97,7 @@ def likely_errors(fit: TrajectoryFit) -> tuple[Level, float]:
             "xatol": 0.05,
         },
     )
-    return level_of(found.x), float(found.fun)
+    return Errors(*sizes(found.x), float(found.fun))
 
 
 def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> Solution:
@@ -97,23 +107,23 @@ def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> S
     level = fit.level.with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
     for share in SHARES:
         fit = exchange_terms(at_level(fit, level), share * prices, max_terms)
-        level, deviance = likely_errors(fit)
-    process = level.process_noise
+        errors = likely_errors(fit)
+        level = level.with_errors(errors.noise, errors.process)
     fit = at_level(fit, level)
     noise, none = noise_beside(fit), np.zeros(len(problem.states))
     explained = replace(
         noise,
-        std=level.noise[0],
+        std=errors.noise,
         memory=none,
         unexplained=none,
         patterned=none > 0.0,
-        deviance=deviance,
+        deviance=errors.deviance,
     )
     return Solution(
         fit=fit,
-        observation=Observation(explained, none, process),
+        observation=Observation(explained, none, errors.process),
         prices=prices,
-        deviance=deviance,
+        deviance=errors.deviance,
         tests=(_test_defects(fit), *_test_innovations(fit)),
     )
 
@@ -124,8 +134,7 @@ def _test_defects(fit: TrajectoryFit) -> LackOfFit:
     Infinite for a state without a law: one whose equation has no term, which noise alone moves.
     """
     defects = squares_of_steps(fit)[0] / len(fit.path)
-    noise, process = fit.level.noise[0], fit.level.process_noise
-    allowed = np.square(MAX_DEFECT * process) + np.square(EXACT * noise)
+    allowed = MAX_DEFECT**2 * fit.process[0] + np.square(EXACT * fit.level.noise[0])
     moves = fit.problem.coef(fit.free).any(axis=0)
     return LackOfFit(np.where(moves, np.sqrt(defects / allowed), np.inf), 1.0)
 

@@ -16,7 +16,6 @@ from jaxtyping import Float
 
 from ep2sindy.data.coerce import keep_inside, noise_inside
 from ep2sindy.data.numbers import least_squares
-from ep2sindy.estimation.delay import DelayedGram, delayed_gram
 from ep2sindy.estimation.likelihood import (
     FAR,
     MAX_DIVERGENCE,
@@ -28,8 +27,14 @@ from ep2sindy.estimation.likelihood import (
     gram,
 )
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
+from ep2sindy.estimation.observation import (
+    DelayedGram,
+    LackOfFit,
+    Observation,
+    Solution,
+    delayed_gram,
+)
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
-from ep2sindy.estimation.solution import LackOfFit, Observation, Solution
 from ep2sindy.estimation.supports import alternatives, best_support, excess, penalise, term_prices
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 

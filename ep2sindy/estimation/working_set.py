@@ -30,8 +30,8 @@ from ep2sindy.estimation.likelihood import (
     hessian_on,
     observe,
 )
+from ep2sindy.estimation.observation import Solution
 from ep2sindy.estimation.problem import EstimationProblem
-from ep2sindy.estimation.solution import Solution
 from ep2sindy.estimation.solver import (
     COMPARED_AT,
     OTHER_STARTS,

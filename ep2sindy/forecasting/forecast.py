@@ -32,11 +32,11 @@ def forecast(
     """Forecast from the end of a history, whose last periods determine the start.
 
     The model itself is fitted to the samples of the last four periods: nothing but the past enters.
-    The noise of the samples, and random pushes for what the model does not describe, are the
-    likeliest ones for the record that the model was fitted to; the pushes are then scaled until
+    The noise of the samples, and process noise for what the model does not describe, are the
+    likeliest ones for the record that the model was fitted to; the latter is then scaled until
     bands hold 90 % of that record, if it is long enough (`calibrate`). The bands follow from the
     uncertainty of the start, from the covariance of the model's coefficients if it has one, from
-    these pushes, and from the noise.
+    this process noise, and from the noise.
     history: samples of the measured states and of the inputs; a Trajectory, a table or (t, x).
     States of the model that it lacks are told from the others (`estimate_states`).
     horizon: duration in s, in steps of the history; or the times (samples,) themselves, in s.

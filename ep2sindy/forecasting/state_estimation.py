@@ -210,7 +210,7 @@ def estimate_states(
 ) -> Trajectory:
     """All states of a model along a record, those included that nobody measured.
 
-    The states follow the model but for random pushes, and the samples but for noise; the sizes of
+    The states follow the model but for process noise, and the samples but for noise; the sizes of
     both are the likeliest ones for this record (Kalman smoothing, iterated).
     run: has the inputs and some states of the model. measured: as for `tune_estimator`.
     Raises ValueError for a run without any state of the model, or a state that the model cannot
@@ -235,8 +235,8 @@ def _with_likely_noise(
     paths = [estimator.fit_path(*pair).path for pair in zip(records, paths, strict=True)]
     samples, process = estimator.scaled_noise()
     level = Level(np.tile(samples, (sum(map(len, paths)), 1)), 1.0, estimator.n_substeps, process)
-    found, _ = likely_errors(_fit_of(estimator.problem, records, paths, estimator.free, level))
-    noise = _noise_of(estimator.problem, found.noise[0], found.process_noise)
+    errors = likely_errors(_fit_of(estimator.problem, records, paths, estimator.free, level))
+    noise = _noise_of(estimator.problem, errors.noise, errors.process)
     return replace(estimator, noise=noise), paths
 
 
