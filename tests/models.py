@@ -20,6 +20,12 @@ def model_of(
     return SparseModel(library, list(equations), coef_matrix(library, [*equations.values()]))
 
 
+def slopes_of(library: Library, values: np.ndarray) -> np.ndarray:
+    """Derivative of every term by every variable, (variables, samples, terms)."""
+    products, shares = library.with_derivatives(len(library.variables))
+    return np.einsum("sp,tvp->vst", products.evaluate(values), shares[:, 1:])
+
+
 def plain_rows(
     theta: np.ndarray,
     target: np.ndarray,

@@ -63,8 +63,7 @@ def found(
 
 def liouville(model: SparseModel, cycle: LimitCycle) -> float:
     """Product of the multipliers: exp of the divergence, integrated over the period."""
-    library = model.library.over(model.states)
-    trace = np.einsum("kst,tk->s", library.jacobian(cycle.states), model.coef)
+    trace = np.trace(model.field.jacobian(cycle.states), axis1=1, axis2=2)
     return float(np.exp(trace.mean() * cycle.period_s))  # spectral: the samples are periodic
 
 

@@ -187,11 +187,11 @@ def _infer_state(
 
     States that are not known yet count as zero; the equation is linearised there.
     """
-    variables = list(model.library.variables)
+    variables = list(model.field.library.variables)
     none = np.zeros(len(next(iter(known.values()))))
     values = np.stack([known.get(variable, none) for variable in variables], axis=1)
-    slopes = model.library.jacobian(values)[variables.index(name)] @ model.coef
-    rest = model.library.evaluate(values) @ model.coef
+    slopes = model.field.jacobian(values)[:, :, variables.index(name)]
+    rest = model.field.rates(values)
     for k, state in enumerate(model.states):
         if state in rates and slopes[:, k].any():
             return _quotient(rates[state] - rest[:, k], slopes[:, k])

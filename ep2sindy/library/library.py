@@ -215,18 +215,6 @@ class Library:
         places = np.array([*map(list(known).index, self.variables), *others])
         return places[self.table if rows is None else self.table[rows]]
 
-    def jacobian(self, values: Any) -> Any:
-        """Derivative of every term with respect to every variable, at every sample.
-
-        values: as for `evaluate`. Returns (variables, ..., terms), of the same kind.
-        """
-        xp = array_namespace(values)
-        products, addends = self._slopes
-        theta = products.evaluate(values)
-        return xp.stack(
-            [sum(theta[..., k] * xp.asarray(weights) for k, weights in each) for each in addends]
-        )
-
     def with_derivatives(
         self, n: int
     ) -> tuple[Library, Float[np.ndarray, "terms columns products"]]:
@@ -268,24 +256,6 @@ class Library:
     @cached_property
     def _derived(self) -> dict[int, tuple[Library, np.ndarray]]:
         return {}
-
-    @cached_property
-    def derivatives(self) -> tuple[Library, Float[np.ndarray, "terms columns products"]]:
-        """Terms and their derivatives by all variables, as in `with_derivatives`."""
-        return self.with_derivatives(len(self.variables))
-
-    @cached_property
-    def _slopes(self) -> tuple[Library, list[list[tuple[np.ndarray, np.ndarray]]]]:
-        """Products, and for each variable the addends of all derivatives: (indices, weights)."""
-        products, shares = self.derivatives
-        addends = []
-        for by_variable in np.moveaxis(shares[:, 1:], 1, 0):
-            present = by_variable != 0.0
-            n_addends = max(1, int(present.sum(axis=1).max()))
-            first = np.argsort(~present, axis=1, kind="stable")[:, :n_addends]
-            weights = np.take_along_axis(by_variable, first, axis=1)
-            addends.append(list(zip(first.T, weights.T, strict=True)))
-        return products, addends
 
 
 def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:

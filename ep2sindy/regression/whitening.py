@@ -151,7 +151,8 @@ class _Sums(NamedTuple):
 
     @staticmethod
     def of(problem: RegressionRows, kept: Bool[np.ndarray, " terms"]) -> _Sums:
-        products, shares = problem.library.derivatives
+        library = problem.library
+        products, shares = library.with_derivatives(len(library.variables))
         shares = shares[kept] / problem.theta_scale[kept, None, None]
         used = shares.any(axis=(0, 1))
         parts = [csr_array(share) for share in shares[:, :, used].transpose(1, 0, 2)]
