@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -128,9 +128,9 @@ class ODE(nn.Module):
     drive: steps and inputs on the way, which must be set before an integration.
     """
 
-    factors: torch.Tensor
     basis: torch.Tensor
     offset: torch.Tensor
+    of_rates: torch.Tensor
     drive: Drive
 
     def __init__(
@@ -143,10 +143,11 @@ class ODE(nn.Module):
     ) -> None:
         super().__init__()
         self.library, self.n_states = library, n_states
-        factors = torch.tensor(library.table.T, device=basis.device)
-        self.register_buffer("factors", factors.contiguous())
         self.register_buffer("basis", basis)
         self.register_buffer("offset", offset)
+        rows = slice(n_states)  # the products that rates alone need
+        used = (basis[:, rows] != 0.0).any(dim=-1) | (offset[:, rows] != 0.0)
+        self.register_buffer("of_rates", torch.nonzero(used.any(dim=0).any(dim=0))[:, 0])
         self.scaling = nn.Parameter(basis.new_ones((len(basis), basis.shape[-1])))
         self.correction = correction
 
@@ -175,6 +176,10 @@ class ODE(nn.Module):
         """Number of columns: the rate, its derivatives by each state, then by each scaling."""
         return 1 + self.n_states + self.n_free
 
+    @cached_property
+    def _library_of_rates(self) -> Library:
+        return self.library.take(self.of_rates.cpu().numpy())
+
     def take(self, points: torch.Tensor) -> ODE:
         """Module of some of the points, with scalings of one, without drive or correction."""
         return ODE(self.library, self.n_states, self.basis[points], self.offset[points])
@@ -194,15 +199,19 @@ class ODE(nn.Module):
     def fields(self, x: torch.Tensor, inputs: torch.Tensor, n_columns: int) -> torch.Tensor:
         """Rates, then their derivatives, (points, n_columns, n_states, batch).
 
-        x: (points, n_states, batch). One gather and product evaluates every distinct product, one
-        matmul all columns.
+        x: (points, n_states, batch). One gather and product evaluates every distinct product that
+        is needed, one matmul all columns.
         """
+        library, weights = self.library, self.weights(n_columns)
+        if n_columns == 1:
+            library, weights = self._library_of_rates, weights[:, :, self.of_rates]
         columns = torch.cat([x, inputs, torch.ones_like(x[:, :1])], dim=1)
-        columns = self.library.with_functions(columns, axis=1)
-        products = columns.index_select(1, self.factors[0])
-        for rows in self.factors[1:]:
+        columns = library.with_functions(columns, axis=1)
+        first, *others = torch.tensor(library.table.T, device=x.device)
+        products = columns.index_select(1, first)
+        for rows in others:
             products = products * columns.index_select(1, rows)
-        found = torch.bmm(self.weights(n_columns), products)
+        found = torch.bmm(weights, products)
         return found.view(len(x), n_columns, self.n_states, x.shape[-1])
 
     def forward(self, t: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
