@@ -65,9 +65,9 @@ def test_gram_matrix_is_the_weighted_product_of_unit_columns() -> None:
     assert np.diag(problem.train_gram.xx) == pytest.approx(1.0)
     counts = rng.integers(0, 3, size=30).astype(float)
     repeated = np.repeat(theta / np.linalg.norm(theta, axis=0), counts.astype(int), axis=0)
-    (sums,) = problem.resampled_sums(counts[None])
+    (sums,) = problem.resampled_products(counts[None])
     plain = np.column_stack([repeated, np.repeat(problem.train_rows[:, 3], counts.astype(int))])
-    assert np.allclose(sums, (plain.T @ plain)[np.triu_indices(4)], atol=1e-14)
+    assert np.allclose(sums, plain.T @ plain, atol=1e-14)
 
 
 def test_columns_at_the_edge_of_the_number_format_keep_finite_norms() -> None:

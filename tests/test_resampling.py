@@ -22,7 +22,7 @@ def test_bootstraps_draw_neighbours_together() -> None:
     n_train = len(problem.train_rows)
     whole = Bootstraps(n=2, n_culled=0, smallest=1.0, largest=1.0, block=n_train)
     sums, _ = whole.draw(problem, terms, np.random.default_rng(0))
-    once = problem.train_products[np.triu_indices(len(problem.train_products))]
+    once = problem.train_products
     np.testing.assert_allclose(sums, np.array([once, once]), rtol=1e-12, atol=1e-14)
 
 
@@ -35,13 +35,13 @@ def test_weights_of_a_long_record_are_held_for_some_draws_at_once(
     )
     terms, held = np.ones(len(system.model.library), dtype=np.bool_), []
     together = Bootstraps(n=7).draw(problem, terms, np.random.default_rng(0))
-    resampled_sums = ep.regression.RegressionRows.resampled_sums
+    resampled_products = ep.regression.RegressionRows.resampled_products
 
     def tell(problem: ep.regression.RegressionRows, weights: np.ndarray) -> np.ndarray:
         held.append(weights.size)
-        return resampled_sums(problem, weights)
+        return resampled_products(problem, weights)
 
-    monkeypatch.setattr(ep.regression.RegressionRows, "resampled_sums", tell)
+    monkeypatch.setattr(ep.regression.RegressionRows, "resampled_products", tell)
     monkeypatch.setattr(bootstraps, "MOST_WEIGHTS", 2 * problem.n_train)
     in_parts = Bootstraps(n=7).draw(problem, terms, np.random.default_rng(0))
     assert max(held) <= 2 * problem.n_train

@@ -168,9 +168,9 @@ def test_bootstraps_draw_whole_groups() -> None:
 
     def record(weights: np.ndarray) -> np.ndarray:
         seen.append(weights)
-        return np.ones((len(weights), 28))
+        return np.ones((len(weights), 7, 7))
 
-    object.__setattr__(problem, "resampled_sums", record)
+    object.__setattr__(problem, "resampled_products", record)
     Bootstraps(n=5).draw(problem, np.ones(6, dtype=bool), np.random.default_rng(0))
     assert len(seen[0]) == 5
     for drawn in seen[0]:

@@ -61,14 +61,13 @@ class Bootstraps:
 
     def draw(
         self, problem: RegressionRows, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, "draws pairs"], Bool[np.ndarray, "draws terms"]]:
-        """Sums of products (`resampled_sums`) and kept terms of every bootstrap.
+    ) -> tuple[Float[np.ndarray, "draws columns columns"], Bool[np.ndarray, "draws terms"]]:
+        """Products of all columns (`resampled_products`) and kept terms of every bootstrap.
 
         The terms are chosen among the usable `terms`.
         """
         if self.n == 0:
-            triangle = [row[k:] for k, row in enumerate(problem.train_products)]
-            return np.concatenate(triangle)[None], terms[None]
+            return problem.train_products[None], terms[None]
         if self.block > 1 and len(problem.trajectories) > 1:
             raise ValueError(
                 f"blocks of {self.block} would cross from one trajectory to the next: "
@@ -80,7 +79,7 @@ class Bootstraps:
             return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
         numbers, group = np.unique(problem.groups[~problem.test], return_inverse=True)
         counts, kept = self.draw_groups(len(numbers), terms, rng)
-        return problem.resampled_sums(counts.take(group, axis=1)), kept
+        return problem.resampled_products(counts.take(group, axis=1)), kept
 
     def draw_groups(
         self, n_groups: int, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
@@ -199,12 +198,8 @@ def draw_resamples(
     if bootstraps.n:
         problem.check_grams(bootstraps.n)  # before the work on terms, which may take minutes
     usable = usable_terms(problem)
-    sums, kept = bootstraps.draw(problem, usable, rng)
-    n_columns, n_terms = len(problem.library) + len(problem.equations), len(problem.library)
-    products = np.empty((len(sums), n_columns, n_columns))
-    left, right = np.triu_indices(n_columns)
-    products[:, left, right] = products[:, right, left] = sums
-    squares = products.diagonal(axis1=1, axis2=2)
+    products, kept = bootstraps.draw(problem, usable, rng)
+    squares, n_terms = products.diagonal(axis1=1, axis2=2), len(problem.library)
     # Resampling changes the norms, so columns are scaled to unit norm again; then the search does
     # not depend on units or draws. A culled term becomes a column of zeros.
     kept_squares = np.where(kept, squares[:, :n_terms], 0.0)

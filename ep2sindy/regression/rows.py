@@ -209,25 +209,26 @@ class RegressionRows:
             each=each,
         )
 
-    def resampled_sums(
+    def resampled_products(
         self, weights: Float[np.ndarray, "draws train"]
-    ) -> Float[np.ndarray, "draws pairs"]:
-        """Products of all pairs of scaled columns, summed over the training rows for each draw.
+    ) -> Float[np.ndarray, "draws columns columns"]:
+        """Products of all scaled columns, summed over the training rows for each draw.
 
-        Each row is counted `weights` times. The pairs are those of an upper triangle, row by row.
-        All draws share the products, so each draw is one row of a matrix product. Rows are
-        processed in blocks to keep these products small.
+        Each row is counted `weights` times. All draws share the products of a row, so each draw is
+        one row of a matrix product. Rows are processed in blocks to keep these products small.
         """
         self.check_grams(len(weights))
-        left, right = np.triu_indices(len(self.library) + len(self.equations))
-        sums, begin = np.zeros((len(weights), len(left))), 0
+        n = len(self.library) + len(self.equations)
+        (left, right), begin = np.triu_indices(n), 0
+        sums, products = np.zeros((len(weights), len(left))), np.empty((len(weights), n, n))
         for columns in self.blocks(test=False):
             for start in range(0, columns.shape[1], ROW_BLOCK):
                 some = columns[:, start : start + ROW_BLOCK]
                 here = slice(begin + start, begin + start + some.shape[1])
                 sums += weights[:, here] @ (some[left] * some[right]).T
             begin += columns.shape[1]
-        return sums
+        products[:, left, right] = products[:, right, left] = sums
+        return products
 
     def _products(self, *, test: bool) -> Float[np.ndarray, "columns columns"]:
         parts = [columns @ columns.T for columns in self.blocks(test=test)]
