@@ -21,10 +21,10 @@ from ep2sindy.discovery.result import Discovery
 from ep2sindy.discovery.signal_unknowns import (
     FITTED,
     HiddenStates,
-    alone,
     embed_hidden,
     fit_functions,
-    names_of,
+    name_states,
+    record_of,
     search_hidden,
 )
 from ep2sindy.estimation.explanation import FIRST_MAX_TERMS
@@ -116,18 +116,18 @@ def choose_attempt(attempts: Sequence[Attempt]) -> Attempt:
     return best
 
 
-def error_where_fitted(past: Trace, chosen: Chosen, estimator: StateEstimator) -> float:
+def measure_forecast_error(past: Trace, chosen: Chosen, estimator: StateEstimator) -> float:
     """Error of forecasts up to a period from starts in the last half of the fitted part."""
-    record, longest = with_all_states(past, chosen), max(2, round(past.per_period))
+    record, longest = complete_states(past, chosen), max(2, round(past.per_period))
     n = record.n_samples
     first = spread_starts(record.t, n // 2, longest, N_TRIED)
     rolling = RollingStarts(estimator, record, [past.name], first, longest)
-    ahead = rolling.forecasts(partial(states_before, past, chosen.embedding), N_DRAWS_TRIED, seed=0)
+    ahead = rolling.forecast(partial(embed_past, past, chosen.embedding), N_DRAWS_TRIED, seed=0)
     scale = past.x[n // 2 :].std()
     return float(horizon_errors(rolling.measured(ahead), rolling.truth, scale).mean())
 
 
-def with_all_states(signal: Trace, chosen: Chosen) -> Trajectory:
+def complete_states(signal: Trace, chosen: Chosen) -> Trajectory:
     """Samples of the signal as measured, with the other states beside it as far as they are known.
 
     Where a state is not known, at the beginning or beyond the fitted part, the nearest is taken;
@@ -140,10 +140,10 @@ def with_all_states(signal: Trace, chosen: Chosen) -> Trajectory:
     return replace(known, t=signal.t, states=states, inputs=np.empty((len(signal.t), 0)))
 
 
-def states_before(signal: Trace, embedding: Embedding, past: Trajectory) -> Trajectory:
+def embed_past(signal: Trace, embedding: Embedding, past: Trajectory) -> Trajectory:
     """The states at a time, made from samples before it alone."""
     if isinstance(embedding, HiddenStates):  # the estimator fits them itself
-        return alone(signal.with_samples(past.t, past.states[:, 0]))
+        return record_of(signal.with_samples(past.t, past.states[:, 0]))
     return embedding.embed(signal.with_samples(past.t, past.states[:, 0])).run
 
 
@@ -199,8 +199,8 @@ class SignalSearch:
                 return [self._attempt(past, chosen, found, progress)]
             if say is not None:
                 say(NOT_EXPLAINED)
-        pairs = [once(partial(self._smoothed, past, n, seed, progress)) for n in numbers]
-        return [self._attempt(past, *pair, progress) for pair in pairs]
+        pairs = [once(partial(self._search_smoothed, past, n, seed, progress)) for n in numbers]
+        return [self._attempt(past, chosen, found, progress) for chosen, found in pairs]
 
     def _numbers(self, signal: Trace) -> list[int]:
         """Numbers of states to try; a signal of two states either repeats itself or spirals."""
@@ -211,9 +211,9 @@ class SignalSearch:
     def _libraries(self, past: Trace, numbers: Sequence[int]) -> Iterator[Library]:
         """Of the signal and hidden states, the smallest first."""
         for n_states in numbers:
-            names, functions = names_of(past, n_states), self.functions
+            names, functions = name_states(past, n_states), self.functions
             if any(FITTED in text for text in functions):
-                functions = self._fitted_functions(self._embedded(past, n_states).embedded)
+                functions = self._fitted_functions(self._embed(past, n_states).embedded)
             for degree in self._degrees:
                 yield self.library(names, functions, degree)
 
@@ -229,25 +229,25 @@ class SignalSearch:
             return TrajectorySearch(max_terms=own.max_terms)
         return TrajectorySearch()
 
-    def _smoothed(
+    def _search_smoothed(
         self, past: Trace, n_states: int, seed: int, progress: Progress
     ) -> tuple[Chosen, Discovery]:
         with progress.stage(None, "", f"{n_states} states of the signal"):
-            chosen = self._embedded(past, n_states)
-        return chosen, self._found(chosen, past.name, seed, progress)
+            chosen = self._embed(past, n_states)
+        return chosen, self._discover(chosen, past.name, seed, progress)
 
     def _attempt(
         self, past: Trace, chosen: Chosen, found: Discovery, progress: Progress
     ) -> Attempt:
         with progress.stage(None, "", "forecasts where it was fitted"):
-            record = with_all_states(past, chosen)
+            record = complete_states(past, chosen)
             estimator = tune_estimator(found.model, record, measured=[past.name])
-            error = error_where_fitted(past, chosen, estimator)
+            error = measure_forecast_error(past, chosen, estimator)
             own = chosen.embedding
             share = unexplained(past, own) if isinstance(own, AnyEmbedding) else None
         return Attempt(chosen, found, estimator, error, share)
 
-    def _embedded(self, signal: Trace, n_states: int) -> Chosen:
+    def _embed(self, signal: Trace, n_states: int) -> Chosen:
         kind = EMBEDDINGS.get(self.embedding)
         own = kind(harmonics=self.harmonics, n_states=n_states) if kind else None
         return embed(signal, own, n_states=n_states, harmonics=self.harmonics)
@@ -266,10 +266,10 @@ class SignalSearch:
         """The functions, with numbers where they have a `?`."""
         library_of = partial(self.library, known.run.state_names)
         return fit_functions(
-            self.functions, known.run, library_of, partial(_misfit, self.method, known)
+            self.functions, known.run, library_of, partial(_measure_misfit, self.method, known)
         )
 
-    def _found(self, chosen: Chosen, signal: str, seed: int, progress: Progress) -> Discovery:
+    def _discover(self, chosen: Chosen, signal: str, seed: int, progress: Progress) -> Discovery:
         method, rule, known = self.method, self.method.selection, chosen.embedded
         if isinstance(rule, SystemSelection):  # the measured signal is judged, not derived states
             from ep2sindy.selection.free_run import (
@@ -300,7 +300,7 @@ def repeats(signal: Trace) -> bool:
     return signal.cycle is not None and signal.cycle.share >= REPEATS
 
 
-def _misfit(method: AnyMethod, known: Embedded, library: Library) -> float:
+def _measure_misfit(method: AnyMethod, known: Embedded, library: Library) -> float:
     """Share of the derivatives that the largest candidates leave, the product over equations.
 
     Infinite for a library that cannot be used on the states.
@@ -434,16 +434,16 @@ def evaluate(
     """
     best = choose_attempt(attempts)
     chosen, model = best.chosen, best.found.model
-    whole = with_all_states(signal, replace(
+    whole = complete_states(signal, replace(
         chosen, embedded=chosen.embedding.embed(signal)
     ))  # fmt: skip
     own = [signal.name]
-    is_whole, before = n_fitted == len(signal.t), partial(states_before, signal, chosen.embedding)
+    is_whole, before = n_fitted == len(signal.t), partial(embed_past, signal, chosen.embedding)
     if is_whole:
         first, estimator = int(np.searchsorted(signal.t, chosen.embedded.run.t[0])), best.estimator
         start = chosen.embedded.run.states[0]
     else:
-        first, past = n_fitted - 1, with_all_states(signal.window(0, n_fitted), chosen)
+        first, past = n_fitted - 1, complete_states(signal.window(0, n_fitted), chosen)
         with progress.stage(None, "", "width of the forecasts' bands"):
             estimator = calibrate(best.estimator, past, states_of=before)
         start = estimator.filter(before(past)).mean

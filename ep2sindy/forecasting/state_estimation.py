@@ -108,7 +108,7 @@ class StateEstimator:
 
         history: has the measured states of the model; others that it has only start the fit.
         """
-        record = self.problem.record(_of_model(self.model, history)).end(self.memory)
+        record = self.problem.record(_select_variables(self.model, history)).end(self.memory)
         path = self.fit_path(record, record.samples)
         variances = error_variances(len(path), *self.scaled_noise())
         _, mean, covariance = filtered(*self.linearise(record, path), *variances, FREE_START)
@@ -123,7 +123,7 @@ class StateEstimator:
 
         Between gaps it starts anew. Stretches of under five samples are left out.
         """
-        own = _of_model(self.model, run)
+        own = _select_variables(self.model, run)
         whole = self.problem.record(own)
         pieces = whole.stretches()
         paths = [self.fit_path(piece, piece.samples) for piece in pieces]
@@ -146,8 +146,8 @@ class StateEstimator:
     ) -> Float[np.ndarray, "samples d"]:
         """The most likely path near the given one, by way of larger pushes that fade."""
         samples, process = self.scaled_noise()
-        problem = replace(self.problem, records=(_as_values(record),))
-        fit = _fit_of([path], self.free)
+        problem = replace(self.problem, records=(_drop_limits(record),))
+        fit = _fix([path], self.free)
         for share in (*COOLING, 0.0):
             level = _level_of([path], samples, np.maximum(process, share * samples))
             fit = fit_paths(problem, fit, replace(level, n_substeps=self.n_substeps))
@@ -190,12 +190,12 @@ def tune_estimator(
             f"a record must have {MIN_SAMPLES} samples or more to tell its noise: got "
             f"{run.n_samples}; pass the record that the model was fitted to, fitted_to=..."
         )
-    own = _of_model(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
+    own = _select_variables(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
     terms = {state: list(model.terms(state)) for state in model.states}
     problem = scale_problem(
         [own], model.library, terms=terms, measured=names, courses=model.courses
     )
-    paths, free = [record.samples.copy() for record in problem.records], _free_of(model, problem)
+    paths, free = [record.samples for record in problem.records], _free_of(model, problem)
     # Differences remove what is smooth; those of white noise have a variance of 20.
     differences = np.concatenate([np.diff(path, n=3, axis=0) for path in paths])
     rough = np.sqrt(np.square(differences).mean(axis=0) / 20.0)
@@ -204,8 +204,8 @@ def tune_estimator(
         model=model,
         problem=problem,
         free=free,
-        n_substeps=enough_substeps(problem, _fit_of(paths, free), _level_of(paths, rough, None)),
-        per_period=_per_period(own, names),
+        n_substeps=enough_substeps(problem, _fix(paths, free), _level_of(paths, rough, None)),
+        per_period=_count_per_period(own, names),
         noise=_noise_of(problem, rough, 0.1 * rough),
     )
     watch = as_progress(progress)
@@ -249,7 +249,7 @@ def _with_likely_noise(
     return replace(estimator, noise=noise), found
 
 
-def _fit_of(paths: Sequence[np.ndarray], free: np.ndarray) -> TrajectoryFit:
+def _fix(paths: Sequence[np.ndarray], free: np.ndarray) -> TrajectoryFit:
     """A fit of these paths, whose coefficients stay as they are."""
     fixed = np.zeros(len(free), dtype=np.bool_)
     return TrajectoryFit(tuple(paths), free, fixed, np.zeros(paths[0].shape[1]))
@@ -261,7 +261,7 @@ def _level_of(
     return Level(tuple(np.tile(samples, (len(path), 1)) for path in paths), 1.0, push=process)
 
 
-def _as_values(record: ScaledRecord) -> ScaledRecord:
+def _drop_limits(record: ScaledRecord) -> ScaledRecord:
     """The record with clipped and rounded samples as they are: forecasts are compared with them."""
     return replace(record, limits=None)
 
@@ -282,7 +282,7 @@ def measured_states(model: SparseModel, run: Trajectory) -> list[str]:
     return found
 
 
-def _of_model(model: SparseModel, run: Trajectory) -> Trajectory:
+def _select_variables(model: SparseModel, run: Trajectory) -> Trajectory:
     """The variables of a run that a model has, in its order; states that it lacks are guessed."""
     if len(measured_states(model, run)) < len(model.states):
         run = with_guess_by(model, run)
@@ -305,7 +305,7 @@ def _free_of(model: SparseModel, problem: EstimationProblem) -> Float[np.ndarray
     return np.array(coef) / problem.to_SI
 
 
-def _per_period(run: Trajectory, measured: Sequence[str]) -> float:
+def _count_per_period(run: Trajectory, measured: Sequence[str]) -> float:
     """Samples to a period of the fastest measured state, or in all if it holds none."""
     frequency_Hz = max(dominant_frequency(run.t, column) for column in run.columns(measured).T)
     return run.n_samples / max(frequency_Hz * run.dt_s * run.n_samples, 1.0)
