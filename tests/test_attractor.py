@@ -8,9 +8,9 @@ from scipy.signal import fftconvolve
 
 import ep2sindy as ep
 from ep2sindy.signals.attractor import (
-    _columns,
+    _factorise,
+    _fourier_columns,
     _moving_average,
-    _triangle,
     best_shift,
     distribution_distances,
     find_cycle,
@@ -175,7 +175,7 @@ def test_what_does_not_repeat_has_no_mean_cycle() -> None:
 
 @pytest.mark.parametrize("reach", [40.0, 3.0])  # in rad: over periods, and over half of one
 def test_triangles_are_those_of_reflections_also_where_samples_cluster(reach: float) -> None:
-    columns = _columns(np.linspace(0.0, reach, 400), 4)
+    columns = _fourier_columns(np.linspace(0.0, reach, 400), 4)
     plain = np.linalg.qr(columns, mode="r")
-    signs = np.sign(np.diagonal(plain) * np.diagonal(_triangle(columns)))
-    np.testing.assert_allclose(_triangle(columns), signs[:, None] * plain, rtol=1e-11, atol=1e-11)
+    signs = np.sign(np.diagonal(plain) * np.diagonal(_factorise(columns)))
+    np.testing.assert_allclose(_factorise(columns), signs[:, None] * plain, rtol=1e-11, atol=1e-11)

@@ -196,10 +196,10 @@ def _search_block(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarra
     t = grid_points(block, "time")
     found: dict[str, list[np.ndarray]] = {name: [] for name in LAYOUT}
     status, reasons = [], []
-    no_result = nothing(search)
-    for values in _columns(block, search.variables):
+    no_result = empty_point(search)
+    for values in _iterate_points(block, search.variables):
         point = no_result
-        status.append(_status(values, search))
+        status.append(_judge_samples(values, search))
         if status[-1] == 0:
             try:
                 point = search_point(_trajectory(t, values, block, search), search)
@@ -213,7 +213,7 @@ def _search_block(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarra
     return stacked | {"status": flags, NO_FIT: np.array(min(reasons, default=""))}
 
 
-def _columns(
+def _iterate_points(
     block: xr.Dataset, names: Sequence[str]
 ) -> Iterator[Float[np.ndarray, "variables samples"]]:
     """All variables at one point after another, the samples of each contiguous in memory."""
@@ -223,7 +223,7 @@ def _columns(
         yield np.stack([grid[:, point] for grid in grids])
 
 
-def _status(values: Float[np.ndarray, "variables samples"], search: PointSearch) -> int:
+def _judge_samples(values: Float[np.ndarray, "variables samples"], search: PointSearch) -> int:
     """Status that can be told before a fit; 0 if a fit is worth trying."""
     lost = ~np.isfinite(values)
     if lost.all(axis=1).any():
@@ -285,7 +285,7 @@ def blocks_of(field: xr.Dataset, n_points: int) -> list[Block]:
 # The search at one point.
 
 
-def nothing(search: PointSearch) -> dict[str, np.ndarray]:
+def empty_point(search: PointSearch) -> dict[str, np.ndarray]:
     """The result at a point that cannot be fitted."""
     sizes = search.sizes
     return {name: np.full([sizes[d] for d in dims], np.nan) for name, dims in LAYOUT.items()}
@@ -298,16 +298,16 @@ def search_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
     equations = search.method.search_equations(task, rng=rng)
     fronts = [equation.front for equation in equations]
     choice = search.method.choose(fronts, task)
-    point = nothing(search)
+    point = empty_point(search)
     for row, (equation, chosen) in enumerate(zip(equations, choice.chosen, strict=True)):
         problem = equation.front.rows
         mask: Bool[np.ndarray, " terms"] = np.isin(search.library.names, chosen.terms)
         point["coef"][row] = choice.model.coef[:, row]
         point["inclusion"][row] = equation.supports.inclusion[chosen.n_terms]
-        point["weight"][row] = shares(point["coef"][row] * problem.theta_scale)
+        point["weight"][row] = weigh_terms(point["coef"][row] * problem.theta_scale)
         fits = equation.draws.fits(equation.number, equation.found, mask)
         point["coef_draws"][:, row] = problem.coef_SI(fits, equation.number)
-        point["weight_draws"][:, row] = shares(fits)
+        point["weight_draws"][:, row] = weigh_terms(fits)
         point["r2_train"][row], point["r2_test"][row] = chosen.r2_train, chosen.r2_test
         point["n_terms"][row] = chosen.n_terms
     return point if choice.constraint is None else _constrained(point, equations, choice.constraint)
@@ -327,7 +327,7 @@ def _constrained(
         for k, (state, term) in enumerate(held.coefficients):
             if state == equation.front.equation:
                 drawn[:, row, problem.library.index(term)] = found[:, k]
-        weights[:, row] = shares(drawn[:, row] * problem.theta_scale)
+        weights[:, row] = weigh_terms(drawn[:, row] * problem.theta_scale)
         for held_out in sorted({False, bool(problem.test.any())}):
             at = problem.test == held_out
             fitted = problem.theta[at] @ point["coef"][row]
@@ -338,7 +338,7 @@ def _constrained(
     }  # fmt: skip
 
 
-def shares(contributions: Float[np.ndarray, "*draws terms"]) -> Float[np.ndarray, "*draws terms"]:
+def weigh_terms(parts: Float[np.ndarray, "*draws terms"]) -> Float[np.ndarray, "*draws terms"]:
     """Each term's part in the sum of absolute values, with its sign; zeros if all are zero."""
-    total = np.abs(contributions).sum(axis=-1, keepdims=True)
-    return contributions / np.where(total > 0.0, total, 1.0)
+    total = np.abs(parts).sum(axis=-1, keepdims=True)
+    return parts / np.where(total > 0.0, total, 1.0)

@@ -147,7 +147,7 @@ class Discovery:
         without_rows = {state: replace(f, problem=None) for state, f in self.fronts.items()}
         parts = replace(self, fronts=without_rows)
         content = {"format": FORMAT, "model": json.loads(self.model.to_json())}
-        content |= {name: _stored(getattr(parts, name)) for name in _PARTS}
+        content |= {name: _encode(getattr(parts, name)) for name in _PARTS}
         return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
     @staticmethod
@@ -162,7 +162,7 @@ class Discovery:
             if content["format"] != FORMAT:
                 raise ValueError(f"format {content['format']!r}")
             model = SparseModel.from_json(json.dumps(content["model"]))
-            found = Discovery(model=model, **{name: _restored(content[name]) for name in _PARTS})
+            found = Discovery(model=model, **{name: _decode(content[name]) for name in _PARTS})
             _check_parts(found)
             return found
 
@@ -206,8 +206,8 @@ _PARTS = (
 )  # fmt: skip
 
 
-def _stored(value: Any) -> Any:
-    """A value as JSON that `_restored` reads: arrays, mappings and dataclasses say what they are.
+def _encode(value: Any) -> Any:
+    """A value as JSON that `_decode` reads: arrays, mappings and dataclasses say what they are.
 
     Raises ValueError for a value that is neither in `STORED` nor one that configs may name.
     """
@@ -216,38 +216,38 @@ def _stored(value: Any) -> Any:
     if value is None or isinstance(value, str | int | float):
         return value
     if isinstance(value, np.ndarray):
-        numbers = [_stored(number) for number in value.ravel().tolist()]
+        numbers = [_encode(number) for number in value.ravel().tolist()]
         return {"array": numbers, "shape": list(value.shape), "type": value.dtype.name}
     if isinstance(value, Mapping):
-        return {"mapping": [[_stored(key), _stored(each)] for key, each in value.items()]}
+        return {"mapping": [[_encode(key), _encode(each)] for key, each in value.items()]}
     if isinstance(value, list | tuple):
-        return [_stored(each) for each in value]
+        return [_encode(each) for each in value]
     name = type(value).__name__ if type(value) in STORED.values() else place_of(type(value))
     if name is None or not is_dataclass(value):
         raise ValueError(
             f"a discovery is stored with its method, of classes of this package alone: {value!r} "
             "came; store its model, found.model.save(path)"
         )
-    return {"class": name, **{f.name: _stored(getattr(value, f.name)) for f in fields(value)}}
+    return {"class": name, **{f.name: _encode(getattr(value, f.name)) for f in fields(value)}}
 
 
-def _restored(content: Any) -> Any:
-    """Inverse of `_stored`; lists become tuples. Raises ValueError for a class of another kind."""
+def _decode(content: Any) -> Any:
+    """Inverse of `_encode`; lists become tuples. Raises ValueError for a class of another kind."""
     if isinstance(content, list):
-        return tuple(_restored(each) for each in content)
+        return tuple(_decode(each) for each in content)
     if not isinstance(content, dict):
         return content
     if "number" in content:
         return float(content["number"])
     if "mapping" in content:
-        return {_restored(key): _restored(each) for key, each in content["mapping"]}
+        return {_decode(key): _decode(each) for key, each in content["mapping"]}
     if "array" in content:
         if content["type"] not in ("float64", "int64", "bool"):
             raise ValueError(f"an array of type {content['type']!r:.80}")
-        numbers = [_restored(number) for number in content["array"]]
+        numbers = [_decode(number) for number in content["array"]]
         return np.array(numbers, dtype=content["type"]).reshape(content["shape"])
     kind = _class_named(content["class"])
-    return kind(**{name: _restored(each) for name, each in content.items() if name != "class"})
+    return kind(**{name: _decode(each) for name, each in content.items() if name != "class"})
 
 
 def _class_named(name: str) -> type:

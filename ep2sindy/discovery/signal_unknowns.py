@@ -61,13 +61,13 @@ class HiddenStates:
     def embed(self, signal: Trace) -> Embedded:
         model = self.estimator.model
         known = {signal.name: tuple(model.terms(signal.name))}  # its term sets a scale
-        return Embedded(self.estimator.smooth(alone(signal)), (), known, self.noise_std)
+        return Embedded(self.estimator.smooth(record_of(signal)), (), known, self.noise_std)
 
 
 def embed_hidden(signal: Trace, found: Discovery, reason: str) -> Chosen:
     """The states that a model with hidden ones has along a signal."""
     assert found.estimate is not None  # a search of trajectories has one
-    estimator = tune_estimator(found.model, alone(signal))
+    estimator = tune_estimator(found.model, record_of(signal))
     own = HiddenStates(estimator, float(found.estimate.noise_std[0]))
     return Chosen(own, reason, own.embed(signal))
 
@@ -84,7 +84,7 @@ def search_hidden(
     It explains the signal if it does so to its noise, and run freely stays with it where it was
     fitted. once: does each search, or takes it from a run that was broken off.
     """
-    run, explains = _last_of(past), False
+    run, explains = _record_searched(past), False
     for library in libraries:
         hidden = [name for name in library.variables if name != past.name]
         found = once(partial(discover, run, library, method, hidden=hidden, progress=progress))
@@ -120,7 +120,7 @@ def fit_offset(
     Raises ValueError if none of its models explains the signal to its noise, or if the signal and
     its offset are not positive.
     """
-    run = _last_of(past)
+    run = _record_searched(past)
     mean, spread = run.states.mean(), run.states.std()
     x, g = library.variables
     for share in SHIFTS:
@@ -161,13 +161,13 @@ def _endures(estimate: Estimate, signal: str) -> bool:
     return free.multiplier**n_periods < SPIRALS
 
 
-def names_of(signal: Trace, n_states: int) -> tuple[str, ...]:
+def name_states(signal: Trace, n_states: int) -> tuple[str, ...]:
     """Names of the signal and of hidden states: a growth rate or a rate, and others."""
     natural = LogRate if signal.is_positive else Rate
     return natural(n_states=n_states).names(signal.name)
 
 
-def alone(signal: Trace) -> Trajectory:
+def record_of(signal: Trace) -> Trajectory:
     """A signal as a record of one state."""
     return Trajectory(
         signal.t,
@@ -179,9 +179,9 @@ def alone(signal: Trace) -> Trajectory:
     )
 
 
-def _last_of(past: Trace) -> Trajectory:
+def _record_searched(past: Trace) -> Trajectory:
     """The samples that the search sees, as a record of one state."""
-    return alone(past.window(max(0, len(past.t) - MAX_FITTED), len(past.t)))
+    return record_of(past.window(max(0, len(past.t) - MAX_FITTED), len(past.t)))
 
 
 # Numbers inside functions, written as `?`.
@@ -216,7 +216,7 @@ def fit_functions(
         unit = _unit(text, run)
 
         def off(log_size: float, text: str = text, unit: float = unit) -> float:
-            return misfit(library_of([*known, _filled(text, np.exp(log_size), unit)]))
+            return misfit(library_of([*known, _fill_in(text, np.exp(log_size), unit)]))
 
         tried = np.array([off(log_size) for log_size in np.log(SIZES)])
         if not np.isfinite(tried).any():
@@ -225,7 +225,7 @@ def fit_functions(
                 "argument leaves the domain; write the number yourself, or another function"
             )
         log_size = least_beside_grid(off, np.log(SIZES), tried, tolerance=TOLERANCE)
-        known.append(_filled(text, np.exp(log_size), unit))
+        known.append(_fill_in(text, np.exp(log_size), unit))
     return known
 
 
@@ -241,7 +241,7 @@ def _unit(text: str, run: Trajectory) -> float:
     return float(run.columns(named).std())
 
 
-def _filled(text: str, size: float, unit: float) -> str:
+def _fill_in(text: str, size: float, unit: float) -> str:
     """The function with a number: a factor in 1/unit, or a summand in unit."""
     is_factor = f"{FITTED}*" in text.replace(" ", "")
     number = 1.0 / (size * unit) if is_factor else size * unit

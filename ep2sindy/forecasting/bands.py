@@ -80,7 +80,7 @@ class Forecast:
         return _interval(kept.std(axis=1).tolist(), level)
 
 
-def forecasts(
+def draw_forecasts(
     estimator: StateEstimator,
     ends: Sequence[FittedState],
     begins: Float[np.ndarray, " starts"],

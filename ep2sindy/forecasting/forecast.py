@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ep2sindy.data.runs import Run, trajectory_of
-from ep2sindy.forecasting.bands import Forecast, forecasts
+from ep2sindy.forecasting.bands import Forecast, draw_forecasts
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.model.model import SparseModel
@@ -59,7 +59,7 @@ def forecast(
     known = past if fitted_to is None else trajectory_of(fitted_to)
     estimator = calibrate(tune_estimator(model, known, measured=measured), known, seed=seed)
     end = estimator.filter(past)
-    return forecasts(
+    return draw_forecasts(
         estimator, [end], past.t[-1:], times[None], inputs=inputs,
         n_draws=check_count("n_draws", n_draws), seed=seed, clock=past.clock,
     )[0]  # fmt: skip

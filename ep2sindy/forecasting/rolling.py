@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.forecasting.bands import Forecast, forecasts
+from ep2sindy.forecasting.bands import Forecast, draw_forecasts
 from ep2sindy.forecasting.baselines import Baseline
 from ep2sindy.forecasting.state_estimation import FittedState, StateEstimator
 from ep2sindy.runtime.progress import Advance, nothing
@@ -74,7 +74,7 @@ class RollingStarts:
             advance(1)
         return found
 
-    def forecasts(
+    def forecast(
         self, states_of: StatesOf | None, n_draws: int, seed: int, advance: Advance = nothing
     ) -> list[Forecast]:
         return self.from_ends(self.ends(states_of, advance), n_draws, seed)
@@ -82,7 +82,7 @@ class RollingStarts:
     def from_ends(self, ends: Sequence[FittedState], n_draws: int, seed: int) -> list[Forecast]:
         """Forecasts from fitted states; at equal steps, all of them are drawn together."""
         t, begins = self.record.t, self.record.t[self.first - 1]
-        draw = partial(forecasts, self.estimator, n_draws=n_draws, clock=self.record.clock)
+        draw = partial(draw_forecasts, self.estimator, n_draws=n_draws, clock=self.record.clock)
         if is_uniform(t):
             times = begins[:, None] + self.steps_s
             return draw(ends, begins, times, seed=seed)

@@ -109,7 +109,7 @@ class ForecastSkill:
 
     def summary(self) -> dict[str, object]:
         """For `summary.json`: the errors at a few horizons."""
-        places = _few(len(self.horizons_s))
+        places = _pick_few(len(self.horizons_s))
         return {
             "horizons_periods": [self._in_unit(h) for h in self.horizons_s[places].tolist()],
             "nrmse": {name: values[places].tolist() for name, values in self.nrmse.items()},
@@ -154,12 +154,12 @@ def forecast_skill(
     if estimator is None:
         estimator = tune_estimator(model, fitted, measured=names)
         estimator = calibrate(estimator, fitted, states_of=states_of)
-    longest = _longest(record, n_fitted, period_s := _period_s(fitted, names), horizon_s)
+    longest = _horizon_of(record, n_fitted, period_s := _period_of(fitted, names), horizon_s)
     first = spread_starts(record.t, n_fitted, longest, check_count("starts", starts))
     rolling = RollingStarts(estimator, record, names, first, longest)
-    ahead = rolling.forecasts(states_of, check_count("n_draws", n_draws), seed, advance)
+    ahead = rolling.forecast(states_of, check_count("n_draws", n_draws), seed, advance)
     shown = spread_evenly(longest, N_HORIZONS)
-    baselines, order = _baselines(fitted, names)
+    baselines, order = _fit_baselines(fitted, names)
     paths = {name: rolling.continued(baseline) for name, baseline in baselines.items()}
     paths = {MODEL: rolling.measured(ahead), **paths}
     scale = zero_to_one(record.columns(names)[n_fitted:].std(axis=0))
@@ -189,7 +189,7 @@ def _check_skill(model: SparseModel, record: Trajectory, n_fitted: int) -> None:
         )
 
 
-def _period_s(run: Trajectory, names: Sequence[str]) -> float:
+def _period_of(run: Trajectory, names: Sequence[str]) -> float:
     """Period of the record, or mean time between crossings; NaN if it holds fewer than two."""
     values = run.columns(names)
     cycle = find_cycle(run.t, values)
@@ -201,7 +201,7 @@ def _period_s(run: Trajectory, names: Sequence[str]) -> float:
     return 1.0 / frequency_Hz if enough else float("nan")
 
 
-def _longest(record: Trajectory, n_fitted: int, period_s: float, horizon_s: float | None) -> int:
+def _horizon_of(record: Trajectory, n_fitted: int, period_s: float, horizon_s: float | None) -> int:
     """Longest horizon, in samples."""
     left = record.n_samples - n_fitted
     wanted = PERIODS_AHEAD * period_s if horizon_s is None else horizon_s
@@ -216,7 +216,7 @@ def _longest(record: Trajectory, n_fitted: int, period_s: float, horizon_s: floa
     return min(n, max(1, left // 2)) if horizon_s is None else n
 
 
-def _baselines(fitted: Trajectory, names: Sequence[str]) -> tuple[dict[str, Baseline], int]:
+def _fit_baselines(fitted: Trajectory, names: Sequence[str]) -> tuple[dict[str, Baseline], int]:
     """The baselines that the record allows, by name, and the order of the autoregression."""
     own = Trajectory(fitted.t, fitted.columns(names), tuple(names))
     found: dict[str, Baseline] = {PERSISTENCE: Persistence()}
@@ -237,6 +237,6 @@ def horizon_errors(
     return np.sqrt(np.square(np.minimum(off, WORST)).mean(axis=(0, 2)))
 
 
-def _few(n: int) -> list[int]:
+def _pick_few(n: int) -> list[int]:
     """A few places of n, closer at the beginning."""
     return sorted({round(share * (n - 1)) for share in (0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1)})

@@ -109,7 +109,7 @@ class StateEstimator:
 
         history: has the measured states of the model; others that it has only start the fit.
         """
-        record = self.problem.record(_of_model(self.model, history)).end(self.memory)
+        record = self.problem.record(_select_variables(self.model, history)).end(self.memory)
         fit = self.fit_path(record, record.samples)
         _, mean, covariance = filtered(*linearise(fit))
         end, scale = fit.path[-1] + mean, self.problem.scale
@@ -123,7 +123,7 @@ class StateEstimator:
 
         Between gaps it starts anew. Stretches of under five samples are left out.
         """
-        own = _of_model(self.model, run)
+        own = _select_variables(self.model, run)
         whole = self.problem.record(own)
         pieces = whole.stretches()
         paths = [self.fit_path(piece, piece.samples).path for piece in pieces]
@@ -145,7 +145,7 @@ class StateEstimator:
         """The most likely path near the given one, by way of larger process noise that fades."""
         samples, process = self.scaled_noise()
         level = Level(np.tile(samples, (len(path), 1)), 1.0, self.n_substeps)
-        fit = _fit_of(self.problem, [record], [path], self.free, level)
+        fit = _fix(self.problem, [record], [path], self.free, level)
         for share in (*CONTINUATION, 0.0):
             level = replace(level, process_noise=np.maximum(process, share * samples))
             fit = fit_paths(replace(fit, level=level))
@@ -179,12 +179,12 @@ def tune_estimator(
             f"a record must have {MIN_SAMPLES} samples or more to tell its noise: got "
             f"{run.n_samples}; pass the record that the model was fitted to, fitted_to=..."
         )
-    own = _of_model(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
+    own = _select_variables(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
     terms = {state: list(model.terms(state)) for state in model.states}
     problem = scale_problem(
         [own], model.library, terms=terms, measured=names, courses=model.courses
     )
-    paths, free = [record.samples.copy() for record in problem.records], _free_of(model, problem)
+    paths, free = [record.samples for record in problem.records], _free_of(model, problem)
     # Differences remove what is smooth; those of white noise have a variance of 20.
     differences = np.concatenate([np.diff(path, n=3, axis=0) for path in paths])
     rough = np.sqrt(np.square(differences).mean(axis=0) / 20.0)
@@ -194,8 +194,8 @@ def tune_estimator(
         model=model,
         problem=problem,
         free=free,
-        n_substeps=enough_substeps(_fit_of(problem, problem.records, paths, free, level)),
-        per_period=_per_period(own, names),
+        n_substeps=enough_substeps(_fix(problem, problem.records, paths, free, level)),
+        per_period=_count_per_period(own, names),
         noise=_noise_of(problem, rough, 0.1 * rough),
     )
     watch = as_progress(progress)
@@ -235,12 +235,12 @@ def _with_likely_noise(
     paths = [estimator.fit_path(*pair).path for pair in zip(records, paths, strict=True)]
     samples, process = estimator.scaled_noise()
     level = Level(np.tile(samples, (sum(map(len, paths)), 1)), 1.0, estimator.n_substeps, process)
-    errors = likely_errors(_fit_of(estimator.problem, records, paths, estimator.free, level))
+    errors = likely_errors(_fix(estimator.problem, records, paths, estimator.free, level))
     noise = _noise_of(estimator.problem, errors.noise, errors.process)
     return replace(estimator, noise=noise), paths
 
 
-def _fit_of(
+def _fix(
     problem: EstimationProblem,
     records: Sequence[ScaledRecord],
     paths: Sequence[np.ndarray],
@@ -272,7 +272,7 @@ def measured_states(model: SparseModel, run: Trajectory) -> list[str]:
     return found
 
 
-def _of_model(model: SparseModel, run: Trajectory) -> Trajectory:
+def _select_variables(model: SparseModel, run: Trajectory) -> Trajectory:
     """The variables of a run that a model has, in its order; states that it lacks are guessed."""
     if len(measured_states(model, run)) < len(model.states):
         run = with_guess_by(model, run)
@@ -295,7 +295,7 @@ def _free_of(model: SparseModel, problem: EstimationProblem) -> Float[np.ndarray
     return np.array(coef) / problem.to_SI
 
 
-def _per_period(run: Trajectory, measured: Sequence[str]) -> float:
+def _count_per_period(run: Trajectory, measured: Sequence[str]) -> float:
     """Samples to a period of the fastest measured state, or in all if it holds none."""
     frequency_Hz = max(dominant_frequency(run.t, column) for column in run.columns(measured).T)
     return run.n_samples / max(frequency_Hz * run.dt_s * run.n_samples, 1.0)

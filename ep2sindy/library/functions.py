@@ -244,12 +244,12 @@ def register_function(
     if not low < high:
         raise ValueError(f"a domain must be an interval (low, high): {domain} came")
     if derivative is None:
-        derivative = _derived(name, value, (low, high))
+        derivative = _derive(name, value, (low, high))
     _check_derivative(name, value, derivative, low, high)
     _kinds[name] = Kind(name, value, derivative, ((low, high),), own=True)
 
 
-def _derived(name: str, value: Values, domain: Interval) -> Values:
+def _derive(name: str, value: Values, domain: Interval) -> Values:
     """The derivative of a formula. Raises ValueError, with the way out, for what is none."""
     try:
         slope = DerivedSlope(value, domain)
@@ -314,7 +314,7 @@ def formula(kind: Kind, argument: sympy.Expr) -> sympy.Expr:
     Raises ValueError for a function that is no formula of NumPy's arithmetic and functions.
     """
     try:
-        x, found = _recorded_formula(kind.value, kind.domain[0])
+        x, found = _record(kind.value, kind.domain[0])
     except NoFormulaError as error:
         raise ValueError(
             f"a function of your own leaves the package as {FORMULA}: {kind.name!r} came, which is "
@@ -328,7 +328,7 @@ class NoFormulaError(ValueError):
     """A function that cannot be recorded as a formula."""
 
 
-def _recorded_formula(value: Values, domain: Interval) -> tuple[sympy.Symbol, sympy.Expr]:
+def _record(value: Values, domain: Interval) -> tuple[sympy.Symbol, sympy.Expr]:
     """A symbol, and what a function computes of it, checked at a few points of its domain.
 
     Raises NoFormulaError with the reason if it is none.
@@ -337,7 +337,7 @@ def _recorded_formula(value: Values, domain: Interval) -> tuple[sympy.Symbol, sy
 
     x = sympy.Dummy("x", real=True)
     try:
-        found = _recorded(value(Recorded(x)))
+        found = _unwrap(value(Recorded(x)))
         points = points_inside(*domain)
         numbers = [float(found.subs(x, point)) for point in points.tolist()]
         if not np.allclose(numbers, value(points), rtol=1e-9, atol=0.0):
@@ -358,7 +358,7 @@ class DerivedSlope:
     def _slope(self) -> Values:
         import sympy
 
-        x, found = _recorded_formula(self.value, self.domain)
+        x, found = _record(self.value, self.domain)
         slope: Values = sympy.lambdify(x, sympy.diff(found, x), "numpy")
         return slope
 
@@ -386,7 +386,7 @@ class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
             used = f"np.{name}" if method == "__call__" else f"np.{name}.{method}"
             raise TypeError(f"it uses {used}")
         of = ARITHMETIC[name] if name in ARITHMETIC else getattr(sympy, SYMPY_NAMES[name])
-        return Recorded(of(*map(_recorded, args)))
+        return Recorded(of(*map(_unwrap, args)))
 
 
 # NumPy's names of functions, and what does the same with sympy's expressions.
@@ -415,7 +415,7 @@ FORMULA = (
 )
 
 
-def _recorded(value: Any) -> sympy.Expr:
+def _unwrap(value: Any) -> sympy.Expr:
     return value.expression if isinstance(value, Recorded) else number_sympy(float(value))
 
 

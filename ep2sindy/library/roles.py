@@ -167,7 +167,7 @@ class Roles:
     @property
     def known(self) -> dict[Place, float]:
         """What known processes add to the coefficients, in SI."""
-        return summed(self.told)
+        return sum_known(self.told)
 
     def with_known(self, known: Mapping[str, Mapping[str, float]]) -> Roles:
         """These roles with what a record gives in place of "known".
@@ -222,7 +222,7 @@ class Roles:
             )
         zones, states = list(sizes), self.states
         exchange = [
-            (*pair, _exchanged(*pair, near=[f"{giver}@{z}" for z in _beside(zones, k)]))
+            (*pair, _list_exchanges(*pair, near=[f"{giver}@{z}" for z in _neighbours(zones, k)]))
             for k, zone in enumerate(zones)
             for giver, taker, _ in [role for role in self._roles if role.giver and role.taker]
             for pair in [(f"{giver}@{zone}", f"{taker}@{zone}")]
@@ -231,13 +231,13 @@ class Roles:
             own = [f"{state}@{zone}" for state in states]
             for state in states:
                 there = f"{state}@{beyond}"
-                terms = _carried(f"{state}@{zone}", [*own, there])
+                terms = _carriers(f"{state}@{zone}", [*own, there])
                 exchange.append((f"{state}@{zone}", there, terms))
         last = [f"{state}@{zones[-1]}" for state in states]
         share = sum(sizes.values()) / sizes[zones[0]]
         return Roles(
             exchange=exchange,
-            outflow={f"{s}@{zones[-1]}": _carried(f"{s}@{zones[-1]}", last) for s in self.outflow},
+            outflow={f"{s}@{zones[-1]}": _carriers(f"{s}@{zones[-1]}", last) for s in self.outflow},
             inflow={
                 f"{state}@{zones[0]}": value if isinstance(value, str) else share * value
                 for state, value in self.inflow.items()
@@ -380,23 +380,23 @@ def _holds(term: str, side: str) -> bool:
     return _bodies(side) <= Counter(factors_of(term))
 
 
-def _beside(zones: Sequence[str], k: int) -> list[str]:
+def _neighbours(zones: Sequence[str], k: int) -> list[str]:
     """The neighbours of a zone."""
     return [*zones[max(k - 1, 0) : k], *zones[k + 1 : k + 2]]
 
 
-def _exchanged(giver: str, taker: str, *, near: Sequence[str]) -> list[str]:
+def _list_exchanges(giver: str, taker: str, *, near: Sequence[str]) -> list[str]:
     """Terms by which a state gives another of its zone something; see `Roles.in_zones`."""
     pair = [giver, taker]
     return [product_of(Counter(pair)), *(product_of(Counter([*pair, x])) for x in [*pair, *near])]
 
 
-def _carried(state: str, others: Sequence[str]) -> list[str]:
+def _carriers(state: str, others: Sequence[str]) -> list[str]:
     """Terms by which a state moves on."""
     return [state, *(product_of(Counter([state, other])) for other in others)]
 
 
-def summed(told: Sequence[Process]) -> dict[Place, float]:
+def sum_known(told: Sequence[Process]) -> dict[Place, float]:
     """What processes with known coefficients add to the coefficients of a model, in SI."""
     found: dict[Place, float] = {}
     for process in told:
@@ -416,7 +416,7 @@ def constraint_of(
     Returns None if the coefficients do not determine the processes, as with an exchange and the
     outflow of both states by one term.
     """
-    known = summed(told)
+    known = sum_known(told)
     places = {place for process in processes for place in process.factors}
     places |= {*known}
     order = sorted(places, key=lambda at: (states.index(at[0]), library.index(at[1])))
@@ -442,7 +442,7 @@ def process_amounts(
     held: Constraint, terms: Mapping[str, Mapping[str, float]]
 ) -> list[tuple[Process, float]]:
     """Every process with its coefficient, those to be found first; terms of a model by state."""
-    known = summed(held.known)
+    known = sum_known(held.known)
     places = [held.coefficients[k] for k in held.free]
     found = [terms[s].get(term, 0.0) - known.get((s, term), 0.0) for s, term in places]
     values = np.linalg.solve(shares_of(held), found).tolist()

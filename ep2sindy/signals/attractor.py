@@ -13,12 +13,12 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.spectrum import (
-    at_mean_step,
     dominant_frequency,
     is_uniform,
     noise_floor,
     peak,
     power_spectrum,
+    resample_evenly,
 )
 
 MIN_PERIODS = 3.0  # fewest periods in a record that counts as repeating
@@ -104,16 +104,16 @@ def find_cycle(
         return None
     scaled = (states - states.mean(axis=0)) / zero_to_one(spread)
     spectra = [power_spectrum(t, column) for column in scaled.T]
-    lines = [_line(*spectrum) for spectrum in spectra]
+    lines = [_find_line(*spectrum) for spectrum in spectra]
     leader = int(np.argmax([sharpness for _, sharpness in lines]))
     rough_Hz = lines[leader][0]
     n_periods = rough_Hz * (t[-1] - t[0])
     if not n_periods >= MIN_PERIODS:
         return None
     most = _most_harmonics(len(t), n_periods) if n_harmonics is None else n_harmonics
-    phase = _phase(t, scaled, leader, rough_Hz, most)
+    phase = _estimate_phase(t, scaled, leader, rough_Hz, most)
     frequency_Hz = float(np.polynomial.Polynomial.fit(t, phase, 1).convert().coef[1]) / (2 * np.pi)
-    series, rest = _series(phase, scaled, most, chosen=n_harmonics is None)
+    series, rest = _fit_series(phase, scaled, most, chosen=n_harmonics is None)
     whole = np.square(scaled).sum(axis=0)
     if not (whole - rest >= MIN_VISIBLE * whole).any():
         return None
@@ -131,7 +131,7 @@ def find_cycle(
     )
 
 
-def _phase(
+def _estimate_phase(
     t: np.ndarray, scaled: np.ndarray, leader: int, rough_Hz: float, most: int
 ) -> np.ndarray:
     """Phase at every sample, from a rough frequency of the leading state, with `most` harmonics."""
@@ -141,28 +141,21 @@ def _phase(
     tried = [phase]
     n_periods = rough_Hz * (t[-1] - t[0])
     if n_periods >= 2.0 * PERIODS_TRACKED:
-        tried.append(phase + _drift(t, scaled[:, leader], phase))
+        tried.append(phase + _follow_phase(t, scaled[:, leader], phase))
     for _ in range(2):
         tried = [_sharpen(t, each, scaled, most) for each in tried]
     if len(tried) == 1:
         return tried[0]
     # What is followed in noise is noise, too: a phase that wanders must be worth its freedom (BIC),
     # a number for every half of the window, in which a Hann window's weight lies.
-    straight, wandering = (len(t) * np.log(_left(each, scaled, most)).sum() for each in tried)
+    varying = scaled[:, scaled.any(axis=0)]
+    left = [_fit_series(each, varying, most, chosen=False)[1] for each in tried]
+    straight, wandering = (len(t) * np.log(squares).sum() for squares in left)
     price = np.log(len(t)) * n_periods / (0.5 * PERIODS_TRACKED)
     return tried[1] if straight - wandering > price else tried[0]
 
 
-def _left(phase: np.ndarray, scaled: np.ndarray, order: int) -> np.ndarray:
-    """What a Fourier series in the phase leaves of the squares of every state that varies."""
-    scaled = scaled[:, scaled.any(axis=0)]
-    columns = _columns(phase, order)
-    known = np.linalg.solve(_triangle(columns).T, columns.T @ scaled)
-    whole = np.square(scaled).sum(axis=0)
-    return np.maximum(whole - np.square(known).sum(axis=0), 1e-12 * whole)
-
-
-def _line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
+def _find_line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
     """Dominant frequency in Hz of a spectrum, and the share of the power within two bins of it."""
     rough_Hz = peak(frequency, power)
     if rough_Hz <= 0.0:
@@ -212,15 +205,15 @@ def phase_along(
     at the given frequency.
     """
     straight = 2.0 * np.pi * frequency_Hz * (t - t[0])
-    return straight + _drift(t, x, straight)
+    return straight + _follow_phase(t, x, straight)
 
 
-def _drift(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
+def _follow_phase(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
     """Phase of x minus a phase linear in time, smoothed over the averaging window."""
     slow = (x - x.mean()) * np.exp(-1j * straight)
     even = t
     if not is_uniform(t):
-        even, slow = at_mean_step(t, slow, degree=1)
+        even, slow = resample_evenly(t, slow, degree=1)
     per_period = len(t) * 2.0 * np.pi / (straight[-1] - straight[0])
     n = max(3, round(min(PERIODS_TRACKED * per_period, 0.5 * len(t))))
     drift = np.unwrap(np.angle(_moving_average(slow, np.hanning(n + 2)[1:-1])))
@@ -242,27 +235,27 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
 
     One Gauss-Newton step: the residual of the series is regressed on the change of slope.
     """
-    columns = _columns(phase, order)
-    triangle = _triangle(columns)
+    columns = _fourier_columns(phase, order)
+    triangle = _factorise(columns)
 
-    def fitted(values: np.ndarray) -> np.ndarray:
+    def fit(values: np.ndarray) -> np.ndarray:
         return np.linalg.solve(triangle, np.linalg.solve(triangle.T, columns.T @ values))
 
-    series = fitted(scaled)
+    series = fit(scaled)
     orders = np.arange(1, order + 1)
     slope = np.zeros_like(series)  # derivative of the series by the phase
     slope[1::2] = orders[:, None] * series[2::2]
     slope[2::2] = -orders[:, None] * series[1::2]
     since = (t - t.mean()) / (t[-1] - t[0])
     direction = (columns @ slope) * since[:, None]
-    direction -= columns @ fitted(direction)
+    direction -= columns @ fit(direction)
     size = float(np.square(direction).sum())
     change = float((direction * (scaled - columns @ series)).sum()) / size if size > 0.0 else 0.0
     # At most half a period over the record: a larger change would reach another spectral line.
     return phase + float(np.clip(change, -np.pi, np.pi)) * since
 
 
-def _columns(phase: np.ndarray, order: int) -> np.ndarray:
+def _fourier_columns(phase: np.ndarray, order: int) -> np.ndarray:
     """Constant, then cosine and sine of each harmonic: (samples, 1 + 2 order)."""
     # Powers of one exponential: each costs a product instead of a sine and a cosine.
     turns = np.empty((order, len(phase)), dtype=np.complex128)
@@ -274,7 +267,7 @@ def _columns(phase: np.ndarray, order: int) -> np.ndarray:
     return columns
 
 
-def _triangle(columns: np.ndarray) -> np.ndarray:
+def _factorise(columns: np.ndarray) -> np.ndarray:
     """R of columns = Q R but for signs; the basis Q, which takes long to form, is not needed.
 
     Harmonics over some periods are nearly orthogonal, so that R follows from the columns' products
@@ -296,7 +289,7 @@ def _most_harmonics(n_samples: int, n_periods: float) -> int:
     return int(np.clip(min(by_period, (n_samples - 1) // 4), 1, MAX_HARMONICS))
 
 
-def _series(
+def _fit_series(
     phase: np.ndarray, scaled: np.ndarray, most: int, *, chosen: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fourier coefficients of the states, and the residual sum of squares of each state.
@@ -305,8 +298,8 @@ def _series(
     chosen: if true, BIC chooses the number of harmonics, up to `most`.
     """
     # The columns are ordered, so one factorisation gives the fits of every number of harmonics.
-    columns = _columns(phase, most)
-    triangle = _triangle(columns)
+    columns = _fourier_columns(phase, most)
+    triangle = _factorise(columns)
     known = np.linalg.solve(triangle.T, columns.T @ scaled)
     whole = np.square(scaled).sum(axis=0)
     left = np.maximum(whole - np.cumsum(np.square(known), axis=0)[::2], 1e-12 * whole)
@@ -323,7 +316,7 @@ def best_shift(data: Cycle, other: Cycle) -> float:
 
     One shift serves all states.
     """
-    ours, theirs, order = _side_by_side(data, other)
+    ours, theirs, order = _pad_harmonics(data, other)
     overlap = ((np.conj(ours) * theirs) / np.square(zero_to_one(data.std))).sum(axis=1)
     shifts = 2.0 * np.pi * np.arange(N_SHIFTS) / N_SHIFTS
     best = float(shifts[np.argmax((np.exp(1j * np.outer(shifts, order)) @ overlap).real)])
@@ -339,13 +332,13 @@ def waveform_errors(data: Cycle, other: Cycle) -> Float[np.ndarray, " n_states"]
 
     All states share one shift, so a wrong lag between states counts as an error.
     """
-    ours, theirs, order = _side_by_side(data, other)
+    ours, theirs, order = _pad_harmonics(data, other)
     turned = theirs * np.exp(1j * order * best_shift(data, other))[:, None]
     off = np.square(np.abs(turned - ours)).sum(axis=0)
     return np.sqrt(np.square(other.mean - data.mean) + 0.5 * off) / zero_to_one(data.std)
 
 
-def _side_by_side(data: Cycle, other: Cycle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pad_harmonics(data: Cycle, other: Cycle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Harmonics of both cycles, zero-padded to the same number, and their orders."""
     n = max(len(data.harmonics), len(other.harmonics))
     ours, theirs = (np.pad(c.harmonics, ((0, n - len(c.harmonics)), (0, 0))) for c in (data, other))

@@ -95,7 +95,7 @@ class LogRate:
         return f"the signal and its growth rate{_and_derivatives(self.n_states)}"
 
     def names(self, signal: str) -> tuple[str, ...]:
-        return _chain(signal, "ghkl"[: self.n_states - 1])
+        return _name_chain(signal, "ghkl"[: self.n_states - 1])
 
     def embed(self, signal: Trace) -> Embedded:
         """Raises ValueError for a signal that is not positive."""
@@ -110,9 +110,9 @@ class LogRate:
             )
         smoother = LogSmoother(**_memory_bounds(signal, self.harmonics))
         found = smoother.estimate(signal.t, signal.x)
-        states = [found.smoothed, *_derivatives(signal.t, found.log, self.n_states)[1:]]
+        states = [found.smoothed, *_differentiate(signal.t, found.log, self.n_states)[1:]]
         chain = {x: f"{x}*{g}"} | dict(pairwise([g, *higher]))
-        return _embedded(signal, [x, g, *higher], "s^-1", states, chain, found.noise_std)
+        return _assemble(signal, [x, g, *higher], "s^-1", states, chain, found.noise_std)
 
 
 @dataclass(frozen=True)
@@ -134,14 +134,14 @@ class Rate:
         return f"the signal and its derivative{_and_derivatives(self.n_states)}"
 
     def names(self, signal: str) -> tuple[str, ...]:
-        return _chain(signal, "vwuz"[: self.n_states - 1])
+        return _name_chain(signal, "vwuz"[: self.n_states - 1])
 
     def embed(self, signal: Trace) -> Embedded:
         names = self.names(signal.name)
         smoothed, derivative, noise_std = _smooth(signal, self.harmonics)
-        states = [smoothed, derivative, *_derivatives(signal.t, smoothed, self.n_states)[2:]]
+        states = [smoothed, derivative, *_differentiate(signal.t, smoothed, self.n_states)[2:]]
         unit = unit_product([(signal.unit, 1), ("s", -1)])
-        return _embedded(signal, names, unit, states, dict(pairwise(names)), noise_std)
+        return _assemble(signal, names, unit, states, dict(pairwise(names)), noise_std)
 
 
 @dataclass(frozen=True)
@@ -175,13 +175,13 @@ class Delays:
         smoothed, _, noise_std = _smooth(signal, self.harmonics)
         lags_s = self.share * signal.period_s * np.arange(1, self.n_states)
         parts = [
-            _with_past(signal.t[a:b], smoothed[a:b], lags_s)
+            _append_past(signal.t[a:b], smoothed[a:b], lags_s)
             for a, b in between_gaps(signal.t)
             if b - a > CUBIC
         ]
         t, states = (np.concatenate(each) for each in zip(*parts, strict=True))
         late = signal.with_samples(t, states[:, 0])
-        return _embedded(late, self.names(signal.name), "", list(states.T), {}, noise_std)
+        return _assemble(late, self.names(signal.name), "", list(states.T), {}, noise_std)
 
 
 AnyEmbedding = LogRate | Rate | Delays
@@ -246,7 +246,7 @@ def _memory_bounds(signal: Trace, harmonics: float) -> dict[str, float]:
     return {"finest_s": finest_s, "coarsest_s": max(coarsest_s, finest_s)}
 
 
-def _embedded(
+def _assemble(
     signal: Trace, names: Sequence[str], rate_unit: str, states: Sequence[np.ndarray],
     chain: Mapping[str, str], noise_std: float,
 ) -> Embedded:  # fmt: skip
@@ -269,7 +269,7 @@ def _embedded(
     return Embedded(run, relations, {state: (term,) for state, term in chain.items()}, noise_std)
 
 
-def _chain(signal: str, letters: str) -> tuple[str, ...]:
+def _name_chain(signal: str, letters: str) -> tuple[str, ...]:
     """Names of the states, changed where the signal already has one."""
     return signal, *(name if name != signal else f"{name}_rate" for name in letters)
 
@@ -278,14 +278,14 @@ def _and_derivatives(n_states: int) -> str:
     return "" if n_states == 2 else f", with {n_states - 2} more derivative{'s'[: n_states - 3]}"
 
 
-def _with_past(t: np.ndarray, x: np.ndarray, lags_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _append_past(t: np.ndarray, x: np.ndarray, lags_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Times of a stretch without a gap, and its states there: x, and x some lags before."""
     late = t >= t[0] + lags_s[-1]
     past = make_interp_spline(t, x, k=CUBIC)
     return t[late], np.column_stack([x[late], *(past(t[late] - lag_s) for lag_s in lags_s)])
 
 
-def _derivatives(t: np.ndarray, x: np.ndarray, n: int) -> list[np.ndarray]:
+def _differentiate(t: np.ndarray, x: np.ndarray, n: int) -> list[np.ndarray]:
     """x and its derivatives, n in all, by the quintic spline through the samples."""
     spline = make_interp_spline(t, x, k=5)
     return [x, *(spline.derivative(order)(t) for order in range(1, n))]

@@ -229,7 +229,7 @@ class KalmanSmoother:
         zero, and its ratio is the smoothest one unless log10_ratio is set.
         Raises ValueError for fewer than five samples.
         """
-        steps, step_s = unit_steps(t, values, MIN_SAMPLES)
+        steps, step_s = scale_steps(t, values, MIN_SAMPLES)
         process, spread = WienerProcess.at(steps), values.max(axis=0) - values.min(axis=0)
         columns = (values - values[0]) / zero_to_one(spread)
         signal, noise_std = np.empty(values.shape), np.empty(len(spread))
@@ -323,7 +323,7 @@ def _check_ratio(log10_ratio: float) -> None:
         )
 
 
-def unit_steps(
+def scale_steps(
     t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples ..."], least: int
 ) -> tuple[Float[np.ndarray, " steps"], float]:
     """Time steps in units of their mean, and that mean in s.

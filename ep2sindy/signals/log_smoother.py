@@ -11,7 +11,7 @@ from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.runtime.values import read_only
-from ep2sindy.signals.kalman import WienerProcess, check_memory_bounds, ratio_bounds, unit_steps
+from ep2sindy.signals.kalman import WienerProcess, check_memory_bounds, ratio_bounds, scale_steps
 
 # Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
 # time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.
@@ -89,7 +89,7 @@ class LogSmoother:
 
         Raises ValueError for fewer than eight samples, or a mean that is not positive.
         """
-        steps, step_s = unit_steps(t, x, MIN_SAMPLES)
+        steps, step_s = scale_steps(t, x, MIN_SAMPLES)
         mean = float(x.mean())
         if not mean > 0.0:
             raise ValueError(
@@ -98,7 +98,7 @@ class LogSmoother:
             )
         y, process = x / mean, WienerProcess.at(steps, lumped=True)
         limits = (LOG10_RATIO_MIN, LOG10_RATIO_MAX)
-        ratio, found = _best_mode(
+        ratio, found = _find_likeliest_mode(
             y, process, *ratio_bounds(self.finest_s, self.coarsest_s, step_s, limits)
         )
         log = found.log + np.log(mean)
@@ -123,7 +123,7 @@ class _Mode:
     misfit: float
 
 
-def _best_mode(
+def _find_likeliest_mode(
     y: np.ndarray, process: WienerProcess, lowest: float, highest: float
 ) -> tuple[float, _Mode]:
     """Ratio of greatest likelihood, and the mode of the posterior for it.
@@ -134,30 +134,30 @@ def _best_mode(
     decades = np.append(np.arange(highest, lowest, -1.0), lowest)
     modes, log = [], np.log(np.maximum(y, FLOOR))
     for decade in decades:
-        modes.append(_mode(y, process, decade, log))
+        modes.append(_find_mode(y, process, decade, log))
         log = modes[-1].log
     misfits = np.array([mode.misfit for mode in modes])
     start = modes[int(misfits.argmin())].log
     ratio = least_beside_grid(
-        lambda ratio: _mode(y, process, ratio, start).misfit,
+        lambda ratio: _find_mode(y, process, ratio, start).misfit,
         decades,
         misfits,
         tolerance=LOG10_RATIO_TOLERANCE,
     )
-    return ratio, _mode(y, process, ratio, start)
+    return ratio, _find_mode(y, process, ratio, start)
 
 
-def _mode(y: np.ndarray, process: WienerProcess, log10_ratio: float, log: np.ndarray) -> _Mode:
+def _find_mode(y: np.ndarray, process: WienerProcess, log10_ratio: float, log: np.ndarray) -> _Mode:
     """Most likely logarithm for one ratio, by damped Gauss-Newton steps."""
     n, ratio = len(y) - 3, 10.0**log10_ratio
-    squares_at = partial(_squares, y, process, ratio)
+    squares_at = partial(_sum_squares, y, process, ratio)
     squares = squares_at(log)
     for _ in range(MAX_ITER):
         value = np.exp(log)
         pull = value * (y - value)
         step = -process.solve(log[:, None], ratio, weights=value**2, pull=pull[:, None])[0][:, 0]
         share = min(1.0, 2.0 / max(np.abs(step).max(), 1e-300))
-        while (tried := _squares(y, process, ratio, log + share * step)) > squares and share > 1e-6:
+        while (tried := squares_at(log + share * step)) > squares and share > 1e-6:
             share *= 0.5
         if tried > squares:
             break
@@ -169,6 +169,6 @@ def _mode(y: np.ndarray, process: WienerProcess, log10_ratio: float, log: np.nda
     return _Mode(log, squares, float(n * np.log(squares) + logs))
 
 
-def _squares(y: np.ndarray, process: WienerProcess, ratio: float, log: np.ndarray) -> float:
+def _sum_squares(y: np.ndarray, process: WienerProcess, ratio: float, log: np.ndarray) -> float:
     with np.errstate(over="ignore"):  # a step that is too long overflows, and is then halved
         return float(np.square(y - np.exp(log)).sum() + process.roughness(log) / ratio)

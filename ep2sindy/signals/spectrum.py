@@ -20,7 +20,7 @@ def is_uniform(t: Float[np.ndarray, " samples"]) -> bool:
     return bool(np.ptp(steps) <= max(STEP_TOLERANCE * steps.mean(), 2 * rounding_s(t)))
 
 
-def at_mean_step(
+def resample_evenly(
     t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], *, degree: int = 3
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
     """Samples at equal steps, the mean of the given ones, by splines of a degree between gaps.
@@ -49,7 +49,7 @@ def power_spectrum(
     Returns frequencies in Hz and power density in u^2/Hz.
     """
     if not is_uniform(t):
-        x = at_mean_step(t, x)[1]
+        x = resample_evenly(t, x)[1]
     rate_Hz = (len(t) - 1) / (t[-1] - t[0])
     return _periodogram(x, rate_Hz)
 

@@ -125,10 +125,10 @@ def prepare_signal(
         raise ValueError(f"one signal must be named: this run has {list(run.names)}")
     _check_settings(decimate, detrend)
     t, x = run.t, run.columns([name])[:, 0]
-    t, evened = _even_within_digits(t)
-    t, x, averaged = _averaged(t, x, decimate)
+    t, evened = _restore_even_times(t)
+    t, x, averaged = _average(t, x, decimate)
     cycle = find_cycle(t, x[:, None])
-    x, straightened, drifting = _without_drift(t, x, name, cycle, detrend)
+    x, straightened, drifting = _remove_drift(t, x, name, cycle, detrend)
     cycle = find_cycle(t, x[:, None]) if straightened else cycle
     if cycle is not None and cycle.std[0] < MIN_VISIBLE * x.std():
         cycle = None
@@ -167,7 +167,7 @@ def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples
     return bool(explained and x.mean() > 0.0 and (x <= 0.0).mean() <= SHARE_BELOW)
 
 
-def _even_within_digits(t: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+def _restore_even_times(t: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     """Even times if the recorded ones are their rounding to a few digits, and what was done."""
     if is_uniform(t):
         return t, ()
@@ -185,11 +185,11 @@ def _even_within_digits(t: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     return t, ()
 
 
-def _averaged(
+def _average(
     t: np.ndarray, x: np.ndarray, decimate: int | str | None
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Samples replaced by means over neighbours, and what was done, in words."""
-    factor = _spare(t, x) if decimate == "auto" else int(decimate or 1)
+    factor = _count_spare(t, x) if decimate == "auto" else int(decimate or 1)
     if factor < 2:
         return t, x, ()
     pieces = between_gaps(t)
@@ -197,7 +197,7 @@ def _averaged(
     return t, x, (f"means over {factor} samples: {len(t)} are left",)
 
 
-def _spare(t: np.ndarray, x: np.ndarray) -> int:
+def _count_spare(t: np.ndarray, x: np.ndarray) -> int:
     """Number of samples to average, so that a hundred are left in a period; 1 without a cycle.
 
     A long record is looked at in means first. If they show too few samples to a period to decide,
@@ -246,12 +246,12 @@ def _means(values: np.ndarray, factor: int) -> np.ndarray:
     return values[: n * factor].reshape(n, factor).mean(axis=1)
 
 
-def _without_drift(
+def _remove_drift(
     t: np.ndarray, x: np.ndarray, name: str, cycle: Cycle | None, detrend: bool | str
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
     """The signal without its drift, what was done, and what is advised, in words."""
-    rise, error = _drift(t, x, cycle)
-    share = abs(rise) / _level(t, x)
+    rise, error = _fit_drift(t, x, cycle)
+    share = abs(rise) / _measure_level(t, x)
     counts = abs(rise) > CERTAIN * error and share > DRIFT
     if detrend is True or (detrend == "auto" and counts and cycle is not None):
         line = rise * ((t - t[0]) / (t[-1] - t[0]) - 0.5)
@@ -266,7 +266,7 @@ def _without_drift(
     return x, (), (advice,)
 
 
-def _drift(t: np.ndarray, x: np.ndarray, cycle: Cycle | None) -> tuple[float, float]:
+def _fit_drift(t: np.ndarray, x: np.ndarray, cycle: Cycle | None) -> tuple[float, float]:
     """Rise over the record of the line that x follows beside its cycle, and its standard error.
 
     What remains lasts over many samples, so its means over periods are the independent data.
@@ -290,7 +290,7 @@ def _drift(t: np.ndarray, x: np.ndarray, cycle: Cycle | None) -> tuple[float, fl
     return rise, float(np.sqrt(left @ left / max(kept.sum() - 2, 1) / (away @ away)))
 
 
-def _level(t: np.ndarray, x: np.ndarray) -> float:
+def _measure_level(t: np.ndarray, x: np.ndarray) -> float:
     """Troughs of a positive signal, or the standard deviation of any other."""
     spread = float(x.std())
     return max(float(np.quantile(x, 0.1)), 1e-3 * spread) if is_positive(t, x) else spread
