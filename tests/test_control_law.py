@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ep2sindy.library.library import polynomial
-from ep2sindy.operating.quantity_law import control_law
+from ep2sindy.operating.quantities import control_law
 
 # The thesis's six operating points, V and mg/s: a cross.
 POINTS = np.array([[200, 5], [300, 2], [300, 4], [300, 5], [300, 6], [400, 5]], dtype=np.float64)
@@ -24,7 +24,7 @@ def test_a_law_without_noise_is_recovered() -> None:
 
 def test_a_law_of_one_term_beats_the_larger_ones_that_hold_it() -> None:
     law = control_law(3.7e22 * POINTS[:, 1], POINTS, LIBRARY)
-    assert law.terms == ("mdot_mg_s",)
+    assert law.functions.names == ("mdot_mg_s",)
     assert law.search_error < 1e-9
 
 
@@ -54,7 +54,7 @@ def test_leave_one_out_errors_are_those_of_fits_without_the_point(seed: int) -> 
             if min(np.linalg.matrix_rank(np.delete(columns, k, axis=0)) for k in range(6)) == size:
                 error = np.sqrt(np.mean(left_out(columns) ** 2)) / abs(values.mean())
                 every[tuple(LIBRARY.names[j] for j in support)] = error
-    assert law.terms == min(every, key=every.__getitem__)
+    assert law.functions.names == min(every, key=every.__getitem__)
     assert law.loo_error == pytest.approx(min(every.values()), rel=1e-6)
 
 
@@ -73,7 +73,7 @@ def test_units_of_quantity_and_parameters_change_nothing_else() -> None:
     values = 0.02 + 3e-3 * POINTS[:, 1] + 1e-3 * rng.normal(size=6)
     here = control_law(values, POINTS, LIBRARY)
     there = control_law(1e25 * values, POINTS * [1e-3, 1e-6], LIBRARY)
-    assert here.terms == there.terms
+    assert here.functions.names == there.functions.names
     assert there.loo_error == pytest.approx(here.loo_error)
     assert there.predict(POINTS * [1e-3, 1e-6]) == pytest.approx(1e25 * here.predict(POINTS))
 
@@ -81,14 +81,14 @@ def test_units_of_quantity_and_parameters_change_nothing_else() -> None:
 def test_two_points_more_than_terms_are_asked_for() -> None:
     rng = np.random.default_rng(0)
     three = POINTS[[0, 1, 5]]
-    assert len(control_law(rng.normal(size=3), three, LIBRARY).terms) == 1
-    assert len(control_law(rng.normal(size=6), POINTS, LIBRARY).terms) <= 4
+    assert len(control_law(rng.normal(size=3), three, LIBRARY).functions) == 1
+    assert len(control_law(rng.normal(size=6), POINTS, LIBRARY).functions) <= 4
 
 
 def test_a_term_that_one_point_alone_decides_is_out() -> None:
     points = np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])
     law = control_law(np.array([1.0, 1.1, 0.9, 1.0, 5.0]), points, polynomial(["x"], degree=1))
-    assert law.terms == ("1",)  # with x the last point fits exactly, and says nothing
+    assert law.functions.names == ("1",)  # with x the last point fits exactly, and says nothing
 
 
 @pytest.mark.parametrize(

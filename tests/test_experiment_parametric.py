@@ -12,7 +12,7 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.data.open import write_field
 from ep2sindy.figures.operating import PUBLISHED, trends_figure
 from ep2sindy.library.library import polynomial
-from ep2sindy.operating.quantity_law import control_law
+from ep2sindy.operating.quantities import control_law
 from tests import programs
 from tests.fields import along_channel
 from tests.programs import summary_of

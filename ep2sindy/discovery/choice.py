@@ -31,7 +31,6 @@ from ep2sindy.selection.rule import (
     Decision,
     OtherSystem,
     Selection,
-    SystemSelection,
     best_first,
     support_of,
 )
@@ -47,6 +46,9 @@ MAX_CHI_SQUARED, STANDARD_ERRORS = 1.2, 3.0
 # Samples that are tested, and those of one block. More would say the same: the standard error of
 # chi-squared is 2 % then.
 MOST_TESTED, BLOCK = 20_000, 4_000
+
+# Steps of weighting and correction of a final fit.
+N_STEPS = 8
 
 SMALLEST = np.finfo(np.float64).tiny  # for exact fits, without residuals
 
@@ -161,39 +163,21 @@ def choose(
     return Choice(scored, best, model, left=left)
 
 
-def choose_by_runs(
-    fronts: Sequence[ParetoFront],
-    rule: SystemSelection,
-    relations: Sequence[Relation] = (),
-    *,
-    library: Library,
-    runs: Sequence[Trajectory],
-    provenance: Mapping[str, str],
-    progress: Progress = SILENT,
-) -> Choice:
-    """Select among systems of candidates by a rule that integrates them and refines the winner.
-
-    Raises ValueError for relations that no combination has the terms for.
-    """
-    decision = rule.decide(fronts, library, runs, relations, progress=progress)
-    return choice_of(fronts, decision, runs, provenance=provenance)
-
-
-def choice_of(
+def choose_system(
     fronts: Sequence[ParetoFront],
     decision: Decision,
     runs: Sequence[Trajectory],
     *,
     provenance: Mapping[str, str],
 ) -> Choice:
-    """The choice that a rule's decision makes, with its scores on the fronts."""
+    """The choice of a rule that judged whole systems, with its scores on the fronts."""
     scored = [f.with_scores(s) for f, s in zip(fronts, decision.scores, strict=True)]
     model = replace(decision.model, units=runs[0].units, provenance=provenance)
     best = [front.best for front in scored]
     held = decision.constraint
-    is_tied = held is not None and len(held.free) < len(held.coefficients)
-    tied = held if is_tied else None
-    return Choice(scored, best, model, decision.note, constraint=tied, others=decision.others)
+    if held is not None and len(held.free) == len(held.coefficients):
+        held = None
+    return Choice(scored, best, model, decision.note, constraint=held, others=decision.others)
 
 
 def noise_test(
@@ -215,12 +199,12 @@ def noise_test(
     runs = runs if estimate is None else estimate.runs  # with hidden states
     states, tested = choice.model.states, choice.left or {}
     unknown = [state for state in states if state not in tested]
-    found = {**tested, **(_left_of_weak_rows(choice, runs, unknown) if unknown else {})}
+    found = {**tested, **(_test_on_weak_rows(choice, runs, unknown) if unknown else {})}
     ordered = {state: found[state] for state in states if state in found}
     return NoiseTest(ordered, _misfit(ordered, choice.n_free), tested=bool(ordered))
 
 
-def _left_of_weak_rows(
+def _test_on_weak_rows(
     choice: Choice, runs: Sequence[Trajectory], states: Sequence[str]
 ) -> dict[str, LeftOver]:
     """Residuals of some equations on weak rows, as far as their rows can be made and whitened."""
@@ -239,9 +223,9 @@ def _left_of_weak_rows(
         problem, fit = problems[state], _fit_in(model, state)
         with suppress(ValueError, np.linalg.LinAlgError):
             if state in choice.n_free:
-                left[state] = _left_of_fit(problem, fit, n_free=choice.n_free[state])
+                left[state] = _test_fit(problem, fit, n_free=choice.n_free[state])
             else:
-                left[state] = _left_of_terms(problem, fit)
+                left[state] = _test_terms(problem, fit)
     return left
 
 
@@ -309,14 +293,14 @@ def assemble_model(
 
 
 def reweight(
-    problem: RegressionRows, candidate: Candidate | EquationFit, *, n_steps: int = 8
+    problem: RegressionRows, candidate: Candidate | EquationFit, *, n_steps: int = N_STEPS
 ) -> EquationFit:
     """Fit a candidate's terms again, with weights and corrected samples, and test the residuals.
 
     If the residuals exceed the noise of the rows there is no covariance: intervals would not cover
     the truth.
     """
-    theta, target, scale = _whitened_terms(problem, candidate, n_steps=n_steps)
+    theta, target, scale = whiten_terms(problem, candidate, n_steps=n_steps)
     upper = np.linalg.qr(theta, mode="r")
     root = np.linalg.inv(upper) * scale[:, None]
     fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
@@ -330,42 +314,47 @@ def reweight(
     )
 
 
-def _left_of_terms(problem: RegressionRows, fit: EquationFit) -> LeftOver:
+def whiten_terms(
+    problem: RegressionRows,
+    candidate: Candidate | EquationFit,
+    *,
+    terms: Sequence[str] | None = None,
+    n_steps: int = N_STEPS,
+    negligible: float = 0.0,
+) -> tuple[
+    Float[np.ndarray, "rows terms"], Float[np.ndarray, " rows"], Float[np.ndarray, " terms"]
+]:
+    """Columns and target of rows of variance 1 under a candidate, and the coefficients' scales.
+
+    terms: whose columns are wanted, at least the candidate's; None for just these.
+    """
+    names = candidate.terms if terms is None else tuple(terms)
+    order = [problem.library.index(name) for name in names]
+    scale = problem.coef_scale(0)
+    own, coef = np.isin(problem.term_names, candidate.terms), np.zeros(len(scale))
+    places = [problem.library.index(name) for name in candidate.terms]
+    coef[places] = candidate.coef / scale[places]
+    kept = np.isin(problem.term_names, names)
+    rows = whitened_rows(problem, own, coef, n_steps=n_steps, negligible=negligible, kept=kept)
+    return rows.theta[:, order], rows.target, scale[order]
+
+
+def _test_terms(problem: RegressionRows, fit: EquationFit) -> LeftOver:
     """Residuals of a fit's terms, fitted again with weights as by `reweight`."""
-    theta, target, _ = _whitened_terms(problem, fit, negligible=NEGLIGIBLE)
+    theta, target, _ = whiten_terms(problem, fit, negligible=NEGLIGIBLE)
     fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
     return _compare_with_noise(target - theta @ fitted, n_free=len(fitted))
 
 
-def _left_of_fit(problem: RegressionRows, fit: EquationFit, *, n_free: int) -> LeftOver:
+def _test_fit(problem: RegressionRows, fit: EquationFit, *, n_free: int) -> LeftOver:
     """Residuals of a fit with its own coefficients, whitened about a free fit of its terms.
 
     The free fit is as close to the data as these terms allow, so the samples are corrected by it,
     not by coefficients that the data may contradict. n_free: number of free coefficients.
     """
     free = fit_support(problem, fit.equation, fit.terms)
-    theta, target, scale = _whitened_terms(problem, free, negligible=NEGLIGIBLE)
-    order = [fit.terms.index(name) for name in free.terms]
-    return _compare_with_noise(target - theta @ (fit.coef[order] / scale), n_free=n_free)
-
-
-def _whitened_terms(
-    problem: RegressionRows,
-    candidate: Candidate | EquationFit,
-    *,
-    n_steps: int = 8,
-    negligible: float = 0.0,
-) -> tuple[
-    Float[np.ndarray, "rows terms"], Float[np.ndarray, " rows"], Float[np.ndarray, " terms"]
-]:
-    """Whitened columns of a candidate's terms, the whitened target, and coefficients' scales."""
-    terms = np.isin(problem.term_names, candidate.terms)
-    scale = problem.coef_scale(0)
-    coef = np.zeros(len(terms))
-    order = [problem.library.index(name) for name in candidate.terms]
-    coef[order] = candidate.coef / scale[order]
-    rows = whitened_rows(problem, terms, coef, n_steps=n_steps, negligible=negligible, kept=terms)
-    return rows.theta[:, order], rows.target, scale[order]
+    theta, target, scale = whiten_terms(problem, free, terms=fit.terms, negligible=NEGLIGIBLE)
+    return _compare_with_noise(target - theta @ (fit.coef / scale), n_free=n_free)
 
 
 def _compare_with_noise(left: Float[np.ndarray, " rows"], *, n_free: int) -> LeftOver:
@@ -386,9 +375,9 @@ def _least_sum(
     one by one.
     """
     place = np.array([int(np.argmin(front.scores)) for front in fronts])
-    for states in _tied_states(relations):
-        tied = [k for k, front in enumerate(fronts) if front.equation in states]
-        some = [fronts[k] for k in tied]
+    for states in _related_states(relations):
+        related = [k for k, front in enumerate(fronts) if front.equation in states]
+        some = [fronts[k] for k in related]
         own = [r for r in relations if any(state in states for _, state, _ in r.factors)]
         order = [np.argsort(front.scores, kind="stable") for front in some]
         ranked = best_first([f.scores[places] for f, places in zip(some, order, strict=True)])
@@ -403,17 +392,17 @@ def _least_sum(
                 f"{MAX_COMBINATIONS} combinations of candidates has; raise the search's "
                 "max_terms, or depth, or let the relations tie fewer states to each other"
             )
-        place[tied] = best
+        place[related] = best
     return place
 
 
-def _tied_states(relations: Sequence[Relation]) -> list[set[str]]:
+def _related_states(relations: Sequence[Relation]) -> list[set[str]]:
     """Sets of states that relations tie to each other, directly or through a third state."""
     sets: list[set[str]] = []
     for relation in relations:
-        tied = {state for _, state, _ in relation.factors}
-        tied = tied.union(*(other for other in sets if other & tied))
-        sets = [other for other in sets if not other & tied] + [tied]
+        related = {state for _, state, _ in relation.factors}
+        related = related.union(*(other for other in sets if other & related))
+        sets = [other for other in sets if not other & related] + [related]
     return sets
 
 

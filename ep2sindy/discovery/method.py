@@ -19,7 +19,7 @@ from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import Choice, choice_of, choose, choose_by_runs
+from ep2sindy.discovery.choice import Choice, choose, choose_system
 from ep2sindy.estimation.cost import check_limit_s
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
@@ -167,10 +167,10 @@ class TrajectorySearch:
         """Candidates of every equation with their scores, and the model by the selection rule."""
         fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
         if isinstance(self.selection, SystemSelection):
-            choice = choose_by_runs(
-                fronts, self.selection, task.relations, library=task.library, runs=task.runs,
-                provenance=found.model.provenance, progress=progress,
-            )  # fmt: skip
+            decision = self.selection.decide(
+                fronts, task.library, task.runs, task.relations, progress=progress
+            )
+            choice = choose_system(fronts, decision, task.runs, provenance=found.model.provenance)
             return replace(choice, model=replace(choice.model, courses=found.model.courses))
         scores = self.selection.scores(fronts)
         scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
@@ -335,7 +335,7 @@ class Regression:
         systems = conserving_systems(problems, task, roles, self.search, depth=self.depth)
         decision = self.selection.judge(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)
-        choice = choice_of(systems.fronts, decision, task.runs, provenance=provenance)
+        choice = choose_system(systems.fronts, decision, task.runs, provenance=provenance)
         found = [each for rows in problems for each in (*few_rows(rows), *ambiguities(rows))]
         return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(task.runs))
 
@@ -365,10 +365,10 @@ class Regression:
         """Select a candidate from every front, and fit it."""
         provenance = self.provenance | _labels(task)
         if isinstance(self.selection, SystemSelection):
-            return choose_by_runs(
-                fronts, self.selection, task.relations, library=task.library, runs=task.runs,
-                provenance=provenance, progress=progress,
-            )  # fmt: skip
+            decision = self.selection.decide(
+                fronts, task.library, task.runs, task.relations, progress=progress
+            )
+            return choose_system(fronts, decision, task.runs, provenance=provenance)
         return choose(
             fronts, self.selection, task.relations, units=task.runs[0].units,
             provenance=provenance, progress=progress,

@@ -16,8 +16,8 @@ from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.scores import r2
-from ep2sindy.operating.law import LawFit, fit_law
+from ep2sindy.operating.fit_rows import LawFit, fit_law, score_rows
+from ep2sindy.operating.law import coefficients_of
 from ep2sindy.operating.quantities import (
     FITTED,
     REFINED,
@@ -42,6 +42,9 @@ from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
 from ep2sindy.signals.spectrum import dominant_frequency, samples_in_periods
+
+# Directions that the rows of a draw hold to less than this share of their squares count as absent.
+UNSEEN = 1e-14
 
 MIN_BLOCKS = 5  # fewest blocks in a record: with fewer, draws differ too little from one another
 
@@ -238,14 +241,11 @@ def _search_point(run: Trajectory, study: PointStudy, *, rng: np.random.Generato
 
 def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, float]:
     """R2 of the derivative, by state, on the unweighted training rows."""
-    found = {}
-    for problem in problems:
-        rows = ~problem.test
-        for number, state in enumerate(problem.equations):
-            predicted = problem.theta[rows] @ model.coef[:, model.states.index(state)]
-            truth = problem.target[rows, number]
-            found[state] = float(r2(truth=truth, prediction=predicted[None])[0])
-    return found
+    return {
+        state: score_rows(problem, model, state)
+        for problem in problems
+        for state in problem.equations
+    }
 
 
 @dataclass(frozen=True)
@@ -278,7 +278,8 @@ def resample_coefficients(
     has on all rows, and rows of known noise stay whitened as under `model`. model: result of
     `constrained_fit` on these problems. block: number of consecutive groups in a block.
     Returns one column per coefficient of the constraint. The draws are shifted so that their mean
-    is the fit: blocks seldom reach the ends of the record, which would bias them.
+    is the fit: blocks seldom reach the ends of the record, which would bias them. Before the shift,
+    a coefficient whose terms are zero on all rows of a draw is zero in this draw.
     Raises ValueError for blocks that leave fewer than five to draw from, or several trajectories.
     Source: Kuensch 1989, doi:10.1214/aos/1176347265; Lahiri 2003, Resampling Methods for Dependent
     Data, 2.5, for the centre.
@@ -307,8 +308,8 @@ def resample_coefficients(
         dtype=np.float64,
     )
     grams = np.tensordot(counts, sums, axes=1)
-    z = np.linalg.solve(grams[:, :-1, :-1], grams[:, :-1, -1:])[:, :, 0]
-    z *= scale[-1] / scale[:-1]
+    inverse = np.linalg.pinv(grams[:, :-1, :-1], rcond=UNSEEN, hermitian=True)
+    z = (inverse @ grams[:, :-1, -1:])[:, :, 0] * scale[-1] / scale[:-1]
     return (z - z.mean(axis=0) + coef[constraint.free]) @ constraint.C.T + constraint.d
 
 
@@ -319,12 +320,6 @@ def _check_blocks(n_groups: int, block: int) -> None:
             f"asked of {n_groups} groups of rows; use fewer periods per block "
             "(bootstrap.periods), or a longer record"
         )
-
-
-def coefficients_of(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
-    """Coefficients of a model in the order of the constraint's."""
-    index, states = model.library.index, model.states.index
-    return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])
 
 
 def _free_rows(
@@ -341,14 +336,14 @@ class SharedResult:
     """Result of one search over all points that oscillate.
 
     fitted: for each point that oscillates, the support with the point's own coefficients; None at
-    the others. tied: the coefficients as polynomials of the parameters; None if the points do not
-    suffice, for the reason in `why_not_tied`.
+    the others. fit: the coefficients as polynomials of the parameters; None if the points do not
+    suffice, for the reason in `why_no_law`.
     """
 
     found: SharedDiscovery
     fitted: Sequence[Fitted | None]
-    tied: LawFit | None
-    why_not_tied: str = ""
+    fit: LawFit | None
+    why_no_law: str = ""
 
 
 def search_shared(
@@ -362,8 +357,8 @@ def search_shared(
 ) -> SharedResult | None:
     """Search all points that oscillate at once; None for fewer than two of them.
 
-    law: functions of the points' parameters that tie the coefficients. Also None for a search that
-    cannot weigh several points: only BestSubset can.
+    law: functions of the points' parameters that give the coefficients. Also None for a search
+    that cannot weigh several points: only BestSubset can.
     """
     used = {
         point.label: point
@@ -382,16 +377,16 @@ def search_shared(
         seed=rng,
         progress=progress,
     )
-    tied, reason = None, ""
+    fit, reason = None, ""
     try:
         parameters = {label: point.parameters for label, point in used.items()}
-        with progress.stage(None, "", "coefficients tied by a law"):
-            tied = fit_law(found, law, parameters=parameters)
+        with progress.stage(None, "", "one law of all coefficients"):
+            fit = fit_law(found, law, parameters=parameters)
     except ValueError as error:
         reason = str(error)
     labels = [point.label for point in points]
     fitted = [_fitted(found, label) if label in used else None for label in labels]
-    return SharedResult(found, fitted, tied, reason)
+    return SharedResult(found, fitted, fit, reason)
 
 
 def _fitted(found: SharedDiscovery, label: str) -> Fitted:

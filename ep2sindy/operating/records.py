@@ -10,8 +10,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.data.numbers import column_norms, zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement
+from ep2sindy.regression.pooled import Basis
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
 from ep2sindy.signals.spectrum import steps_in
@@ -180,6 +181,18 @@ def values_of(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records 
     return np.array([[record.parameters[name] for name in names] for record in records])
 
 
+def values_at(
+    names: Sequence[str], parameters: Mapping[str, float]
+) -> Float[np.ndarray, " parameters"]:
+    """Values of the parameters of these names at a point; ValueError unless they are finite."""
+    if set(parameters) != set(names) or not np.isfinite(list(parameters.values())).all():
+        raise ValueError(
+            f"an operating point must have one finite value for each of {list(names)}, and no "
+            f"other: {dict(parameters)} came"
+        )
+    return np.array([float(parameters[name]) for name in names])
+
+
 def most_central(records: Sequence[OperatingRecord]) -> OperatingRecord:
     """The record whose parameters are nearest to the mean of all."""
     values = values_of(records)
@@ -187,30 +200,8 @@ def most_central(records: Sequence[OperatingRecord]) -> OperatingRecord:
     return records[int(np.argmin(np.linalg.norm(off, axis=1)))]
 
 
-# A point with this leverage alone determines some coefficient: without it there is no fit.
-FULL_LEVERAGE = 1.0 - 1e-9
-
-# Smallest singular value of unit columns, relative to the largest, at which they are independent.
-INDEPENDENT = 1e-10
-
-
-def left_out_predictions(
-    values: Float[np.ndarray, "records ..."], basis: Float[np.ndarray, "records functions"]
-) -> tuple[Float[np.ndarray, "records ..."], Float[np.ndarray, "records ..."]]:
-    """Values at every point by the least-squares fit to all points, and by that to the others.
-
-    The second is infinite if one point is indispensable, or if the functions depend on each other.
-    """
-    left, singular, _ = np.linalg.svd(basis / column_norms(basis), full_matrices=False)
-    leverage = np.square(left).sum(axis=1)
-    fitted = left @ (left.T @ values)
-    if singular[-1] <= INDEPENDENT * singular[0] or leverage.max() > FULL_LEVERAGE:
-        return fitted, np.full_like(fitted, np.inf)
-    return fitted, values - ((values - fitted).T / (1.0 - leverage)).T
-
-
 def interpolation_errors(
-    records: Sequence[OperatingRecord], basis: Float[np.ndarray, "records functions"]
+    records: Sequence[OperatingRecord], basis: Basis
 ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:
     """Leave-one-out errors of interpolating frequency and amplitude by functions of the parameters.
 
@@ -221,7 +212,7 @@ def interpolation_errors(
     """
     f = np.log([[record.cycle.frequency_Hz] for record in records])
     logs = np.hstack([f, np.log([record.cycle.std for record in records])])
-    off = np.abs(np.expm1(left_out_predictions(logs, basis)[1] - logs))
+    off = np.abs(np.expm1(basis.predict_left_out(logs) - logs))
     return off[:, 0], off[:, 1:].max(axis=1)
 
 
