@@ -27,14 +27,14 @@ import ep2sindy as ep
 from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.operating.fit import LeaveOneOut, OperatingFit, leave_one_out, operating_fit
-from ep2sindy.operating.law import OperatingLaw, law_basis
+from ep2sindy.operating.law import OperatingLaw, make_basis
 from ep2sindy.operating.map import Fate, law_map
 from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
     interpolation_errors,
     point_label,
-    values_of,
+    read_points,
 )
 
 CONFIG = Path(__file__).parents[1] / "conf" / "exp" / "predict.yaml"
@@ -148,7 +148,7 @@ def fitted(records: Sequence[OperatingRecord], model: Mapping[str, Any]) -> Oper
 
 def smoothness(records: Sequence[OperatingRecord], degree: int) -> None:
     functions = ep.polynomial(list(records[0].parameters), degree=degree)
-    basis = law_basis(functions, values_of(records))
+    basis = make_basis(functions, read_points(records))
     f, amplitude = interpolation_errors(records, basis)
     print(
         f"the records' own, by as many functions: f {np.median(f):.2%}, 9 in 10 "

@@ -8,7 +8,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.operating.fit import SETTINGS, OperatingFit, leave_one_out, operating_fit
-from ep2sindy.operating.law import Known, law_constraint
+from ep2sindy.operating.law import Known, constrain_law
 from tests.test_operating_law import GRID, LIBRARY, SHORT, STATES, STRUCTURE
 
 # What leaves x enters y, and the growth of x is known; its square is beyond a law of degree one.
@@ -143,7 +143,7 @@ def test_relations_that_cannot_hold_are_refused(
 
 
 def test_constraints_of_the_points_of_a_law_must_be_alike() -> None:
-    held = law_constraint(LIBRARY, STRUCTURE, RELATIONS, KNOWN, parameters=["a", "b"])
+    held = constrain_law(LIBRARY, STRUCTURE, RELATIONS, KNOWN, parameters=["a", "b"])
     own = held.at(np.array([[0.5, 0.0], [1.0, 0.0], [1.5, 0.0]]))
     assert [each.d[0] for each in own] == pytest.approx([0.75, 0.9, 1.15])
     models = [model_at(a, 0.0) for a in (0.5, 1.0, 1.5)]

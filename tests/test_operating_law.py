@@ -10,7 +10,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.operating.fit import SETTINGS, LeaveOneOut, OperatingFit, leave_one_out, operating_fit
-from ep2sindy.operating.law import OperatingLaw, in_hull, law_basis
+from ep2sindy.operating.law import OperatingLaw, in_hull, make_basis
 from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
@@ -176,7 +176,7 @@ def test_a_run_that_diverges_counts_as_ten_bounds() -> None:
 
 def test_a_smooth_family_interpolates_its_own_frequency() -> None:
     quadratic = ep.polynomial(["a", "b"], degree=2)
-    f, amplitude = interpolation_errors(records(), law_basis(quadratic, fit().points))
+    f, amplitude = interpolation_errors(records(), make_basis(quadratic, fit().points))
     assert f.shape == amplitude.shape == (9,)
     assert np.median(f) < 0.01
 
@@ -194,12 +194,12 @@ def test_a_law_that_is_tested_needs_a_point_more_than_it_has_functions() -> None
     functions, points = fit().functions(1), np.array([list(p.values()) for p in GRID])
     corners = points[[0, 2, 6]]
     assert len(functions) == 3
-    law_basis(functions, corners)
-    law_basis(functions, points[[0, 2, 6, 8]], n_spare=1)
+    make_basis(functions, corners)
+    make_basis(functions, points[[0, 2, 6, 8]], n_spare=1)
     with pytest.raises(
         ValueError, match="a law of 3 functions .* more points than these.*: 3 came"
     ):
-        law_basis(functions, corners, n_spare=1)
+        make_basis(functions, corners, n_spare=1)
 
 
 def test_parameters_must_vary_and_be_the_same_everywhere() -> None:

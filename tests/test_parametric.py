@@ -20,11 +20,11 @@ from ep2sindy.operating.quantities import (
     PointResult,
     Quantity,
     QuantityEstimate,
-    estimates_of_covariance,
-    estimates_of_draws,
+    estimate_from_covariance,
+    estimate_from_draws,
+    fit_control_laws,
     fit_power_law,
-    laws,
-    trends,
+    fit_trends,
 )
 from ep2sindy.operating.records import OperatingRecord
 from ep2sindy.regression.bootstraps import moving_block_counts
@@ -222,9 +222,9 @@ def test_a_point_that_does_not_oscillate_is_kept_and_left_out(
     (found,) = results_of([replace(points[0], trajectory=still)], study())
     assert (found.status, found.fits, found.searched) == ("steady", {}, None)
     assert found.spread["x"] < 0.01
-    assert trends([found], along="V", at={}).empty
-    assert laws([found], ep.polynomial(["V", "m"], degree=1)) == {}
-    along_m = trends(results, along="m", at={})
+    assert fit_trends([found], along="V", at={}).empty
+    assert fit_control_laws([found], ep.polynomial(["V", "m"], degree=1)) == {}
+    along_m = fit_trends(results, along="m", at={})
     assert set(along_m["n_points"]) == {3}
 
 
@@ -357,7 +357,7 @@ def coverage(*, block: int, n_seeds: int) -> float:
             [problem], relations, model, block=block, n_draws=200, rng=rng
         )
         coef = np.array([model.terms("z")[name] for name in ("a", "b")])
-        estimates, _ = estimates_of_draws(coef, draws, quantities, relations, library)
+        estimates, _ = estimate_from_draws(coef, draws, quantities, relations, library)
         inside += [e.low <= t <= e.high for e, t in zip(estimates.values(), (2, 3), strict=True)]
     return float(np.mean(inside))
 
@@ -371,7 +371,7 @@ def test_intervals_hold_the_truth_where_rows_are_alike() -> None:
 
 
 def test_a_quantity_is_a_coefficient_or_its_reciprocal() -> None:
-    assert LENGTH.of(np.array([-40.0, -50.0])) == pytest.approx([0.025, 0.02])
+    assert LENGTH.evaluate(np.array([-40.0, -50.0])) == pytest.approx([0.025, 0.02])
     assert LENGTH.slope(-40.0) == pytest.approx(1 / 1600)
     assert Quantity("y: x*y*R", -1.0).slope(-0.6) == -1.0
     units = [q.unit(LIBRARY, UNITS) for q in CASES["free"].quantities.values()]
@@ -386,7 +386,7 @@ def model_of(covariance: np.ndarray | None = None) -> ep.SparseModel:
 def test_intervals_are_carried_from_coefficients_to_quantities() -> None:
     model = model_of(np.diag([4.0, 1e-4, 0.01, 4e-4]))
     case = CASES["free"]
-    found = estimates_of_covariance(model, case.quantities, case.constraint, LIBRARY)
+    found = estimate_from_covariance(model, case.quantities, case.constraint, LIBRARY)
     reach = {name: 0.5 * (e.high - e.low) for name, e in found.items()}
     z = 1.959964
     assert reach == pytest.approx(
@@ -410,21 +410,21 @@ def power_law(V: float, m: float, status: str = "fitted") -> PointResult:
 
 def test_trends_are_exponents_with_the_other_parameters_held() -> None:
     results = [power_law(V, m) for V, m in ((200, 5), (300, 2), (300, 5), (300, 6), (400, 5))]
-    (row,) = trends(results, along="m", at={"V": 300.0}).to_dict("records")
+    (row,) = fit_trends(results, along="m", at={"V": 300.0}).to_dict("records")
     assert (row["n_points"], row["exponent"]) == (3, pytest.approx(-0.3))
     assert row["r2"] == pytest.approx(1.0)
-    (row,) = trends(results, along="V", at={"m": 5.0}).to_dict("records")
+    (row,) = fit_trends(results, along="V", at={"m": 5.0}).to_dict("records")
     assert (row["n_points"], row["exponent"]) == (3, pytest.approx(0.5))
     # The k-th draws of all points are off by one factor, which moves no slope.
     assert row["low"] == pytest.approx(0.5)
     lost = [*results, power_law(300, 9, status="max_iter")]
-    (row,) = trends(lost, along="m", at={"V": 300.0}).to_dict("records")
+    (row,) = fit_trends(lost, along="m", at={"V": 300.0}).to_dict("records")
     assert row["n_points"] == 3
 
 
 def test_two_points_say_nothing_of_how_good_a_power_law_is() -> None:
     results = [power_law(V, 5) for V in (200, 400)]
-    (row,) = trends(results, along="V", at={"m": 5.0}).to_dict("records")
+    (row,) = fit_trends(results, along="V", at={"m": 5.0}).to_dict("records")
     assert (row["n_points"], row["exponent"]) == (2, pytest.approx(0.5))
     assert np.isnan([row["low"], row["high"], row["r2"]]).all()
 
@@ -441,12 +441,12 @@ def test_r2_says_whether_points_lie_on_a_power_law() -> None:
 def test_laws_are_made_from_fits_that_came_to_their_end() -> None:
     library = ep.polynomial(["V", "m"], degree=1)
     results = [power_law(V, m) for V, m in ((200, 5), (300, 2), (300, 6), (400, 5))]
-    law = laws(results, library, max_terms=2)["free"]["L"]
+    law = fit_control_laws(results, library, max_terms=2)["free"]["L"]
     assert len(law.functions) <= 2
     lost = [*results[:2], *(power_law(300, m, status="max_iter") for m in (7, 8))]
-    assert laws(lost, library) == {}
+    assert fit_control_laws(lost, library) == {}
     held = [power_law(300, m) for m in (2, 4, 6)]
-    assert laws(held, library) == {}
+    assert fit_control_laws(held, library) == {}
 
 
 @pytest.mark.parametrize(

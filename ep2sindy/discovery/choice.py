@@ -180,7 +180,7 @@ def choose_system(
     return Choice(scored, best, model, decision.note, constraint=held, others=decision.others)
 
 
-def noise_test(
+def judge_noise(
     choice: Choice, runs: Sequence[Trajectory], *, estimate: Estimate | None = None
 ) -> NoiseTest:
     """Test the residuals of the chosen model against the noise of the samples.

@@ -20,7 +20,7 @@ from ep2sindy.operating.fit import (
     leave_one_out,
     operating_fit,
 )
-from ep2sindy.operating.law import Known, OperatingLaw, law_basis
+from ep2sindy.operating.law import Known, OperatingLaw, make_basis
 from ep2sindy.operating.map import MapPoint, law_map, map_points
 from ep2sindy.operating.records import (
     OperatingRecord,
@@ -249,7 +249,7 @@ def find_branch(
         left_out=leave_one_out(
             choice.fit, functions, start=law, workers=workers, progress=progress
         ),
-        smooth=interpolation_errors(records, law_basis(functions, choice.fit.points)),
+        smooth=interpolation_errors(records, make_basis(functions, choice.fit.points)),
         at_points=_follow(law, records, points, workers, progress),
         map=_follow(law, records, grid, workers, progress),
     )

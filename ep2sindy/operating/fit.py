@@ -18,14 +18,14 @@ from ep2sindy.operating.law import (
     Known,
     LawConstraint,
     OperatingLaw,
-    coefficients_of,
-    law_basis,
-    law_constraint,
+    constrain_law,
+    make_basis,
+    read_coefficients,
 )
 from ep2sindy.operating.records import (
     OperatingRecord,
     check_records,
-    values_of,
+    read_points,
 )
 from ep2sindy.refinement.law import LawRefinement, refine_law
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
@@ -48,7 +48,7 @@ Structure = Mapping[str, Sequence[str]]
 SETTINGS = RefinementSettings(n_windows=20, periods=2.0, n_reweights=0)
 
 
-def in_samples(
+def set_window(
     settings: RefinementSettings, records: Sequence[OperatingRecord]
 ) -> RefinementSettings:
     """Settings for the records of one law: windows have the same number of samples in all of them.
@@ -92,7 +92,7 @@ class OperatingFit:
     def coefficients(self) -> Float[np.ndarray, "records free"]:
         """The free coefficients of each record."""
         common = self.relations.common
-        return np.array([coefficients_of(fit.model, common) for fit in self.fits])[:, common.free]
+        return np.array([read_coefficients(fit.model, common) for fit in self.fits])[:, common.free]
 
     @cached_property
     def information(self) -> Float[np.ndarray, "records free free"]:
@@ -106,7 +106,7 @@ class OperatingFit:
 
     @property
     def points(self) -> Float[np.ndarray, "records parameters"]:
-        return values_of(self.records)
+        return read_points(self.records)
 
     def without(self, number: int) -> OperatingFit:
         others = [k for k in range(len(self.records)) if k != number]
@@ -119,7 +119,7 @@ class OperatingFit:
     def functions(self, degree: int) -> Library:
         """Polynomials of the parameters. Raises ValueError if the records do not suffice."""
         found = polynomial(list(self.records[0].parameters), degree=degree)
-        law_basis(found, self.points)
+        make_basis(found, self.points)
         return found
 
     def fit_law(self, functions: Library) -> OperatingLaw:
@@ -138,7 +138,7 @@ class OperatingFit:
         start: a law close to the result, which shortens the refinement. None starts from the
         law of `fit_law`, with all stages.
         """
-        settings = in_samples(self.settings, self.records)
+        settings = set_window(self.settings, self.records)
         if start is None:
             near = self._pool(functions)
         else:
@@ -158,7 +158,7 @@ class OperatingFit:
         return self._make_law(functions, found.law, found.covariance, "refined"), found
 
     def _pool(self, functions: Library) -> Float[np.ndarray, "free functions"]:
-        basis = law_basis(functions, self.points)
+        basis = make_basis(functions, self.points)
         return pool_coefficients(self.coefficients, self.information, basis)
 
     def _make_law(
@@ -209,15 +209,15 @@ def operating_fit(
     if set(structure) != set(states):
         raise ValueError(f"a structure must have terms for each of {states}: {structure} came")
     whole = {state: list(structure[state]) for state in states}
-    held = law_constraint(library, whole, relations, known, parameters=list(records[0].parameters))
-    at = held.at(values_of(records))
+    held = constrain_law(library, whole, relations, known, parameters=list(records[0].parameters))
+    at = held.at(read_points(records))
     rows = Differential(split=RandomSplit(test_fraction=0.0))
     starts = []
     for record, own in zip(records, at, strict=True):
         problems = rows.assemble([record.run], library, rng=np.random.default_rng(seed))
         starts.append(constrained_fit(problems, own, units=record.run.units))
     runs = [[record.run] for record in records]
-    how = in_samples(settings, records)
+    how = set_window(settings, records)
     fits = refine(starts, runs, how, constraints=at, seed=seed, progress=progress)
     return OperatingFit(records, whole, held, fits, settings, seed)
 
@@ -287,7 +287,7 @@ def leave_one_out(
     """
     for k, record in enumerate(fit.records):
         try:
-            law_basis(functions, fit.without(k).points)
+            make_basis(functions, fit.without(k).points)
         except ValueError as error:
             raise ValueError(f"{record.label} cannot be left out: {error}") from error
     one = partial(_leave_out, fit=fit, functions=functions, start=start)

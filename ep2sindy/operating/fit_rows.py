@@ -15,8 +15,8 @@ from ep2sindy.discovery.choice import whiten_terms
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
-from ep2sindy.operating.law import OperatingLaw, law_basis, law_constraint
-from ep2sindy.operating.records import values_at
+from ep2sindy.operating.law import OperatingLaw, constrain_law, make_basis
+from ep2sindy.operating.records import read_point
 from ep2sindy.operating.shared_support import SharedDiscovery, SharedFront
 from ep2sindy.regression.front import Candidate
 from ep2sindy.regression.pooled import Basis, PooledFit, pool_rows
@@ -71,12 +71,12 @@ def fit_law(
     ('a',)
     """
     at = _parameters_of(list(shared.models), parameters)
-    points = np.array([values_at(functions.variables, own) for own in at.values()])
-    basis = law_basis(functions, points)
+    points = np.array([read_point(functions.variables, own) for own in at.values()])
+    basis = make_basis(functions, points)
     fits = {s: _fit_equation(shared, s, basis) for s in shared.fronts}
     model = next(iter(shared.models.values()))
     known = all(each.is_known for each in fits.values())
-    law = law_constraint(model.library, shared.chosen, parameters=functions.variables).make_law(
+    law = constrain_law(model.library, shared.chosen, parameters=functions.variables).make_law(
         model,
         functions,
         points,

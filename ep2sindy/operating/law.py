@@ -24,7 +24,7 @@ from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.relations import Constraint, Relation, constraint, relations_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
-from ep2sindy.operating.records import check_varying, point_label, values_at
+from ep2sindy.operating.records import check_varying, point_label, read_point
 from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import words_of
@@ -123,7 +123,7 @@ class OperatingLaw:
         Raises ValueError unless `parameters` has a finite value for each parameter of the law. Also
         raises ValueError outside the convex hull of the fitted points, unless extrapolate=True.
         """
-        values = values_at(self.parameters, parameters)
+        values = read_point(self.parameters, parameters)
         if not extrapolate and not in_hull(self.points, values):
             ends = self.points.min(axis=0), self.points.max(axis=0)
             ranges = zip(self.parameters, *ends, strict=True)
@@ -148,7 +148,7 @@ class OperatingLaw:
 
     def is_inside(self, parameters: Mapping[str, float]) -> bool:
         """True if a point lies in the convex hull of the fitted points."""
-        return in_hull(self.points, values_at(self.parameters, parameters))
+        return in_hull(self.points, read_point(self.parameters, parameters))
 
     def intervals(self, *, level: float = 0.95) -> dict[tuple[str, str], dict[str, Any]]:
         """(state, term) -> function -> lower and upper bound of its factor, for Gaussian errors.
@@ -252,7 +252,7 @@ def in_hull(
     return float(nnls(columns, target)[1]) <= INSIDE
 
 
-def law_basis(
+def make_basis(
     functions: Library,
     points: Float[np.ndarray, "points parameters"],
     *,
@@ -353,7 +353,7 @@ class LawConstraint:
         )
 
 
-def law_constraint(
+def constrain_law(
     library: Library,
     structure: Mapping[str, Sequence[str]],
     relations: Sequence[Relation | str] = (),
@@ -392,7 +392,7 @@ def law_constraint(
     return LawConstraint(common, functions, np.column_stack([c.d for c in columns]), tuple(texts))
 
 
-def coefficients_of(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
+def read_coefficients(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
     """Coefficients of a model in the order of the constraint's."""
     index, states = model.library.index, model.states.index
     return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])

@@ -17,7 +17,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.fit_rows import LawFit, fit_law, score_rows
-from ep2sindy.operating.law import coefficients_of
+from ep2sindy.operating.law import read_coefficients
 from ep2sindy.operating.quantities import (
     FITTED,
     REFINED,
@@ -25,10 +25,10 @@ from ep2sindy.operating.quantities import (
     Fitted,
     PointResult,
     Quantity,
-    estimates_of_covariance,
-    estimates_of_draws,
+    estimate_from_covariance,
+    estimate_from_draws,
 )
-from ep2sindy.operating.records import OperatingRecord, check_alike, naming
+from ep2sindy.operating.records import OperatingRecord, check_alike, name_point
 from ep2sindy.operating.shared_support import SharedDiscovery, discover_shared
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import RefinementSettings
@@ -128,7 +128,7 @@ def _fit_point(
     piece: tuple[OperatingRecord, np.random.Generator], *, study: PointStudy
 ) -> PointResult:
     point, rng = piece
-    with naming(point.parameters):
+    with name_point(point.parameters):
         return _point_result(point, study, rng=rng)
 
 
@@ -184,9 +184,9 @@ def _least_squares(
         n_draws=study.bootstrap.n_draws,
         rng=rng,
     )
-    coef = coefficients_of(model, case.constraint)
+    coef = read_coefficients(model, case.constraint)
     covariance = np.atleast_2d(np.cov(draws[:, coef != 0.0], rowvar=False))
-    estimates, drawn = estimates_of_draws(
+    estimates, drawn = estimate_from_draws(
         coef, draws, case.quantities, case.constraint, study.library
     )
     return Fitted(
@@ -223,7 +223,7 @@ def _refined(
         status=found.status,
         r2=_r2(problems, found.model),
         loss=found.loss,
-        estimates=estimates_of_covariance(
+        estimates=estimate_from_covariance(
             found.model, case.quantities, case.constraint, study.library
         )
         if known
@@ -290,7 +290,7 @@ def resample_coefficients(
             f"next: {len(problems[0].trajectories)} came"
         )
     equations = weighted_equations(problems, constraint)
-    coef = coefficients_of(model, constraint)
+    coef = read_coefficients(model, constraint)
     rows = [_free_rows(equation, constraint, coef) for equation in equations]
     groups = [e.problem.groups[~e.problem.test] for e in equations]
     numbers = np.unique(np.concatenate(groups))

@@ -59,7 +59,7 @@ class Quantity:
     def term(self) -> str:
         return self.coefficient.split(":")[1].strip()
 
-    def of(self, coef: Float[np.ndarray, " coefs"]) -> Float[np.ndarray, " coefs"]:
+    def evaluate(self, coef: Float[np.ndarray, " coefs"]) -> Float[np.ndarray, " coefs"]:
         """Values of the quantity for an array of values of the coefficient."""
         return self.factor * coef**self.power
 
@@ -129,7 +129,7 @@ class PointResult:
         return fit in self.fits and self.fits[fit].status in (FITTED, CONVERGED)
 
 
-def estimates_of_draws(
+def estimate_from_draws(
     coef: Float[np.ndarray, " coefs"],
     draws: Float[np.ndarray, "draws coefs"],
     quantities: Mapping[str, Quantity],
@@ -145,18 +145,18 @@ def estimates_of_draws(
     estimates, drawn = {}, {}
     for name, quantity in quantities.items():
         k = quantity.place(constraint, library)
-        drawn[name] = quantity.of(draws[:, k])
+        drawn[name] = quantity.evaluate(draws[:, k])
         ends = (50 * (1 - LEVEL), 50 * (1 + LEVEL))
         low, high = np.percentile(drawn[name], ends)
         if quantity.power < 0 and np.prod(np.sign(np.percentile(draws[:, k], ends))) <= 0:
             low, high = -np.inf, np.inf
         estimates[name] = QuantityEstimate(
-            float(quantity.of(coef[k : k + 1])[0]), float(low), float(high)
+            float(quantity.evaluate(coef[k : k + 1])[0]), float(low), float(high)
         )
     return estimates, drawn
 
 
-def estimates_of_covariance(
+def estimate_from_covariance(
     model: SparseModel,
     quantities: Mapping[str, Quantity],
     constraint: Constraint,
@@ -169,7 +169,7 @@ def estimates_of_covariance(
         coef = model.terms(state)[term]
         low, _ = model.intervals(state, level=LEVEL)[term]
         reach = abs(quantity.slope(coef)) * (coef - low)
-        value = float(quantity.of(np.array([coef]))[0])
+        value = float(quantity.evaluate(np.array([coef]))[0])
         estimates[name] = QuantityEstimate(value, value - reach, value + reach)
     return estimates
 
@@ -204,7 +204,7 @@ class ControlLaw:
         return self.functions.evaluate(parameters) @ self.coef
 
 
-def control_law(
+def fit_control_law(
     values: Float[np.ndarray, " points"],
     parameters: Float[np.ndarray, "points parameters"],
     library: Library,
@@ -293,7 +293,7 @@ def fit_names(results: Sequence[PointResult]) -> list[str]:
     return list(dict.fromkeys(name for result in results for name in result.fits))
 
 
-def laws(
+def fit_control_laws(
     results: Sequence[PointResult], library: Library, *, max_terms: int | None = None
 ) -> dict[str, dict[str, ControlLaw]]:
     """A control law per fit and quantity, from the points at which the fit finished.
@@ -308,13 +308,15 @@ def laws(
         if len(usable) < 3 or not np.ptp(values, axis=0).all():
             continue
         found[fit] = {
-            name: control_law(_values(usable, fit, name), values, library, max_terms=max_terms)
+            name: fit_control_law(_values(usable, fit, name), values, library, max_terms=max_terms)
             for name in usable[0].fits[fit].estimates
         }
     return found
 
 
-def trends(results: Sequence[PointResult], *, along: str, at: Mapping[str, float]) -> pd.DataFrame:
+def fit_trends(
+    results: Sequence[PointResult], *, along: str, at: Mapping[str, float]
+) -> pd.DataFrame:
     """Exponents p of |quantity| ~ parameter^p along one parameter, the others held.
 
     One row per fit and quantity: the slope of logarithms, by least squares over the points. r2: of

@@ -122,7 +122,7 @@ def point_label(parameters: Mapping[str, float]) -> str:
 
 
 @contextmanager
-def naming(parameters: Mapping[str, float]) -> Iterator[None]:
+def name_point(parameters: Mapping[str, float]) -> Iterator[None]:
     """Put the name of the operating point before errors raised inside."""
     try:
         yield
@@ -134,7 +134,7 @@ def check_alike(records: Sequence[OperatingRecord], variables: Sequence[str]) ->
     """Raise ValueError, naming the point, unless all have the same states, variables and units."""
     known = [record for record in records if record.trajectory is not None]
     for record in known:
-        with naming(record.parameters):
+        with name_point(record.parameters):
             check_agreement([known[0].run, record.run], variables)
 
 
@@ -171,17 +171,17 @@ def check_records(records: Sequence[OperatingRecord]) -> None:
             f"a law needs more than one operating point: {records[0].label} came alone; add "
             "points near it"
         )
-    check_varying(values_of(records), names)
+    check_varying(read_points(records), names)
     check_alike(records, records[0].run.state_names)
 
 
-def values_of(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records parameters"]:
+def read_points(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records parameters"]:
     """Parameters of the records, columns in the order of the first record's."""
     names = list(records[0].parameters)
     return np.array([[record.parameters[name] for name in names] for record in records])
 
 
-def values_at(
+def read_point(
     names: Sequence[str], parameters: Mapping[str, float]
 ) -> Float[np.ndarray, " parameters"]:
     """Values of the parameters of these names at a point; ValueError unless they are finite."""
@@ -195,7 +195,7 @@ def values_at(
 
 def most_central(records: Sequence[OperatingRecord]) -> OperatingRecord:
     """The record whose parameters are nearest to the mean of all."""
-    values = values_of(records)
+    values = read_points(records)
     off = (values - values.mean(axis=0)) / zero_to_one(np.ptp(values, axis=0))
     return records[int(np.argmin(np.linalg.norm(off, axis=1)))]
 
@@ -224,7 +224,7 @@ def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records
     with the spread on either side of it.
     """
     amplitude = np.log([record.relative_amplitude for record in records])
-    left = _off_plane(values_of(records), amplitude)
+    left = _off_plane(read_points(records), amplitude)
     order = np.argsort(left)
     gaps = np.diff(left[order])
     nothing = np.zeros(len(records), dtype=np.int64)

@@ -22,7 +22,7 @@ from ep2sindy.refinement.problem import (
     RefinementSettings,
     record,
 )
-from ep2sindy.refinement.refine import constraints_of_models, with_coef
+from ep2sindy.refinement.refine import resolve_constraints, with_coef
 from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.regression.pooled import Basis, pool_coefficients
 from ep2sindy.runtime.progress import Progress, as_progress
@@ -96,7 +96,7 @@ def refine_law(
     """
     known = Basis(basis)
     _check_structure(models, len(basis), len(trajectories))
-    own = constraints_of_models(settings, models, constraints)
+    own = resolve_constraints(settings, models, constraints)
     relations = [each or unconstrained(models[0]) for each in own]
     method = MultipleShooting() if settings.method is None else settings.method
     if not isinstance(method, MultipleShooting):

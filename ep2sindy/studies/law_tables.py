@@ -13,7 +13,7 @@ from ep2sindy.figures.operating import frequency_scale
 from ep2sindy.forecasting.skill import AUTOREGRESSION, MODEL, ForecastSkill
 from ep2sindy.operating.branch import Branch, StructureCase, StructureTrial
 from ep2sindy.operating.fit import LeaveOneOut, error_statistics
-from ep2sindy.operating.law import Known, law_constraint
+from ep2sindy.operating.law import Known, constrain_law
 from ep2sindy.operating.map import Fate, MapPoint
 from ep2sindy.operating.point_fits import Case
 from ep2sindy.operating.quantities import ControlLaw, PointResult
@@ -47,7 +47,7 @@ class LawModel:
                 f"{key}"
             )
         try:
-            law_constraint(library, structure, self.relations, self.known, parameters=parameters)
+            constrain_law(library, structure, self.relations, self.known, parameters=parameters)
         except ValueError as error:
             raise ValueError(
                 f"models.{name} cannot hold: {error} (or leave it out: ~models.{name})"

@@ -30,9 +30,9 @@ from ep2sindy.operating.quantities import (
     Fitted,
     PointResult,
     Quantity,
+    fit_control_laws,
     fit_power_law,
-    laws,
-    trends,
+    fit_trends,
 )
 from ep2sindy.operating.records import point_label
 from ep2sindy.regression.rows import Formulation
@@ -218,7 +218,7 @@ class Study:
         return Outcome(
             study=how,
             results=results,
-            laws=laws(results, law, max_terms=self.law.max_terms),
+            laws=fit_control_laws(results, law, max_terms=self.law.max_terms),
             joint=search_shared(points, results, how, tying, rng=together, progress=run.watch),
             along=[(each.along, each.at) for each in self.trends],
             published=published,
@@ -524,7 +524,7 @@ def trends_table(
     """Exponents along each parameter with the others fixed, for our and the published values."""
     tables = [pd.DataFrame()]
     for parameter, at in along:
-        table = trends(results, along=parameter, at=at)
+        table = fit_trends(results, along=parameter, at=at)
         for index, row in table.iterrows():
             known = rows_at(published, {**at, "fit": row["fit"], "quantity": row["quantity"]})
             x, values = (known[c].to_numpy(dtype=float) for c in (parameter, "value"))

@@ -16,7 +16,7 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.branch import Branch, BranchSettings, find_branch, group_by_cycle
 from ep2sindy.operating.fit import SETTINGS, error_statistics
-from ep2sindy.operating.law import law_basis
+from ep2sindy.operating.law import make_basis
 from ep2sindy.operating.map import Fate
 from ep2sindy.operating.records import OperatingRecord, most_central, point_label
 from ep2sindy.report.document import Block, Captioned, Picture, Result, Section, Table, Text
@@ -147,7 +147,7 @@ class Study:
         given = self._given
         sources, names = given.sources(self.source), given.names
         # Points too few for a law, even if all oscillate, are refused before any simulation.
-        law_basis(
+        make_basis(
             polynomial(names, degree=min(self.degrees)),
             np.array([[source.parameters[name] for name in names] for source in sources]),
             n_spare=1,
