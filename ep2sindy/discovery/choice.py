@@ -35,7 +35,7 @@ from ep2sindy.selection.rule import (
     support_of,
 )
 
-# Most combinations, of the fronts that relations tie together, to look at for one with the terms.
+# Most combinations, of the fronts that relations join, to look at for one with the terms.
 MAX_COMBINATIONS = 100_000
 
 
@@ -201,7 +201,7 @@ def judge_noise(
     unknown = [state for state in states if state not in tested]
     found = {**tested, **(_test_on_weak_rows(choice, runs, unknown) if unknown else {})}
     ordered = {state: found[state] for state in states if state in found}
-    return NoiseTest(ordered, _misfit(ordered, choice.n_free), tested=bool(ordered))
+    return NoiseTest(ordered, _describe_misfit(ordered, choice.n_free), tested=bool(ordered))
 
 
 def _test_on_weak_rows(
@@ -245,7 +245,7 @@ def _count_free(held: Constraint, relations: Sequence[Relation]) -> dict[str, in
     }
 
 
-def _misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> str:
+def _describe_misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> str:
     """Sentence on the equations whose residuals exceed the noise; empty if there are none.
 
     related: states whose coefficients obey relations.
@@ -292,15 +292,13 @@ def assemble_model(
     )
 
 
-def reweight(
-    problem: RegressionRows, candidate: Candidate | EquationFit, *, n_steps: int = N_STEPS
-) -> EquationFit:
+def reweight(problem: RegressionRows, candidate: Candidate | EquationFit) -> EquationFit:
     """Fit a candidate's terms again, with weights and corrected samples, and test the residuals.
 
     If the residuals exceed the noise of the rows there is no covariance: intervals would not cover
     the truth.
     """
-    theta, target, scale = whiten_terms(problem, candidate, n_steps=n_steps)
+    theta, target, scale = whiten_terms(problem, candidate)
     upper = np.linalg.qr(theta, mode="r")
     root = np.linalg.inv(upper) * scale[:, None]
     fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
@@ -319,7 +317,6 @@ def whiten_terms(
     candidate: Candidate | EquationFit,
     *,
     terms: Sequence[str] | None = None,
-    n_steps: int = N_STEPS,
     negligible: float = 0.0,
 ) -> tuple[
     Float[np.ndarray, "rows terms"], Float[np.ndarray, " rows"], Float[np.ndarray, " terms"]
@@ -335,7 +332,7 @@ def whiten_terms(
     places = [problem.library.index(name) for name in candidate.terms]
     coef[places] = candidate.coef / scale[places]
     kept = np.isin(problem.term_names, names)
-    rows = whitened_rows(problem, own, coef, n_steps=n_steps, negligible=negligible, kept=kept)
+    rows = whitened_rows(problem, own, coef, n_steps=N_STEPS, negligible=negligible, kept=kept)
     return rows.theta[:, order], rows.target, scale[order]
 
 

@@ -86,7 +86,7 @@ class OperatingFit:
     @property
     def n_free(self) -> int:
         """Number of coefficients that the relations leave free."""
-        return self.relations.n_free
+        return len(self.relations.common.free)
 
     @cached_property
     def coefficients(self) -> Float[np.ndarray, "records free"]:

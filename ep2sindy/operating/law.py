@@ -161,14 +161,10 @@ class OperatingLaw:
             )
         std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(self.coef.shape)
         reach = ndtri(0.5 + 0.5 * level) * std
+        ends = np.stack([self.coef - reach, self.coef + reach], axis=-1).tolist()
         return {
-            pair: {
-                name: (low, high)
-                for name, low, high in zip(
-                    self.functions.names, (row - r).tolist(), (row + r).tolist(), strict=True
-                )
-            }
-            for pair, row, r in zip(self.coefficients, self.coef, reach, strict=True)
+            pair: {name: (*each,) for name, each in zip(self.functions.names, row, strict=True)}
+            for pair, row in zip(self.coefficients, ends, strict=True)
         }
 
     def text(self, *, digits: int = 3) -> str:
@@ -296,10 +292,6 @@ class LawConstraint:
     def __post_init__(self) -> None:
         object.__setattr__(self, "D", read_only(self.D))
         assert self.D.shape == (len(self.common.coefficients), len(self.functions))
-
-    @property
-    def n_free(self) -> int:
-        return len(self.common.free)
 
     def at(self, points: Float[np.ndarray, "points parameters"]) -> list[Constraint]:
         """The relations at each point, with the values that known coefficients have there.

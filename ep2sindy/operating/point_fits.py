@@ -366,12 +366,12 @@ def search_shared(
         if result.fits and point.trajectory is not None
     }
     method = study.method
-    if len(used) < 2:
+    if len(used) < 2 or not isinstance(method, Regression):
         return None
-    if not (isinstance(method, Regression) and isinstance(method.search, BestSubset)):
+    if not isinstance(method.search, BestSubset):
         return None
     found = discover_shared(
-        {label: [point.trajectory] for label, point in used.items() if point.trajectory},
+        {label: [point.run] for label, point in used.items()},
         study.searched,
         replace(method, bootstraps=Bootstraps(n=0)),
         seed=rng,

@@ -240,20 +240,17 @@ def structure_metrics(name: str, branch: Branch) -> list[Metric[StructureTrial]]
         Metric("degree", lambda trial: trial.degree, View.SHOWN),
         Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
         Metric("error", lambda trial: float(trial.errors.mean()), View.SHOWN),
-        Metric("f_error", _median_f_error, View.SHOWN, format=percent(2)),
         Metric(
-            "diverging",
-            lambda trial: sum(point.run.rollout.diverged for point in trial.left_out),
+            "f_error",
+            lambda trial: error_statistics(trial.left_out)["f_median"],
             View.SHOWN,
+            format=percent(2),
+        ),
+        Metric(
+            "diverging", lambda trial: error_statistics(trial.left_out)["diverging"], View.SHOWN
         ),
         Metric("chosen", is_chosen),
     ]
-
-
-def _median_f_error(trial: StructureTrial) -> float:
-    """Median over the points left out; a run without a frequency counts as infinitely far off."""
-    errors = np.array([abs(point.run.f_error) for point in trial.left_out])
-    return float(np.median(np.where(np.isnan(errors), np.inf, errors)))
 
 
 def map_table(branches: Mapping[str, Branch], which: str) -> pd.DataFrame:
