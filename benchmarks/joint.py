@@ -4,7 +4,7 @@
     python -m benchmarks.joint 20      # realizations per noise level
 
 Prints, per noise level, the percentage of realizations in which the supports of all equations are
-right, and the errors of the coefficients, free and tied by the law.
+right, and the errors of the coefficients, free and by the law.
 """
 
 import sys
@@ -18,7 +18,7 @@ import pandas as pd
 from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import AnyMethod, Regression
-from ep2sindy.operating.law import fit_law
+from ep2sindy.operating.fit_rows import fit_law
 from ep2sindy.operating.shared_support import SharedDiscovery, discover_shared
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.splits import RandomSplit
@@ -46,8 +46,8 @@ def run_family(
 
     One row per noise and number. joint, pooled and one column per point: 1 where the supports of
     all equations are right; pooled is one regression over all points, with one set of
-    coefficients. error_free, error_tied: RMS relative error of the coefficients at all points,
-    free or tied by the true law, and p_value the least of the equations', where joint is right.
+    coefficients. error_free, error_law: RMS relative error of the coefficients at all points,
+    free or by the true law, and p_value the least of the equations', where joint is right.
     """
     if n_realizations < 1 or not len(noises):
         raise ValueError(
@@ -77,22 +77,22 @@ def _right(found: SharedDiscovery) -> float:
     return float(all(set(found.chosen[state]) == set(terms) for state, terms in TRUTH.items()))
 
 
-ERRORS = ("error_free", "error_tied", "p_value")
+ERRORS = ("error_free", "error_law", "p_value")
 
 
 def _errors(joint: SharedDiscovery) -> dict[str, float]:
-    tied = fit_law(joint, LAW, parameters=PARAMETERS)
-    errors: dict[str, list[float]] = {"error_free": [], "error_tied": []}
+    fit = fit_law(joint, LAW, parameters=PARAMETERS)
+    errors: dict[str, list[float]] = {"error_free": [], "error_law": []}
     for point, parameters in PARAMETERS.items():
         truth = system_at(parameters).model
         for name, model in (
             ("error_free", joint.models[point]),
-            ("error_tied", tied.law.model_at(parameters)),
+            ("error_law", fit.law.model_at(parameters)),
         ):
             used = truth.coef != 0.0
             errors[name] += (model.coef[used] / truth.coef[used] - 1.0).tolist()
     found = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in errors.items()}
-    return found | {"p_value": min(e.p_value for e in tied.tests.values())}
+    return found | {"p_value": min(e.p_value for e in fit.tests.values())}
 
 
 def rates(outcomes: pd.DataFrame) -> pd.DataFrame:
@@ -118,7 +118,7 @@ def main() -> None:
     n_realizations = int(sys.argv[1]) if len(sys.argv) > 1 else 100
     start = time.perf_counter()
     outcomes = run_family(METHOD, noises=NOISES, n_realizations=n_realizations, workers=Loky())
-    errors = outcomes.groupby("noise")[["error_free", "error_tied"]].median()
+    errors = outcomes.groupby("noise")[["error_free", "error_law"]].median()
     calm = outcomes.groupby("noise")["p_value"].agg(lambda p: (p > 0.05 / 2).mean())
     with pd.option_context(
         "display.width", 120, "display.max_columns", 20, "display.float_format", "{:.4g}".format

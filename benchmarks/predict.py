@@ -5,9 +5,10 @@
 The package's own discharge at 290 to 370 V and 4 to 5.5 mg/s, five by five, 6 ms each after 2 ms
 of warm-up, densities averaged over the channel. First how smooth the measured frequencies and
 amplitudes are: interpolated by as many functions themselves. Then the models of
-conf/exp/predict.yaml and two that leave out what these know; the chosen one tied, also at points
-drawn between; the downstream zone for comparison; a map that reaches to where nothing oscillates;
-three by three points; a wider grid that holds two cycles; and the strong one of two cycles.
+conf/exp/predict.yaml and two that leave out what these know; the chosen one refined over all
+records, also at points drawn between; the downstream zone for comparison; a map that reaches to
+where nothing oscillates; three by three points; a wider grid that holds two cycles; and the strong
+one of two cycles.
 """
 
 import argparse
@@ -26,13 +27,14 @@ import ep2sindy as ep
 from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.operating.fit import LeaveOneOut, OperatingFit, leave_one_out, operating_fit
-from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.law import OperatingLaw, make_basis
 from ep2sindy.operating.map import Fate, law_map
 from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
     interpolation_errors,
     point_label,
+    read_points,
 )
 
 CONFIG = Path(__file__).parents[1] / "conf" / "exp" / "predict.yaml"
@@ -146,7 +148,7 @@ def fitted(records: Sequence[OperatingRecord], model: Mapping[str, Any]) -> Oper
 
 def smoothness(records: Sequence[OperatingRecord], degree: int) -> None:
     functions = ep.polynomial(list(records[0].parameters), degree=degree)
-    basis = functions.evaluate(np.array([list(r.parameters.values()) for r in records]))
+    basis = make_basis(functions, read_points(records))
     f, amplitude = interpolation_errors(records, basis)
     print(
         f"the records' own, by as many functions: f {np.median(f):.2%}, 9 in 10 "
@@ -172,11 +174,11 @@ def judged(fit: OperatingFit, degree: int) -> OperatingLaw:
     smoothness(fit.records, degree)
     print(f"{fit.n_free} coefficients, {fit.n_free * len(functions)} numbers")
     print(line("weighted", runs_of(leave_one_out(fit, functions))), flush=True)
-    law, found = fit.tied(functions)
+    law, found = fit.refine_law(functions)
     left_out = leave_one_out(fit, functions, start=law)
-    print(f"tied: {found.status}, loss {found.loss.mean():.4f}")
-    print(line("tied", runs_of(left_out)))
-    print(line("tied, enclosed only", runs_of(left_out, enclosed=True)))
+    print(f"refined: {found.status}, loss {found.loss.mean():.4f}")
+    print(line("refined", runs_of(left_out)))
+    print(line("refined, enclosed only", runs_of(left_out, enclosed=True)))
     for each in left_out:
         if each.run.verdict is not Verdict.LIVES:
             print(f"  {each.record.label}: {each.run.verdict}, f {each.run.f_error:+.2%}")
@@ -197,7 +199,7 @@ def between(law: OperatingLaw, n: int, *, zone: str = "channel") -> None:
 def mapped(strong: Sequence[OperatingRecord], quiet: Sequence[Mapping[str, float]]) -> None:
     """Whether a law of all that oscillates says where nothing does."""
     fit = fitted(strong, MODELS[BEST])
-    law, found = fit.tied(fit.functions(2))
+    law, found = fit.refine_law(fit.functions(2))
     points = [*quiet, *(record.parameters for record in strong)]
     right = 0
     for k, point in enumerate(law_map(law, strong, points)):

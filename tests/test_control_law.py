@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ep2sindy.library.library import polynomial
-from ep2sindy.operating.quantity_law import control_law
+from ep2sindy.operating.quantities import fit_control_law
 
 # The thesis's six operating points, V and mg/s: a cross.
 POINTS = np.array([[200, 5], [300, 2], [300, 4], [300, 5], [300, 6], [400, 5]], dtype=np.float64)
@@ -14,7 +14,7 @@ LIBRARY = polynomial(["V_D_V", "mdot_mg_s"], degree=2)
 
 def test_a_law_without_noise_is_recovered() -> None:
     values = 0.02 + 3e-3 * POINTS[:, 1] - 4e-8 * POINTS[:, 0] ** 2
-    law = control_law(values, POINTS, LIBRARY)
+    law = fit_control_law(values, POINTS, LIBRARY)
     assert law.coef_by_term == pytest.approx({"1": 0.02, "mdot_mg_s": 3e-3, "V_D_V^2": -4e-8})
     assert law.r2 == pytest.approx(1.0)
     assert law.loo_error < 1e-9
@@ -23,13 +23,13 @@ def test_a_law_without_noise_is_recovered() -> None:
 
 
 def test_a_law_of_one_term_beats_the_larger_ones_that_hold_it() -> None:
-    law = control_law(3.7e22 * POINTS[:, 1], POINTS, LIBRARY)
-    assert law.terms == ("mdot_mg_s",)
+    law = fit_control_law(3.7e22 * POINTS[:, 1], POINTS, LIBRARY)
+    assert law.functions.names == ("mdot_mg_s",)
     assert law.search_error < 1e-9
 
 
 def test_what_does_not_vary_is_a_constant() -> None:
-    law = control_law(np.full(6, 0.8), POINTS, LIBRARY)
+    law = fit_control_law(np.full(6, 0.8), POINTS, LIBRARY)
     assert law.coef_by_term == pytest.approx({"1": 0.8})
     assert np.isnan(law.r2)
 
@@ -38,7 +38,7 @@ def test_what_does_not_vary_is_a_constant() -> None:
 def test_leave_one_out_errors_are_those_of_fits_without_the_point(seed: int) -> None:
     rng = np.random.default_rng(seed)
     values = rng.normal(size=6) + 4.0
-    law = control_law(values, POINTS, LIBRARY, max_terms=3)
+    law = fit_control_law(values, POINTS, LIBRARY, max_terms=3)
     theta = LIBRARY.evaluate(POINTS) / np.linalg.norm(LIBRARY.evaluate(POINTS), axis=0)
 
     def left_out(columns: np.ndarray) -> np.ndarray:
@@ -54,16 +54,16 @@ def test_leave_one_out_errors_are_those_of_fits_without_the_point(seed: int) -> 
             if min(np.linalg.matrix_rank(np.delete(columns, k, axis=0)) for k in range(6)) == size:
                 error = np.sqrt(np.mean(left_out(columns) ** 2)) / abs(values.mean())
                 every[tuple(LIBRARY.names[j] for j in support)] = error
-    assert law.terms == min(every, key=every.__getitem__)
+    assert law.functions.names == min(every, key=every.__getitem__)
     assert law.loo_error == pytest.approx(min(every.values()), rel=1e-6)
 
 
 def test_the_search_is_judged_by_points_it_never_saw() -> None:
     values = np.random.default_rng(3).normal(size=6) + 4.0
-    law = control_law(values, POINTS, LIBRARY)
+    law = fit_control_law(values, POINTS, LIBRARY)
     errors = []
     for k in range(6):
-        others = control_law(np.delete(values, k), np.delete(POINTS, k, axis=0), LIBRARY)
+        others = fit_control_law(np.delete(values, k), np.delete(POINTS, k, axis=0), LIBRARY)
         errors.append(values[k] - others.predict(POINTS[[k]])[0])
     assert law.search_error == pytest.approx(np.sqrt(np.mean(np.square(errors))) / values.mean())
 
@@ -71,9 +71,9 @@ def test_the_search_is_judged_by_points_it_never_saw() -> None:
 def test_units_of_quantity_and_parameters_change_nothing_else() -> None:
     rng = np.random.default_rng(1)
     values = 0.02 + 3e-3 * POINTS[:, 1] + 1e-3 * rng.normal(size=6)
-    here = control_law(values, POINTS, LIBRARY)
-    there = control_law(1e25 * values, POINTS * [1e-3, 1e-6], LIBRARY)
-    assert here.terms == there.terms
+    here = fit_control_law(values, POINTS, LIBRARY)
+    there = fit_control_law(1e25 * values, POINTS * [1e-3, 1e-6], LIBRARY)
+    assert here.functions.names == there.functions.names
     assert there.loo_error == pytest.approx(here.loo_error)
     assert there.predict(POINTS * [1e-3, 1e-6]) == pytest.approx(1e25 * here.predict(POINTS))
 
@@ -81,14 +81,14 @@ def test_units_of_quantity_and_parameters_change_nothing_else() -> None:
 def test_two_points_more_than_terms_are_asked_for() -> None:
     rng = np.random.default_rng(0)
     three = POINTS[[0, 1, 5]]
-    assert len(control_law(rng.normal(size=3), three, LIBRARY).terms) == 1
-    assert len(control_law(rng.normal(size=6), POINTS, LIBRARY).terms) <= 4
+    assert len(fit_control_law(rng.normal(size=3), three, LIBRARY).functions) == 1
+    assert len(fit_control_law(rng.normal(size=6), POINTS, LIBRARY).functions) <= 4
 
 
 def test_a_term_that_one_point_alone_decides_is_out() -> None:
     points = np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])
-    law = control_law(np.array([1.0, 1.1, 0.9, 1.0, 5.0]), points, polynomial(["x"], degree=1))
-    assert law.terms == ("1",)  # with x the last point fits exactly, and says nothing
+    law = fit_control_law(np.array([1.0, 1.1, 0.9, 1.0, 5.0]), points, polynomial(["x"], degree=1))
+    assert law.functions.names == ("1",)  # with x the last point fits exactly, and says nothing
 
 
 @pytest.mark.parametrize(
@@ -105,4 +105,4 @@ def test_what_cannot_make_a_law_is_refused(
     values: np.ndarray, points: np.ndarray, settings: dict[str, int], message: str
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
-        control_law(values, points, LIBRARY, **settings)
+        fit_control_law(values, points, LIBRARY, **settings)

@@ -229,10 +229,10 @@ def test_a_state_whose_rows_cannot_be_whitened_leaves_the_others_tested(
     def fail_for_x(problem: RegressionRows, fit: choice.EquationFit) -> choice.LeftOver:
         if fit.equation == "x":
             raise np.linalg.LinAlgError("singular")
-        return left_of_terms(problem, fit)
+        return test_terms(problem, fit)
 
-    left_of_terms = choice._left_of_terms
-    monkeypatch.setattr(choice, "_left_of_terms", fail_for_x)
+    test_terms = choice._test_terms
+    monkeypatch.setattr(choice, "_test_terms", fail_for_x)
     found = discover(lotka_volterra().trajectory(noise=0.05, rng=0), None, PLAIN)
     assert list(found.noise_test.left) == ["y"]
 

@@ -12,7 +12,7 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.data.open import write_field
 from ep2sindy.figures.operating import PUBLISHED, trends_figure
 from ep2sindy.library.library import polynomial
-from ep2sindy.operating.quantity_law import control_law
+from ep2sindy.operating.quantities import fit_control_law
 from tests import programs
 from tests.fields import along_channel
 from tests.programs import summary_of
@@ -158,7 +158,7 @@ def trend_table(kinds: Sequence[str]) -> pd.DataFrame:
 def test_a_figure_has_a_panel_per_quantity_and_trend_and_a_colour_per_kind() -> None:
     estimates = trend_table(["least squares", "refined", PUBLISHED])
     parameters = estimates[["V", "m"]].to_numpy()
-    law = control_law(parameters.prod(axis=1), parameters, polynomial(["V", "m"], degree=2))
+    law = fit_control_law(parameters.prod(axis=1), parameters, polynomial(["V", "m"], degree=2))
     trends = [("m", {"V": 300.0}), ("V", {"m": 5.0})]
     labels = {"V": "$V_D$ (V)", PUBLISHED: "thesis"}
     figure = trends_figure(estimates, {"a": law}, trends=trends, labels=labels)

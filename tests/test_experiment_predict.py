@@ -9,7 +9,7 @@ import pytest
 from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
-from ep2sindy.operating.choice import map_points
+from ep2sindy.operating.branch import map_points
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import Fate
 from ep2sindy.report.document import Text

@@ -127,7 +127,7 @@ def test_steps_that_are_left_out_hardly_change_the_residuals() -> None:
     for problem in form.assemble([run], library, rng=rng):
         (state,) = problem.equations
         fit = choice.EquationFit(state, library.names, np.array([10.0, 28.0, -1.0]))
-        near, exact = choice._left_of_terms(problem, fit), choice.reweight(problem, fit).left
+        near, exact = choice._test_terms(problem, fit), choice.reweight(problem, fit).left
         assert exact is not None
         assert abs(near.chi_squared / exact.chi_squared - 1.0) < 1e-5
         assert abs(near.autocorrelation - exact.autocorrelation) < 1e-5

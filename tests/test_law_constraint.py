@@ -1,4 +1,4 @@
-"""Laws under relations: exact in every fit, weighted and tied, at points fitted and not."""
+"""Laws under relations: exact in every fit, weighted and pooled, at points fitted and not."""
 
 from dataclasses import replace
 from functools import cache
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.operating.constraint import Known, law_constraint
 from ep2sindy.operating.fit import SETTINGS, OperatingFit, leave_one_out, operating_fit
+from ep2sindy.operating.law import Known, constrain_law
 from tests.test_operating_law import GRID, LIBRARY, SHORT, STATES, STRUCTURE
 
 # What leaves x enters y, and the growth of x is known; its square is beyond a law of degree one.
@@ -46,12 +46,12 @@ def fit() -> OperatingFit:
 
 
 @cache
-def tied() -> ep.operating.OperatingLaw:
-    return fit().tied(fit().functions(1))[0]
+def pooled() -> ep.operating.OperatingLaw:
+    return fit().refine_law(fit().functions(1))[0]
 
 
 def laws() -> list[ep.operating.OperatingLaw]:
-    return [fit().weighted(fit().functions(1)), tied()]
+    return [fit().fit_law(fit().functions(1)), pooled()]
 
 
 def check_exact(model: ep.SparseModel, a: float) -> None:
@@ -71,7 +71,8 @@ def test_relations_and_known_values_are_exact_in_laws_at_every_point() -> None:
     for law in laws():
         for point in [*GRID, BETWEEN, {"a": 3.0, "b": -1.0}]:
             check_exact(law.model_at(point, extrapolate=True), point["a"])
-    for record, model in zip(records(), fit().tied(fit().functions(1))[1].models, strict=True):
+    _, refinement = fit().refine_law(fit().functions(1))
+    for record, model in zip(records(), refinement.models, strict=True):
         check_exact(model, record.parameters["a"])
 
 
@@ -87,27 +88,27 @@ def test_the_law_under_relations_is_the_true_one() -> None:
 
 
 def test_a_known_number_has_no_interval_and_a_shared_one_has_the_same_twice() -> None:
-    bounds = tied().intervals()
+    bounds = pooled().intervals()
     assert bounds["x", "x"] == {"1": (0.7, 0.7), "a": (0, 0), "b": (0, 0), "a^2": (0.2, 0.2)}
     low, high = bounds["x", "y"]["a"]
     assert low < high
     assert bounds["y", "x"]["a"] == pytest.approx((-high, -low))
-    model = tied().model_at(BETWEEN)
+    model = pooled().model_at(BETWEEN)
     low, high = model.intervals("x")["x"]
     assert low == high == model.terms("x")["x"]
 
 
 def test_points_left_out_live_by_laws_under_relations() -> None:
     functions = fit().functions(1)
-    for found in (leave_one_out(fit(), functions), leave_one_out(fit(), functions, start=tied())):
+    for found in (leave_one_out(fit(), functions), leave_one_out(fit(), functions, start=pooled())):
         assert [each.run.verdict for each in found] == [ep.Verdict.LIVES] * 9
 
 
 def test_a_file_and_the_text_hold_the_relations() -> None:
-    again = ep.operating.OperatingLaw.from_json(tied().to_json())
-    np.testing.assert_array_equal(again.coef, tied().coef)
+    again = ep.operating.OperatingLaw.from_json(pooled().to_json())
+    np.testing.assert_array_equal(again.coef, pooled().coef)
     assert again.provenance["exact"] == "; ".join(EXACT)
-    lines = tied().text().splitlines()
+    lines = pooled().text().splitlines()
     assert lines[0] == "x: x = 0.7 + 0.2 a^2"
     assert tuple(lines[4:]) == tuple(f"exact: {text}" for text in EXACT)
     check_exact(again.model_at(BETWEEN), BETWEEN["a"])
@@ -119,7 +120,7 @@ def test_without_known_values_relations_are_the_same_everywhere() -> None:
         settings=SHORT,
     )  # fmt: skip
     assert alone.n_free == 2
-    law = alone.weighted(alone.functions(1))
+    law = alone.fit_law(alone.functions(1))
     assert law.coefficients[2] == ("x", "x^3")
     assert law.coef[2].tolist() == [-0.3, 0.0, 0.0]
 
@@ -142,16 +143,16 @@ def test_relations_that_cannot_hold_are_refused(
 
 
 def test_constraints_of_the_points_of_a_law_must_be_alike() -> None:
-    held = law_constraint(LIBRARY, STRUCTURE, RELATIONS, KNOWN, parameters=["a", "b"])
+    held = constrain_law(LIBRARY, STRUCTURE, RELATIONS, KNOWN, parameters=["a", "b"])
     own = held.at(np.array([[0.5, 0.0], [1.0, 0.0], [1.5, 0.0]]))
     assert [each.d[0] for each in own] == pytest.approx([0.75, 0.9, 1.15])
     models = [model_at(a, 0.0) for a in (0.5, 1.0, 1.5)]
     runs = [[record.run] for record in records()[::3]]
     basis = np.ones((3, 1))
     other = [*own[:2], ep.constraint(LIBRARY, STRUCTURE)]
-    for wrong, message in ((own[:2], "2 came"), (other, "3 came, not alike")):
-        with pytest.raises(ValueError, match=f"one constraint for each of its 3 points.*{message}"):
+    for wrong, message in ((own[:2], "one entry per model.* 2 came for 3"), (other, "not alike")):
+        with pytest.raises(ValueError, match=message):
             ep.refinement.refine_law(models, runs, basis, constraints=wrong, seed=0)
     settings = replace(SETTINGS, constraint=own[0])
-    with pytest.raises(ValueError, match="one for all in the settings"):
+    with pytest.raises(ValueError, match="beside a common one"):
         ep.refinement.refine_law(models, runs, basis, settings, constraints=own, seed=0)

@@ -48,7 +48,7 @@ HEAVY = {
         "selection.free_run",
         "selection.systems",
         "selection.conserving",
-        "operating.choice",
+        "operating.branch",
         "operating.fit",
         "operating.point_fits",
         "studies.law_tables",

@@ -10,7 +10,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.operating.fit import SETTINGS, LeaveOneOut, OperatingFit, leave_one_out, operating_fit
-from ep2sindy.operating.law import OperatingLaw, in_hull, law_basis
+from ep2sindy.operating.law import OperatingLaw, in_hull, make_basis
 from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
@@ -54,7 +54,7 @@ def fit() -> OperatingFit:
 
 @cache
 def law() -> OperatingLaw:
-    return fit().tied(fit().functions(1))[0]
+    return fit().refine_law(fit().functions(1))[0]
 
 
 def truth() -> np.ndarray:
@@ -65,7 +65,7 @@ def test_the_law_of_a_known_family_is_found() -> None:
     assert law().coefficients == (("x", "x"), ("x", "y"), ("x", "x^3"), ("y", "x"))
     # rk4 at 0.1 of a time unit near one, on a stiff corner of the relaxation oscillation.
     np.testing.assert_allclose(law().coef, truth(), atol=1e-4)
-    weighted = fit().weighted(fit().functions(1))
+    weighted = fit().fit_law(fit().functions(1))
     np.testing.assert_allclose(weighted.coef, truth(), atol=1e-4)
 
 
@@ -176,7 +176,7 @@ def test_a_run_that_diverges_counts_as_ten_bounds() -> None:
 
 def test_a_smooth_family_interpolates_its_own_frequency() -> None:
     quadratic = ep.polynomial(["a", "b"], degree=2)
-    f, amplitude = interpolation_errors(records(), fit().basis(quadratic))
+    f, amplitude = interpolation_errors(records(), make_basis(quadratic, fit().points))
     assert f.shape == amplitude.shape == (9,)
     assert np.median(f) < 0.01
 
@@ -194,12 +194,12 @@ def test_a_law_that_is_tested_needs_a_point_more_than_it_has_functions() -> None
     functions, points = fit().functions(1), np.array([list(p.values()) for p in GRID])
     corners = points[[0, 2, 6]]
     assert len(functions) == 3
-    law_basis(functions, corners)
-    law_basis(functions, points[[0, 2, 6, 8]], n_spare=1)
+    make_basis(functions, corners)
+    make_basis(functions, points[[0, 2, 6, 8]], n_spare=1)
     with pytest.raises(
         ValueError, match="a law of 3 functions .* more points than these.*: 3 came"
     ):
-        law_basis(functions, corners, n_spare=1)
+        make_basis(functions, corners, n_spare=1)
 
 
 def test_parameters_must_vary_and_be_the_same_everywhere() -> None:
@@ -225,16 +225,16 @@ def test_a_record_must_hold_six_periods() -> None:
 def test_a_fit_needs_terms_of_every_state_and_no_constraint() -> None:
     with pytest.raises(ValueError, match=r"terms for each of \['x', 'y'\]"):
         operating_fit(records(), LIBRARY, {"x": ["x"]})
-    tied = replace(SETTINGS, constraint=ep.constraint(LIBRARY, STRUCTURE))
+    pooled = replace(SETTINGS, constraint=ep.constraint(LIBRARY, STRUCTURE))
     with pytest.raises(ValueError, match="laws of the operating point take no constraint"):
-        operating_fit(records(), LIBRARY, STRUCTURE, settings=tied)
+        operating_fit(records(), LIBRARY, STRUCTURE, settings=pooled)
 
 
 def test_a_start_that_is_given_leaves_the_method_as_it_was_set() -> None:
     poor = replace(law(), coef=1.2 * law().coef)
     for method, status in ((None, "converged"), (MultipleShooting(max_iter=1), "max_iter")):
         own = replace(fit(), settings=replace(fit().settings, method=method))
-        assert own.tied(own.functions(1), start=poor)[1].status == status
+        assert own.refine_law(own.functions(1), start=poor)[1].status == status
 
 
 def test_a_free_run_starts_where_the_states_move_least() -> None:

@@ -8,7 +8,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.model.fixed_point import eigenvalues, fixed_point
-from ep2sindy.operating.choice import (
+from ep2sindy.operating.branch import (
+    BranchSettings,
     StructureCase,
     StructureTrial,
     candidate_structures,
@@ -21,6 +22,7 @@ from tests.test_operating_law import LIBRARY, SHORT, STATES, STRUCTURE, recorded
 from tests.test_stability import HOPF
 
 ONES = np.ones(2)
+HOW = BranchSettings(LIBRARY, (), 3, degrees=[1, 2], settings=SHORT, n_map=3, seed=0)
 
 
 @cache
@@ -35,7 +37,7 @@ def tries() -> list[StructureTrial]:
     """Three structures, the true one first."""
     structures = [STRUCTURE, {**STRUCTURE, "y": ["x", "y"]}, {**STRUCTURE, "x": ["x", "y"]}]
     cases = [StructureCase(LIBRARY, structure) for structure in structures]
-    return try_structures(line(), cases, [1, 2], settings=SHORT)
+    return try_structures(line(), cases, HOW)
 
 
 def hopf() -> ep.operating.OperatingLaw:
@@ -113,14 +115,14 @@ def test_candidates_are_the_best_supports_of_every_size() -> None:
 def test_too_few_points_for_every_degree_are_refused() -> None:
     few = [records()[k] for k in (0, 1, 4)]
     with pytest.raises(ValueError, match="3 operating points suffice for no law of degree 1"):
-        try_structures(few, [StructureCase(LIBRARY, STRUCTURE)], [1, 2], settings=SHORT)
+        try_structures(few, [StructureCase(LIBRARY, STRUCTURE)], HOW)
 
 
 def test_relations_that_hold_save_numbers_and_others_cost_error() -> None:
     known = {"x": {"x": {"1": 0.8, "a": 0.3}}}
     held = StructureCase(LIBRARY, STRUCTURE, ["x: y == -1"], known, "held")
     wrong = StructureCase(LIBRARY, STRUCTURE, ["x: y == -1 * y: x"], name="wrong")
-    found = try_structures(line(), [held, wrong], [1], settings=SHORT)
+    found = try_structures(line(), [held, wrong], replace(HOW, degrees=[1]))
     assert [trial.n_numbers for trial in found] == [4, 6]
     assert found[0].errors.mean() < found[1].errors.mean()
     assert choose([*tries(), *found]).case.name == "held"

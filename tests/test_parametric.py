@@ -20,10 +20,12 @@ from ep2sindy.operating.quantities import (
     PointResult,
     Quantity,
     QuantityEstimate,
-    estimates_of_covariance,
-    estimates_of_draws,
+    estimate_from_covariance,
+    estimate_from_draws,
+    fit_control_laws,
+    fit_power_law,
+    fit_trends,
 )
-from ep2sindy.operating.quantity_law import laws, power_law_r2, trends
 from ep2sindy.operating.records import OperatingRecord
 from ep2sindy.regression.bootstraps import count_block_draws
 from ep2sindy.regression.constrained import constrained_fit
@@ -165,9 +167,9 @@ def test_one_search_over_all_points_leaves_out_those_that_do_not_oscillate(
         )
         assert fitted.r2 == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-6)
     # g = 2 + V / 100 lies on the law; eps does not.
-    assert joint.tied is not None
-    assert joint.tied.law.functions.names == ("1", "V")
-    assert all(set(e.r2_tied) == set(e.r2_free) for e in joint.tied.tests.values())
+    assert joint.fit is not None
+    assert joint.fit.law.functions.names == ("1", "V")
+    assert all(set(e.r2_law) == set(e.r2_free) for e in joint.fit.tests.values())
 
 
 def test_a_joint_search_says_why_it_ties_nothing(
@@ -176,8 +178,8 @@ def test_a_joint_search_says_why_it_ties_nothing(
     law = ep.polynomial(["V", "m"], degree=2)
     joint = search_shared(points, results, study(), law, rng=np.random.default_rng(0))
     assert joint is not None
-    assert joint.tied is None
-    assert "a law of 6 terms needs as many points: 3 came" in joint.why_not_tied
+    assert joint.fit is None
+    assert "a law of 6 terms needs as many points: 3 came" in joint.why_no_law
 
 
 def test_there_is_no_joint_search_of_one_point_or_without_best_subsets(
@@ -220,9 +222,9 @@ def test_a_point_that_does_not_oscillate_is_kept_and_left_out(
     (found,) = results_of([replace(points[0], trajectory=still)], study())
     assert (found.status, found.fits, found.searched) == ("steady", {}, None)
     assert found.spread["x"] < 0.01
-    assert trends([found], along="V", at={}).empty
-    assert laws([found], ep.polynomial(["V", "m"], degree=1)) == {}
-    along_m = trends(results, along="m", at={})
+    assert fit_trends([found], along="V", at={}).empty
+    assert fit_control_laws([found], ep.polynomial(["V", "m"], degree=1)) == {}
+    along_m = fit_trends(results, along="m", at={})
     assert set(along_m["n_points"]) == {3}
 
 
@@ -312,6 +314,26 @@ def test_draws_of_whitened_rows_spread_as_their_covariance_says() -> None:
     np.testing.assert_allclose(ratio, 1.0, atol=0.35)
 
 
+def test_a_term_that_few_rows_show_is_zero_in_the_draws_without_them() -> None:
+    rng = np.random.default_rng(0)
+    theta = rng.normal(size=(200, 2))
+    theta[10:, 1] = 0.0  # one block of twenty shows it
+    target = theta @ [2.0, -3.0] + 0.1 * rng.normal(size=200)
+    problem = plain_rows(theta, target[:, None], ["a", "b"], ["z"])
+    relations = ep.constraint(ep.named_terms(["a", "b"], ["a", "b"]), {"z": ["a", "b"]})
+    model = constrained_fit([problem], relations)
+    draws = resample_coefficients(
+        [problem], relations, model, block=10, n_draws=400, rng=np.random.default_rng(1)
+    )
+    np.testing.assert_allclose(draws.mean(axis=0), list(model.terms("z").values()), rtol=1e-12)
+    # About half of the draws have no row of the ten; the others find -3 within their noise.
+    unshifted = draws[:, 1] - draws[:, 1].max()
+    absent = unshifted > -1e-9
+    assert 0.2 < absent.mean() < 0.8
+    assert draws[:, 0].std() < 0.02
+    assert np.ptp(draws[~absent, 1]) < 0.5
+
+
 def correlated_problem(rng: np.random.Generator, *, n_rows: int, memory: int) -> RegressionRows:
     """z' = 2 a - 3 b, with columns and errors that are averages over `memory` rows."""
     white = rng.normal(size=(n_rows + memory, 3))
@@ -335,7 +357,7 @@ def coverage(*, block: int, n_seeds: int) -> float:
             [problem], relations, model, block=block, n_draws=200, rng=rng
         )
         coef = np.array([model.terms("z")[name] for name in ("a", "b")])
-        estimates, _ = estimates_of_draws(coef, draws, quantities, relations, library)
+        estimates, _ = estimate_from_draws(coef, draws, quantities, relations, library)
         inside += [e.low <= t <= e.high for e, t in zip(estimates.values(), (2, 3), strict=True)]
     return float(np.mean(inside))
 
@@ -349,7 +371,7 @@ def test_intervals_hold_the_truth_where_rows_are_alike() -> None:
 
 
 def test_a_quantity_is_a_coefficient_or_its_reciprocal() -> None:
-    assert LENGTH.of(np.array([-40.0, -50.0])) == pytest.approx([0.025, 0.02])
+    assert LENGTH.evaluate(np.array([-40.0, -50.0])) == pytest.approx([0.025, 0.02])
     assert LENGTH.slope(-40.0) == pytest.approx(1 / 1600)
     assert Quantity("y: x*y*R", -1.0).slope(-0.6) == -1.0
     units = [q.unit(LIBRARY, UNITS) for q in CASES["free"].quantities.values()]
@@ -364,7 +386,7 @@ def model_of(covariance: np.ndarray | None = None) -> ep.SparseModel:
 def test_intervals_are_carried_from_coefficients_to_quantities() -> None:
     model = model_of(np.diag([4.0, 1e-4, 0.01, 4e-4]))
     case = CASES["free"]
-    found = estimates_of_covariance(model, case.quantities, case.constraint, LIBRARY)
+    found = estimate_from_covariance(model, case.quantities, case.constraint, LIBRARY)
     reach = {name: 0.5 * (e.high - e.low) for name, e in found.items()}
     z = 1.959964
     assert reach == pytest.approx(
@@ -388,21 +410,21 @@ def power_law(V: float, m: float, status: str = "fitted") -> PointResult:
 
 def test_trends_are_exponents_with_the_other_parameters_held() -> None:
     results = [power_law(V, m) for V, m in ((200, 5), (300, 2), (300, 5), (300, 6), (400, 5))]
-    (row,) = trends(results, along="m", at={"V": 300.0}).to_dict("records")
+    (row,) = fit_trends(results, along="m", at={"V": 300.0}).to_dict("records")
     assert (row["n_points"], row["exponent"]) == (3, pytest.approx(-0.3))
     assert row["r2"] == pytest.approx(1.0)
-    (row,) = trends(results, along="V", at={"m": 5.0}).to_dict("records")
+    (row,) = fit_trends(results, along="V", at={"m": 5.0}).to_dict("records")
     assert (row["n_points"], row["exponent"]) == (3, pytest.approx(0.5))
     # The k-th draws of all points are off by one factor, which moves no slope.
     assert row["low"] == pytest.approx(0.5)
     lost = [*results, power_law(300, 9, status="max_iter")]
-    (row,) = trends(lost, along="m", at={"V": 300.0}).to_dict("records")
+    (row,) = fit_trends(lost, along="m", at={"V": 300.0}).to_dict("records")
     assert row["n_points"] == 3
 
 
 def test_two_points_say_nothing_of_how_good_a_power_law_is() -> None:
     results = [power_law(V, 5) for V in (200, 400)]
-    (row,) = trends(results, along="V", at={"m": 5.0}).to_dict("records")
+    (row,) = fit_trends(results, along="V", at={"m": 5.0}).to_dict("records")
     assert (row["n_points"], row["exponent"]) == (2, pytest.approx(0.5))
     assert np.isnan([row["low"], row["high"], row["r2"]]).all()
 
@@ -410,21 +432,21 @@ def test_two_points_say_nothing_of_how_good_a_power_law_is() -> None:
 def test_r2_says_whether_points_lie_on_a_power_law() -> None:
     # Logarithms 0, 1, 0 over 0, 1, 2: the line is flat at 1/3, and explains nothing.
     x, bent = np.exp([0.0, 1.0, 2.0]), np.exp([0.0, 1.0, 0.0])
-    assert power_law_r2(x, bent) == pytest.approx(0.0, abs=1e-12)
+    assert fit_power_law(x, bent)[1] == pytest.approx(0.0, abs=1e-12)
     # Logarithms 0, 1, 1: the line 1/6 + x/2 leaves 1/6 of 2/3.
-    assert power_law_r2(x, -np.exp([0.0, 1.0, 1.0])) == pytest.approx(0.75)
-    assert np.isnan(power_law_r2(x, np.ones(3)))
+    assert fit_power_law(x, -np.exp([0.0, 1.0, 1.0]))[1] == pytest.approx(0.75)
+    assert np.isnan(fit_power_law(x, np.ones(3))[1])
 
 
 def test_laws_are_made_from_fits_that_came_to_their_end() -> None:
     library = ep.polynomial(["V", "m"], degree=1)
     results = [power_law(V, m) for V, m in ((200, 5), (300, 2), (300, 6), (400, 5))]
-    law = laws(results, library, max_terms=2)["free"]["L"]
-    assert len(law.terms) <= 2
+    law = fit_control_laws(results, library, max_terms=2)["free"]["L"]
+    assert len(law.functions) <= 2
     lost = [*results[:2], *(power_law(300, m, status="max_iter") for m in (7, 8))]
-    assert laws(lost, library) == {}
+    assert fit_control_laws(lost, library) == {}
     held = [power_law(300, m) for m in (2, 4, 6)]
-    assert laws(held, library) == {}
+    assert fit_control_laws(held, library) == {}
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from ep2sindy.refinement.law import LawRefinement, refine_law
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import LawMap
 from ep2sindy.refinement.problem import RefinementProblem as Problem
-from ep2sindy.refinement.weighted_law import information_of, weighted_law
+from ep2sindy.regression.pooled import Basis, invert_covariance, pool_coefficients
 from tests.models import model_of
 from tests.single_shooting import SingleShooting
 
@@ -63,7 +63,7 @@ def near(share: float = 0.1) -> list[ep.SparseModel]:
     ]
 
 
-def tied(
+def pooled(
     models: Sequence[ep.SparseModel],
     data: Sequence[Sequence[ep.Trajectory]],
     basis: np.ndarray = BASIS,
@@ -73,7 +73,7 @@ def tied(
 
 
 def test_exact_data_give_the_exact_law() -> None:
-    found = tied(near(), runs())
+    found = pooled(near(), runs())
     assert found.status == "converged"
     assert found.coefficients == tuple((s, t) for s, terms in TRUTH.items() for t in terms)
     # Rounding aside, rk4 at 0.1 of a time unit of one errs by h^4 / 120.
@@ -90,19 +90,19 @@ def test_a_saturated_basis_gives_what_separate_refinements_do() -> None:
     method = MultipleShooting(tolerance=1e-9)
     apart = ep.refine(near(), data, replace(SETTINGS, method=method), seed=0)
     for basis in (np.eye(6), np.random.default_rng(1).normal(size=(6, 6))):
-        found = tied(near(), data, basis, method=method)
+        found = pooled(near(), data, basis, method=method)
         for model, own in zip(found.models, apart, strict=True):
             np.testing.assert_allclose(model.coef, own.model.coef, rtol=1e-6, atol=1e-12)
         np.testing.assert_allclose(found.loss, [own.loss for own in apart], rtol=1e-6)
 
 
-def test_tying_never_lowers_the_loss() -> None:
+def test_pooling_never_lowers_the_loss() -> None:
     data = runs(0.02)
-    free, law = tied(near(), data, np.eye(6)), tied(near(), data)
+    free, law = pooled(near(), data, np.eye(6)), pooled(near(), data)
     assert free.loss.mean() < law.loss.mean() < 1.2 * free.loss.mean()
 
 
-def test_in_noise_a_tied_law_is_closer_to_the_truth_than_one_through_separate_fits() -> None:
+def test_in_noise_a_pooled_law_is_closer_to_the_truth_than_one_through_separate_fits() -> None:
     """One pulse leaves directions of a point free that the others fix."""
     data = runs(0.05)
     apart = ep.refine(near(), data, replace(SETTINGS, n_reweights=1), seed=0)
@@ -113,8 +113,8 @@ def test_in_noise_a_tied_law_is_closer_to_the_truth_than_one_through_separate_fi
     def missed(law: np.ndarray) -> float:
         return float(np.sqrt(np.square(BASIS @ law.T / truth - 1.0).mean()))
 
-    found = tied([each.model for each in apart], data)
-    assert missed(found.law) < 0.7 * missed(weighted_law(own, None, BASIS))
+    found = pooled([each.model for each in apart], data)
+    assert missed(found.law) < 0.7 * missed(pool_coefficients(own, None, Basis(BASIS)))
 
 
 def test_intervals_hold_the_truth() -> None:
@@ -135,14 +135,14 @@ def test_intervals_hold_the_truth() -> None:
 
 def test_units_change_nothing() -> None:
     data = runs(0.02)
-    found = tied(near(), data)
-    kilovolts = tied(near(), data, BASIS / np.array([1.0, 1e3, 1.0]))
+    found = pooled(near(), data)
+    kilovolts = pooled(near(), data, BASIS / np.array([1.0, 1e3, 1.0]))
     np.testing.assert_allclose(kilovolts.law, found.law * [1.0, 1e3, 1.0], rtol=1e-7)
     factor = 1e18
     larger = [[replace(run, states=run.states * factor) for run in at_point] for at_point in data]
     ones = np.full((1, 2), factor)
     rescaled = [replace(m, coef=m.coef * factor / m.library.evaluate(ones).T) for m in near()]
-    other = tied(rescaled, larger)
+    other = pooled(rescaled, larger)
     by_term = dict(zip(found.coefficients, found.law, strict=True))
     for (state, term), row in zip(other.coefficients, other.law, strict=True):
         degree = {"1": 0, "n_i*n_n": 2}.get(term, 1)
@@ -152,8 +152,10 @@ def test_units_change_nothing() -> None:
 def test_the_order_of_points_does_not_matter() -> None:
     data, method = runs(), MultipleShooting(tolerance=1e-9)
     order = [3, 0, 5, 1, 4, 2]
-    found = tied(near(), data, method=method)
-    other = tied([near()[k] for k in order], [data[k] for k in order], BASIS[order], method=method)
+    found = pooled(near(), data, method=method)
+    other = pooled(
+        [near()[k] for k in order], [data[k] for k in order], BASIS[order], method=method
+    )
     np.testing.assert_allclose(other.law, found.law, rtol=1e-5, atol=1e-9)
 
 
@@ -161,7 +163,7 @@ def test_relations_hold_at_every_point() -> None:
     library = truths()[0].library
     support = {state: tuple(terms) for state, terms in TRUTH.items()}
     relations = ep.constraint(library, support, ["n_i: n_i*n_n == -1 * n_n: n_i*n_n"])
-    found = tied(near(), runs(0.02), constraint=relations)
+    found = pooled(near(), runs(0.02), constraint=relations)
     assert len(found.coefficients) == 3
     assert found.law.shape == (3, 3)
     for model in found.models:
@@ -173,7 +175,7 @@ def test_relations_hold_at_every_point() -> None:
 
 def test_reweighting_and_fixed_starts_find_the_exact_law_too() -> None:
     for settings in ({"n_reweights": 1}, {"free_start": False}):
-        found = tied(near(0.05), runs(), **settings)
+        found = pooled(near(0.05), runs(), **settings)
         np.testing.assert_allclose(
             [m.coef for m in found.models], [m.coef for m in truths()], rtol=1e-5
         )
@@ -181,7 +183,7 @@ def test_reweighting_and_fixed_starts_find_the_exact_law_too() -> None:
 
 def test_what_does_not_stay_finite_comes_back_as_it_was() -> None:
     wild = [replace(m, coef=-30.0 * m.coef) for m in truths()]
-    found = tied(wild, runs(), method=MultipleShooting(first_memory=60, max_iter=1))
+    found = pooled(wild, runs(), method=MultipleShooting(first_memory=60, max_iter=1))
     assert found.status in ("non_finite", "max_iter", "flat")
     if found.status == "non_finite":
         assert found.covariance is None
@@ -204,15 +206,16 @@ def test_information_weighting_is_exact_for_linear_problems() -> None:
     rows = np.einsum("p,prk,pm->prkm", weight, A, basis).reshape(n_points * 20, -1)
     direct = np.linalg.lstsq(rows * np.kron(size, [1.0, 1.0]), (weight[:, None] * y).ravel())[0]
     expected = direct.reshape(n_coefs, 2) * size[:, None]
-    np.testing.assert_allclose(weighted_law(own, information, basis), expected, rtol=1e-9)
-    inverses = np.array([information_of(np.linalg.inv(each)) for each in information])
-    np.testing.assert_allclose(weighted_law(own, inverses, basis), expected, rtol=1e-7)
+    known = Basis(basis)
+    np.testing.assert_allclose(pool_coefficients(own, information, known), expected, rtol=1e-9)
+    inverses = np.array([invert_covariance(np.linalg.inv(each)) for each in information])
+    np.testing.assert_allclose(pool_coefficients(own, inverses, known), expected, rtol=1e-7)
 
 
 def test_an_information_of_one_direction_still_gives_a_law() -> None:
     information = np.zeros((3, 2, 2))
     information[:, 0, 0] = 1.0
-    law = weighted_law(np.ones((3, 2)), information, np.ones((3, 1)))
+    law = pool_coefficients(np.ones((3, 2)), information, Basis(np.ones((3, 1))))
     np.testing.assert_allclose(law, [[1.0], [0.0]], atol=1e-12)
 
 
@@ -231,9 +234,9 @@ def test_an_information_of_one_direction_still_gives_a_law() -> None:
         ),
     ],
 )
-def test_what_cannot_be_tied_says_why(change: Mapping[str, object], message: str) -> None:
+def test_what_cannot_be_pooled_says_why(change: Mapping[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        tied(**{"models": near(), "data": runs(), **change})
+        pooled(**{"models": near(), "data": runs(), **change})
 
 
 def problem_of(
@@ -249,10 +252,10 @@ def test_a_law_of_identities_is_no_law_to_rounding(free_start: bool) -> None:
     problem = replace(problem_of(near()[:1], runs(0.02)[:1]), free_start=free_start)
     method = MultipleShooting()
     free, (own,) = fit_and_judge(problem, method)
-    tied, (law,) = fit_and_judge(replace(problem, law=LawMap.identity(problem.n_free)), method)
+    pooled, (law,) = fit_and_judge(replace(problem, law=LawMap.identity(problem.n_free)), method)
     assert own.status == law.status == "converged"
-    np.testing.assert_allclose(tied.scaling, free.scaling, rtol=1e-12)
-    np.testing.assert_allclose(tied.nodes, free.nodes, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(pooled.scaling, free.scaling, rtol=1e-12)
+    np.testing.assert_allclose(pooled.nodes, free.nodes, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(law.covariance, own.covariance, rtol=1e-9)
     np.testing.assert_allclose(law.window_loss, own.window_loss, rtol=1e-10)
 
@@ -261,4 +264,4 @@ def test_records_of_unlike_length_need_as_many_windows() -> None:
     data = [list(at_point) for at_point in runs()]
     data[0] = [data[0][0].window(0, WINDOW + 1)]
     with pytest.raises(ValueError, match=r"as many windows: \[2, 4\] came"):
-        tied(near(), data)
+        pooled(near(), data)

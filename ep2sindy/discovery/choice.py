@@ -31,7 +31,7 @@ from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.combinations import cheapest_first, support_of
 from ep2sindy.selection.rule import Decision, OtherSystem, Selection
 
-# Most combinations, of the fronts that relations tie together, to look at for one with the terms.
+# Most combinations, of the fronts that relations join, to look at for one with the terms.
 MAX_COMBINATIONS = 100_000
 
 
@@ -42,6 +42,9 @@ MAX_CHI_SQUARED, STANDARD_ERRORS = 1.2, 3.0
 # Samples that are tested, and those of one block. More would say the same: the standard error of
 # chi-squared is 2 % then.
 MOST_TESTED, BLOCK = 20_000, 4_000
+
+# Steps of weighting and correction of a final fit.
+N_STEPS = 8
 
 SMALLEST = np.finfo(np.float64).tiny  # for exact fits, without residuals
 
@@ -136,7 +139,7 @@ def choose(
     """
     decision = rule.decide(fronts, task, progress=progress)
     if decision.model is not None:
-        return choice_of(fronts, decision, task.runs, provenance=provenance)
+        return choose_system(fronts, decision, task.runs, provenance=provenance)
     library, relations, units = fronts[0].rows.library, task.relations, task.runs[0].units
     scored = [front.with_scores(s) for front, s in zip(fronts, decision.scores, strict=True)]
     if relations:
@@ -157,7 +160,7 @@ def choose(
     return Choice(scored, best, model, left=left)
 
 
-def choice_of(
+def choose_system(
     fronts: Sequence[ParetoFront],
     decision: Decision,
     runs: Sequence[Trajectory],
@@ -170,12 +173,12 @@ def choice_of(
     model = replace(decision.model, units=runs[0].units, provenance=provenance)
     best = [front.best for front in scored]
     held = decision.constraint
-    is_tied = held is not None and len(held.free) < len(held.coefficients)
-    tied = held if is_tied else None
-    return Choice(scored, best, model, decision.note, constraint=tied, others=decision.others)
+    if held is not None and len(held.free) == len(held.coefficients):
+        held = None
+    return Choice(scored, best, model, decision.note, constraint=held, others=decision.others)
 
 
-def noise_test(
+def judge_noise(
     choice: Choice, runs: Sequence[Trajectory], *, estimate: Estimate | None = None
 ) -> NoiseTest:
     """Test the residuals of the chosen model against the noise of the samples.
@@ -194,12 +197,12 @@ def noise_test(
     runs = runs if estimate is None else estimate.runs  # with hidden states
     states, tested = choice.model.states, choice.left or {}
     unknown = [state for state in states if state not in tested]
-    found = {**tested, **(_left_of_weak_rows(choice, runs, unknown) if unknown else {})}
+    found = {**tested, **(_test_on_weak_rows(choice, runs, unknown) if unknown else {})}
     ordered = {state: found[state] for state in states if state in found}
-    return NoiseTest(ordered, _misfit(ordered, choice.n_free), tested=bool(ordered))
+    return NoiseTest(ordered, _describe_misfit(ordered, choice.n_free), tested=bool(ordered))
 
 
-def _left_of_weak_rows(
+def _test_on_weak_rows(
     choice: Choice, runs: Sequence[Trajectory], states: Sequence[str]
 ) -> dict[str, LeftOver]:
     """Residuals of some equations on weak rows, as far as their rows can be made and whitened."""
@@ -218,9 +221,9 @@ def _left_of_weak_rows(
         problem, fit = problems[state], _fit_in(model, state)
         with suppress(ValueError, np.linalg.LinAlgError):
             if state in choice.n_free:
-                left[state] = _left_of_fit(problem, fit, n_free=choice.n_free[state])
+                left[state] = _test_fit(problem, fit, n_free=choice.n_free[state])
             else:
-                left[state] = _left_of_terms(problem, fit)
+                left[state] = _test_terms(problem, fit)
     return left
 
 
@@ -240,7 +243,7 @@ def _count_free(held: Constraint, relations: Sequence[Relation]) -> dict[str, in
     }
 
 
-def _misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> str:
+def _describe_misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> str:
     """Sentence on the equations whose residuals exceed the noise; empty if there are none.
 
     related: states whose coefficients obey relations.
@@ -287,15 +290,13 @@ def assemble_model(
     )
 
 
-def reweight(
-    problem: RegressionRows, candidate: Candidate | EquationFit, *, n_steps: int = 8
-) -> EquationFit:
+def reweight(problem: RegressionRows, candidate: Candidate | EquationFit) -> EquationFit:
     """Fit a candidate's terms again, with weights and corrected samples, and test the residuals.
 
     If the residuals exceed the noise of the rows there is no covariance: intervals would not cover
     the truth.
     """
-    theta, target, scale = _whitened_terms(problem, candidate, n_steps=n_steps)
+    theta, target, scale = whiten_terms(problem, candidate)
     fit = LeastSquares.of_rows(theta, target)
     root = fit.root * scale[:, None]
     left = _compare_with_noise(target - theta @ fit.coef, n_free=len(scale))
@@ -308,42 +309,46 @@ def reweight(
     )
 
 
-def _left_of_terms(problem: RegressionRows, fit: EquationFit) -> LeftOver:
+def whiten_terms(
+    problem: RegressionRows,
+    candidate: Candidate | EquationFit,
+    *,
+    terms: Sequence[str] | None = None,
+    negligible: float = 0.0,
+) -> tuple[
+    Float[np.ndarray, "rows terms"], Float[np.ndarray, " rows"], Float[np.ndarray, " terms"]
+]:
+    """Columns and target of rows of variance 1 under a candidate, and the coefficients' scales.
+
+    terms: whose columns are wanted, at least the candidate's; None for just these.
+    """
+    names = candidate.terms if terms is None else tuple(terms)
+    order = [problem.library.index(name) for name in names]
+    scale = problem.coef_scale(0)
+    own, coef = np.isin(problem.term_names, candidate.terms), np.zeros(len(scale))
+    places = [problem.library.index(name) for name in candidate.terms]
+    coef[places] = candidate.coef / scale[places]
+    kept = np.isin(problem.term_names, names)
+    rows = whiten_rows(problem, own, coef, n_steps=N_STEPS, negligible=negligible, kept=kept)
+    return rows.theta[:, order], rows.target, scale[order]
+
+
+def _test_terms(problem: RegressionRows, fit: EquationFit) -> LeftOver:
     """Residuals of a fit's terms, fitted again with weights as by `reweight`."""
-    theta, target, _ = _whitened_terms(problem, fit, negligible=NEGLIGIBLE)
+    theta, target, _ = whiten_terms(problem, fit, negligible=NEGLIGIBLE)
     fitted = LeastSquares.of_rows(theta, target).coef
     return _compare_with_noise(target - theta @ fitted, n_free=len(fitted))
 
 
-def _left_of_fit(problem: RegressionRows, fit: EquationFit, *, n_free: int) -> LeftOver:
+def _test_fit(problem: RegressionRows, fit: EquationFit, *, n_free: int) -> LeftOver:
     """Residuals of a fit with its own coefficients, whitened about a free fit of its terms.
 
     The free fit is as close to the data as these terms allow, so the samples are corrected by it,
     not by coefficients that the data may contradict. n_free: number of free coefficients.
     """
     free = fit_support(problem, fit.equation, fit.terms)
-    theta, target, scale = _whitened_terms(problem, free, negligible=NEGLIGIBLE)
-    order = [fit.terms.index(name) for name in free.terms]
-    return _compare_with_noise(target - theta @ (fit.coef[order] / scale), n_free=n_free)
-
-
-def _whitened_terms(
-    problem: RegressionRows,
-    candidate: Candidate | EquationFit,
-    *,
-    n_steps: int = 8,
-    negligible: float = 0.0,
-) -> tuple[
-    Float[np.ndarray, "rows terms"], Float[np.ndarray, " rows"], Float[np.ndarray, " terms"]
-]:
-    """Whitened columns of a candidate's terms, the whitened target, and coefficients' scales."""
-    terms = np.isin(problem.term_names, candidate.terms)
-    scale = problem.coef_scale(0)
-    coef = np.zeros(len(terms))
-    order = [problem.library.index(name) for name in candidate.terms]
-    coef[order] = candidate.coef / scale[order]
-    rows = whiten_rows(problem, terms, coef, n_steps=n_steps, negligible=negligible, kept=terms)
-    return rows.theta[:, order], rows.target, scale[order]
+    theta, target, scale = whiten_terms(problem, free, terms=fit.terms, negligible=NEGLIGIBLE)
+    return _compare_with_noise(target - theta @ (fit.coef / scale), n_free=n_free)
 
 
 def _compare_with_noise(left: Float[np.ndarray, " rows"], *, n_free: int) -> LeftOver:
@@ -364,9 +369,9 @@ def _least_sum(
     one by one.
     """
     place = np.array([int(np.argmin(front.scores)) for front in fronts])
-    for states in _tied_states(relations):
-        tied = [k for k, front in enumerate(fronts) if front.equation in states]
-        some = [fronts[k] for k in tied]
+    for states in _related_states(relations):
+        related = [k for k, front in enumerate(fronts) if front.equation in states]
+        some = [fronts[k] for k in related]
         own = [r for r in relations if any(state in states for _, state, _ in r.factors)]
         scores = [front.scores for front in some]
         best = next(cheapest_first(some, scores, own, most_tried=MAX_COMBINATIONS), None)
@@ -376,17 +381,17 @@ def _least_sum(
                 f"{MAX_COMBINATIONS} combinations of candidates has; raise the search's "
                 "max_terms, or depth, or let the relations tie fewer states to each other"
             )
-        place[tied] = best
+        place[related] = best
     return place
 
 
-def _tied_states(relations: Sequence[Relation]) -> list[set[str]]:
+def _related_states(relations: Sequence[Relation]) -> list[set[str]]:
     """Sets of states that relations tie to each other, directly or through a third state."""
     sets: list[set[str]] = []
     for relation in relations:
-        tied = {state for _, state, _ in relation.factors}
-        tied = tied.union(*(other for other in sets if other & tied))
-        sets = [other for other in sets if not other & tied] + [tied]
+        related = {state for _, state, _ in relation.factors}
+        related = related.union(*(other for other in sets if other & related))
+        sets = [other for other in sets if not other & related] + [related]
     return sets
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import noise_test
+from ep2sindy.discovery.choice import judge_noise
 from ep2sindy.discovery.method import (
     DiscoveryMethod,
     IdentifiedEquations,
@@ -76,7 +76,7 @@ def _discovery(
     found: IdentifiedEquations, method: DiscoveryMethod, runs: Sequence[Trajectory]
 ) -> Discovery:
     choice = found.choice
-    test = noise_test(choice, runs, estimate=found.estimate)
+    test = judge_noise(choice, runs, estimate=found.estimate)
     # Intervals of a model that does not explain the data would not cover the truth.
     model = replace(choice.model, clock=runs[0].clock)
     return Discovery(

@@ -19,7 +19,7 @@ from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import Choice, choice_of, choose
+from ep2sindy.discovery.choice import Choice, choose, choose_system
 from ep2sindy.estimation.cost import check_limit_s
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
@@ -168,7 +168,7 @@ class TrajectorySearch:
         fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
         decision = self.selection.decide(fronts, task, progress=progress)
         if decision.model is not None:
-            choice = choice_of(fronts, decision, task.runs, provenance=found.model.provenance)
+            choice = choose_system(fronts, decision, task.runs, provenance=found.model.provenance)
             return replace(choice, model=replace(choice.model, courses=found.model.courses))
         scored = [front.with_scores(s) for front, s in zip(fronts, decision.scores, strict=True)]
         best = [front.best for front in scored]
@@ -332,7 +332,7 @@ class Regression:
         systems = search_conserving_systems(problems, task, roles, self.search, depth=self.depth)
         decision = self.selection.judge(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)
-        choice = choice_of(systems.fronts, decision, task.runs, provenance=provenance)
+        choice = choose_system(systems.fronts, decision, task.runs, provenance=provenance)
         found = [each for rows in problems for each in (*few_rows(rows), *ambiguities(rows))]
         return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(task.runs))
 

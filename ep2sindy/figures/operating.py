@@ -41,7 +41,7 @@ from ep2sindy.figures.style import (
 from ep2sindy.library.equations import latex_derivative, latex_name, latex_term_name
 from ep2sindy.library.units import unit_product, with_prefix
 from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.operating.quantity_law import ControlLaw
+from ep2sindy.operating.quantities import ControlLaw
 
 FAR_PERCENT, FAR_WAVEFORM = 40.0, 0.6  # beyond: filled marks on the edge
 
@@ -379,7 +379,7 @@ def trends_figure(
             x = here[along].astype(float)
             _draw_kinds(ax, rows_at(here, {"quantity": quantity}), along, colours, np.ptp(x))
             if quantity in laws and np.ptp(x):
-                line, points = sample_line(x, along, at, laws[quantity].library.variables)
+                line, points = sample_line(x, along, at, laws[quantity].functions.variables)
                 colour = next(iter(colours.values()))
                 ax.plot(line, laws[quantity].predict(points), color=colour, lw=1.2, zorder=1)
             ax.set_xticks(np.unique(x), [f"{value:g}" for value in np.unique(x)])

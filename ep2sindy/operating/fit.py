@@ -10,24 +10,30 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.library.relations import Constraint, Relation
+from ep2sindy.library.relations import Relation
 from ep2sindy.model.comparison import FreeRunBounds, Verdict, deviation
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.constraint import NOTHING, Known, LawConstraint, law_constraint
-from ep2sindy.operating.law import OperatingLaw, in_hull, law_basis
+from ep2sindy.operating.law import (
+    NOTHING,
+    Known,
+    LawConstraint,
+    OperatingLaw,
+    constrain_law,
+    make_basis,
+    read_coefficients,
+)
 from ep2sindy.operating.records import (
     OperatingRecord,
     check_records,
-    values_of,
+    read_points,
 )
 from ep2sindy.refinement.law import LawRefinement, refine_law
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine
-from ep2sindy.refinement.weighted_law import information_of, weighted_law
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.pooled import invert_covariance, pool_coefficients
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import Progress, as_progress
@@ -42,7 +48,7 @@ Structure = Mapping[str, Sequence[str]]
 SETTINGS = RefinementSettings(n_windows=20, periods=2.0, n_reweights=0)
 
 
-def in_samples(
+def set_window(
     settings: RefinementSettings, records: Sequence[OperatingRecord]
 ) -> RefinementSettings:
     """Settings for the records of one law: windows have the same number of samples in all of them.
@@ -62,6 +68,10 @@ def in_samples(
 class OperatingFit:
     """Records of one branch, each refined on its own with the same terms, as input for laws.
 
+    A law W of the free coefficients z(p) = W f(p) is fitted to these refinements (`fit_law`: the
+    least sum over the records of d_p^T I_p d_p, with d_p = W f(p) - z_p and I_p the information),
+    or to all trajectories at once (`refine_law`).
+    Assumes that one law holds for all records: they are on one cycle.
     structure: state -> terms. relations: those of the coefficients, and known coefficients. fits:
     one per record.
     """
@@ -76,24 +86,27 @@ class OperatingFit:
     @property
     def n_free(self) -> int:
         """Number of coefficients that the relations leave free."""
-        return self.relations.n_free
+        return len(self.relations.common.free)
 
     @cached_property
     def coefficients(self) -> Float[np.ndarray, "records free"]:
         """The free coefficients of each record."""
-        return np.array([_values(fit.model) for fit in self.fits])[:, self.relations.common.free]
+        common = self.relations.common
+        return np.array([read_coefficients(fit.model, common) for fit in self.fits])[:, common.free]
 
     @cached_property
     def information(self) -> Float[np.ndarray, "records free free"]:
         """Information matrix of each record's free coefficients; zero if its refinement failed."""
-        nothing = np.zeros((self.n_free, self.n_free))
-        free = np.ix_(self.relations.common.free, self.relations.common.free)
-        return np.stack(
-            [
-                nothing if f.covariance_naive is None else information_of(f.covariance_naive[free])
-                for f in self.fits
-            ]
-        )
+        free = self.relations.common.free
+        found = np.zeros((len(self.fits), len(free), len(free)))
+        for own, fit in zip(found, self.fits, strict=True):
+            if fit.covariance_naive is not None:
+                own[:] = invert_covariance(fit.covariance_naive[np.ix_(free, free)])
+        return found
+
+    @property
+    def points(self) -> Float[np.ndarray, "records parameters"]:
+        return read_points(self.records)
 
     def without(self, number: int) -> OperatingFit:
         others = [k for k in range(len(self.records)) if k != number]
@@ -103,78 +116,65 @@ class OperatingFit:
             fits=[self.fits[k] for k in others],
         )
 
-    def basis(self, functions: Library) -> Float[np.ndarray, "records functions"]:
-        return functions.evaluate(values_of(self.records))
-
     def functions(self, degree: int) -> Library:
         """Polynomials of the parameters. Raises ValueError if the records do not suffice."""
         found = polynomial(list(self.records[0].parameters), degree=degree)
-        law_basis(found, values_of(self.records))
+        make_basis(found, self.points)
         return found
 
-    def weighted(self, functions: Library) -> OperatingLaw:
-        """The law fitted to the separate refinements, each weighted by its information."""
-        return self._law(functions, self._weighted(functions), None, "weighted")
+    def fit_law(self, functions: Library) -> OperatingLaw:
+        """The law closest to the separate refinements, each weighted by its information."""
+        return self._make_law(functions, self._pool(functions), None, "weighted")
 
-    def _weighted(self, functions: Library) -> Float[np.ndarray, "free functions"]:
-        return weighted_law(self.coefficients, self.information, self.basis(functions))
-
-    def tied(
+    def refine_law(
         self,
         functions: Library,
         *,
         start: OperatingLaw | None = None,
         progress: Progress | bool = False,
     ) -> tuple[OperatingLaw, LawRefinement]:
-        """The law refined over all records at once, with intervals.
+        """The law refined over the trajectories of all records at once, with intervals.
 
         start: a law close to the result, which shortens the refinement. None starts from the
-        weighted law, with all stages.
+        law of `fit_law`, with all stages.
         """
-        free = self.relations.common.free
-        # Functions beyond these stand in known coefficients alone.
-        near = self._weighted(functions) if start is None else start.coef[free, : len(functions)]
-        settings = in_samples(self.settings, self.records)
-        if start is not None and settings.window is not None:
-            method = settings.method or MultipleShooting()
-            if isinstance(method, MultipleShooting):  # refine_law says that no other will do
-                method = replace(method, first_memory=settings.window, tolerance=1e-4)
-            settings = replace(settings, method=method)
+        settings = set_window(self.settings, self.records)
+        if start is None:
+            near = self._pool(functions)
+        else:
+            # Functions beyond these stand in known coefficients alone.
+            near = start.coef[self.relations.common.free, : len(functions)]
+            settings = _shorten(settings)
         found = refine_law(
             [fit.model for fit in self.fits],
             [[record.run] for record in self.records],
-            self.basis(functions),
+            functions.evaluate(self.points),
             settings,
-            constraints=self.relations.at(values_of(self.records)),
+            constraints=self.relations.at(self.points),
             start=near,
             seed=self.seed,
             progress=progress,
         )
-        return self._law(functions, found.law, found.covariance, "tied"), found
+        return self._make_law(functions, found.law, found.covariance, "refined"), found
 
-    def _law(
-        self,
-        functions: Library,
-        free: Float[np.ndarray, "free functions"],
-        covariance: Float[np.ndarray, "_ _"] | None,
-        how: str,
+    def _pool(self, functions: Library) -> Float[np.ndarray, "free functions"]:
+        basis = make_basis(functions, self.points)
+        return pool_coefficients(self.coefficients, self.information, basis)
+
+    def _make_law(
+        self, functions: Library, free: np.ndarray, covariance: np.ndarray | None, how: str
     ) -> OperatingLaw:
-        model = self.fits[0].model
-        functions, law, covariance = self.relations.law(functions, free, covariance)
-        provenance = {"law": f"{how}, {len(self.records)} points"}
-        if self.relations.texts:
-            provenance["exact"] = "; ".join(self.relations.texts)
-        return OperatingLaw(
-            functions=functions,
-            library=model.library,
-            states=tuple(model.states),
-            coefficients=self.relations.common.coefficients,
-            coef=law,
-            points=values_of(self.records),
-            covariance=covariance,
-            units=model.units,
-            provenance=provenance,
-        )
+        model, points = self.fits[0].model, self.points
+        return self.relations.make_law(model, functions, points, free, covariance, how)
+
+
+def _shorten(settings: RefinementSettings) -> RefinementSettings:
+    """Settings for a start close to the result: the first stage remembers the whole window."""
+    method = settings.method or MultipleShooting()
+    if settings.window is None or not isinstance(method, MultipleShooting):
+        return settings  # refine_law says that no other method will do
+    near = replace(method, first_memory=settings.window, tolerance=1e-4)
+    return replace(settings, method=near)
 
 
 def operating_fit(
@@ -209,36 +209,17 @@ def operating_fit(
     if set(structure) != set(states):
         raise ValueError(f"a structure must have terms for each of {states}: {structure} came")
     whole = {state: list(structure[state]) for state in states}
-    held = law_constraint(library, whole, relations, known, parameters=list(records[0].parameters))
-    at = held.at(values_of(records))
+    held = constrain_law(library, whole, relations, known, parameters=list(records[0].parameters))
+    at = held.at(read_points(records))
     rows = Differential(split=RandomSplit(test_fraction=0.0))
     starts = []
     for record, own in zip(records, at, strict=True):
         problems = rows.assemble([record.run], library, rng=np.random.default_rng(seed))
         starts.append(constrained_fit(problems, own, units=record.run.units))
-    fits = _refine_each(starts, records, at, in_samples(settings, records), seed, progress)
-    return OperatingFit(records, whole, held, fits, settings, seed)
-
-
-def _refine_each(
-    models: Sequence[SparseModel],
-    records: Sequence[OperatingRecord],
-    relations: Sequence[Constraint],
-    settings: RefinementSettings,
-    seed: int,
-    progress: Progress | bool,
-) -> list[Refinement]:
-    """Refine every record with its own relations, all in one batch where these are the same."""
     runs = [[record.run] for record in records]
-    if not any(own.d.any() for own in relations):
-        common = replace(settings, constraint=relations[0])
-        return refine(models, runs, common, seed=seed, progress=progress)
-    rng = np.random.default_rng(seed)
-    each = zip(models, runs, relations, strict=True)
-    return [
-        refine(model, run, replace(settings, constraint=own), seed=rng, progress=progress)
-        for model, run, own in each
-    ]
+    how = set_window(settings, records)
+    fits = refine(starts, runs, how, constraints=at, seed=seed, progress=progress)
+    return OperatingFit(records, whole, held, fits, settings, seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,14 +280,14 @@ def leave_one_out(
     workers: Workers | None = None,
     progress: Progress | bool = False,
 ) -> list[LeaveOneOut]:
-    """Test each point in turn with the law of the others: weighted, or tied if `start` is given.
+    """Test each point in turn with the law of the others, run freely.
 
-    start: the law that the tied laws start from.
+    start: a law from which that of the others is refined (`refine_law`); None takes `fit_law`.
     Raises ValueError if the points without one do not suffice for the law.
     """
     for k, record in enumerate(fit.records):
         try:
-            law_basis(functions, values_of(fit.without(k).records))
+            make_basis(functions, fit.without(k).points)
         except ValueError as error:
             raise ValueError(f"{record.label} cannot be left out: {error}") from error
     one = partial(_leave_out, fit=fit, functions=functions, start=start)
@@ -319,11 +300,10 @@ def _leave_out(
     number: int, *, fit: OperatingFit, functions: Library, start: OperatingLaw | None
 ) -> LeaveOneOut:
     record, others = fit.records[number], fit.without(number)
-    law = others.weighted(functions) if start is None else others.tied(functions, start=start)[0]
+    if start is None:
+        law = others.fit_law(functions)
+    else:
+        law, _ = others.refine_law(functions, start=start)
     model = law.model_at(record.parameters, extrapolate=True)
-    at = values_of([record])[0]
-    return LeaveOneOut(record, free_run(model, record.from_slowest), in_hull(law.points, at))
-
-
-def _values(model: SparseModel) -> list[float]:
-    return [value for state in model.states for value in model.terms(state).values()]
+    run = free_run(model, record.from_slowest)
+    return LeaveOneOut(record, run, law.is_inside(record.parameters))

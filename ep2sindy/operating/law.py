@@ -1,54 +1,64 @@
-"""A model whose coefficients are functions of the operating point, and its fit to all rows."""
+"""The law of the operating point: a model whose coefficients are functions of the point.
+
+Relations between the coefficients, and coefficients that are known at every point, hold in it.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import block_diag
 from scipy.optimize import nnls
 from scipy.special import ndtri
-from scipy.stats import f as f_distribution
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.model.scores import r2
+from ep2sindy.library.relations import Constraint, Relation, constraint, relations_of
+from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
-from ep2sindy.operating.records import check_varying, point_label
-from ep2sindy.operating.shared_support import SharedDiscovery, SharedFront
-from ep2sindy.refinement.weighted_law import Basis
-from ep2sindy.regression.front import ParetoFront
-from ep2sindy.regression.least_squares import LeastSquares
-from ep2sindy.regression.whitening import whiten_rows
+from ep2sindy.operating.records import check_varying, point_label, read_point
+from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import words_of
 from ep2sindy.runtime.values import read_only
-from ep2sindy.selection.criteria import FLOOR
 
 FORMAT = "ep2sindy.OperatingLaw/1"
 
-# Steps of weighting and correction of the final fit, as in `reweight`.
-N_STEPS = 8
+# State -> term -> function of the parameters -> its factor, as in `OperatingLaw.numbers`.
+Known = Mapping[str, Mapping[str, Mapping[str, float]]]
+NOTHING: Known = MappingProxyType({})
 
 INSIDE = 1e-6  # tolerance of the hull, in ranges of the parameters
 
 
 @dataclass(frozen=True, eq=False)
 class OperatingLaw:
-    """One structure, coefficients by a law: coef[k] at a point = coef[k] @ functions(parameters).
+    """One structure whose coefficients are functions of the operating point p: c(p) = W f(p).
 
+    It is fitted by rows of all points (`fit_law`: minimises the sum over p of |theta_p W f(p) -
+    x'_p|^2), by coefficients that were refined at each point (`OperatingFit.fit_law`), or by the
+    trajectories of all points (`refine_law`). Under relations c(p) = C W f(p) + D g(p), with C and
+    D of a `LawConstraint`; `coef` holds the whole, by the functions f and g.
+    Assumes that the same terms act at every point, and coefficients smooth enough for f.
     functions: of the parameters. library: of the states. coefficients: (state, term) of each row of
     coef, in SI. covariance: of coef.ravel(), None if unknown. points: the operating points of the
     fit, columns in the order of the functions' variables.
+    Source: Rudy et al. 2019, doi:10.1137/18M1191944, for coefficients that depend on a parameter.
+
+    >>> functions, library = ep.polynomial(["a"], degree=1), ep.polynomial(["x"], degree=1)
+    >>> pairs, points = (("x", "x"),), np.array([[0.0], [2.0]])
+    >>> coef = np.array([[0.0, -1.0]])  # x' = -a x
+    >>> law = ep.operating.OperatingLaw(functions, library, ("x",), pairs, coef, points)
+    >>> law.model_at({"a": 0.5}).text()
+    "x' = -0.5 x"
     """
 
     functions: Library
@@ -113,28 +123,32 @@ class OperatingLaw:
         Raises ValueError unless `parameters` has a finite value for each parameter of the law. Also
         raises ValueError outside the convex hull of the fitted points, unless extrapolate=True.
         """
-        values = self._values(parameters)
-        if not extrapolate and not self._holds(values):
+        values = read_point(self.parameters, parameters)
+        if not extrapolate and not in_hull(self.points, values):
+            ends = self.points.min(axis=0), self.points.max(axis=0)
+            ranges = zip(self.parameters, *ends, strict=True)
             raise ValueError(
                 f"{point_label(parameters)} lies outside the points that this law was fitted to, "
-                f"{self._ranges()}: pass extrapolate=True to read it off the law all the same"
+                f"{', '.join(f'{name} {low:g} to {high:g}' for name, low, high in ranges)}: pass "
+                "extrapolate=True to read it off the law all the same"
             )
         functions = self.functions.evaluate(values[None])[0]
+        at_point = self.coef @ functions
+        rows = [self.library.index(term) for _, term in self.coefficients]
+        columns = [self.states.index(state) for state, _ in self.coefficients]
         coef, covariance = np.zeros((len(self.library), len(self.states))), None
-        places = [(self.library.index(term), self.states.index(s)) for s, term in self.coefficients]
-        for place, value in zip(places, self.coef @ functions, strict=True):
-            coef[place] = value
+        coef[rows, columns] = at_point
         if self.covariance is not None:
-            spread = np.kron(np.eye(len(self.coefficients)), functions)
-            by_state = sorted(range(len(places)), key=lambda k: (places[k][1], places[k][0]))
-            order = [k for k in by_state if coef[places[k]] != 0.0]
-            covariance = (spread @ self.covariance @ spread.T)[np.ix_(order, order)]
+            order = np.lexsort([rows, columns])
+            used = order[at_point[order] != 0.0]
+            spread = np.kron(np.eye(len(at_point)), functions)[used]
+            covariance = spread @ self.covariance @ spread.T
         provenance = {**self.provenance, "point": point_label(parameters)}
         return SparseModel(self.library, self.states, coef, self.units, provenance, covariance)
 
     def is_inside(self, parameters: Mapping[str, float]) -> bool:
         """True if a point lies in the convex hull of the fitted points."""
-        return self._holds(self._values(parameters))
+        return in_hull(self.points, read_point(self.parameters, parameters))
 
     def intervals(self, *, level: float = 0.95) -> dict[tuple[str, str], dict[str, Any]]:
         """(state, term) -> function -> lower and upper bound of its factor, for Gaussian errors.
@@ -142,17 +156,15 @@ class OperatingLaw:
         Raises ValueError for a law without covariance.
         """
         if self.covariance is None:
-            raise ValueError("intervals need a covariance: this law has none; fit it tied")
+            raise ValueError(
+                "intervals need a covariance: this law has none; refine it over all trajectories"
+            )
         std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(self.coef.shape)
         reach = ndtri(0.5 + 0.5 * level) * std
+        ends = np.stack([self.coef - reach, self.coef + reach], axis=-1).tolist()
         return {
-            pair: {
-                name: (low, high)
-                for name, low, high in zip(
-                    self.functions.names, (row - r).tolist(), (row + r).tolist(), strict=True
-                )
-            }
-            for pair, row, r in zip(self.coefficients, self.coef, reach, strict=True)
+            pair: {name: (*each,) for name, each in zip(self.functions.names, row, strict=True)}
+            for pair, row in zip(self.coefficients, ends, strict=True)
         }
 
     def text(self, *, digits: int = 3) -> str:
@@ -225,24 +237,6 @@ class OperatingLaw:
     def load(path: str | Path) -> OperatingLaw:
         return read_stored(Path(path), OperatingLaw.from_json)
 
-    def _values(self, parameters: Mapping[str, float]) -> Float[np.ndarray, " parameters"]:
-        names = list(self.parameters)
-        if set(parameters) != set(names):
-            raise ValueError(
-                f"an operating point must have {names}, and no other: {dict(parameters)} came"
-            )
-        values = np.array([float(parameters[name]) for name in names])
-        if not np.isfinite(values).all():
-            raise ValueError(f"an operating point must be finite: {dict(parameters)} came")
-        return values
-
-    def _holds(self, values: Float[np.ndarray, " parameters"]) -> bool:
-        return in_hull(self.points, values)
-
-    def _ranges(self) -> str:
-        ends = zip(self.parameters, self.points.min(axis=0), self.points.max(axis=0), strict=True)
-        return ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in ends)
-
 
 def in_hull(
     points: Float[np.ndarray, "points parameters"], value: Float[np.ndarray, " parameters"]
@@ -254,7 +248,7 @@ def in_hull(
     return float(nnls(columns, target)[1]) <= INSIDE
 
 
-def law_basis(
+def make_basis(
     functions: Library,
     points: Float[np.ndarray, "points parameters"],
     *,
@@ -280,172 +274,135 @@ def law_basis(
 
 
 @dataclass(frozen=True, eq=False)
-class LawTest:
-    """Test whether the coefficients of one equation follow a law.
+class LawConstraint:
+    """Relations that hold at every operating point p: c(p) = C z(p) + D g(p), in SI.
 
-    r2_free, r2_tied: for each point, R2 on its training rows with its own coefficients and with
-    those of the law. F: growth of the residual squares per coefficient given up, in variances of a
-    row. p_value: probability of a larger F if the law holds, for rows with independent Gaussian
-    errors. F and p_value are NaN if the law gives up no coefficient.
+    With a law z(p) = W f(p) of the free coefficients, the factors of W obey c(p) = C_p W.ravel() +
+    d_p: a constraint whose C_p = kron(C, f(p)) and d_p = D g(p) depend on the point.
+
+    common: names of the coefficients, the free ones z, and C; its d is zero. functions: g, of the
+    parameters. D: the known part of every coefficient. texts: the relations, one text for each.
     """
 
-    r2_free: Mapping[str, float]
-    r2_tied: Mapping[str, float]
-    F: float
-    p_value: float
+    common: Constraint
+    functions: Library
+    D: Float[np.ndarray, "coefs functions"]
+    texts: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "D", read_only(self.D))
+        assert self.D.shape == (len(self.common.coefficients), len(self.functions))
+
+    def at(self, points: Float[np.ndarray, "points parameters"]) -> list[Constraint]:
+        """The relations at each point, with the values that known coefficients have there.
+
+        Raises ValueError for a point at which one of these is zero or not finite.
+        """
+        d = self.functions.evaluate(points) @ self.D.T
+        known = d[:, ~self.common.C.any(axis=1)]
+        for point, values in zip(points.tolist(), known, strict=True):
+            if not (np.isfinite(values) & (values != 0.0)).all():
+                where = dict(zip(self.functions.variables, point, strict=True))
+                raise ValueError(
+                    "known coefficients must be finite and not zero at every operating point: "
+                    f"{values.tolist()} came at {where}; leave the term or the point out"
+                )
+        return [replace(self.common, d=values) for values in d]
+
+    def make_law(
+        self,
+        model: SparseModel,
+        functions: Library,
+        points: Float[np.ndarray, "points parameters"],
+        free: Float[np.ndarray, "free functions"],
+        covariance: Float[np.ndarray, "_ _"] | None,
+        how: str,
+    ) -> OperatingLaw:
+        """The law of all coefficients from that of the free ones, which obeys the relations.
+
+        model: at one of the points, for its library, states and units. covariance: of free.ravel();
+        known coefficients get none. how: the fit, for the provenance.
+        """
+        # Known coefficients may be expressed in further functions, which follow the given ones.
+        used = np.flatnonzero(self.D.any(axis=0))
+        joined = functions + self.functions.take(used) if used.size else functions
+        spread = np.kron(self.common.C, np.eye(len(joined), len(functions)))
+        coef = (spread @ free.ravel()).reshape(-1, len(joined))
+        coef[:, [joined.index(self.functions.names[k]) for k in used]] += self.D[:, used]
+        provenance = {"law": f"{how}, {len(points)} points"}
+        if self.texts:
+            provenance["exact"] = "; ".join(self.texts)
+        return OperatingLaw(
+            functions=joined,
+            library=model.library,
+            states=self.common.states,
+            coefficients=self.common.coefficients,
+            coef=coef,
+            points=points,
+            covariance=None if covariance is None else spread @ covariance @ spread.T,
+            units=model.units,
+            provenance=provenance,
+        )
 
 
-@dataclass(frozen=True, eq=False)
-class LawFit:
-    """A law fitted to the rows of all points, and for each state the test whether it holds."""
+def constrain_law(
+    library: Library,
+    structure: Mapping[str, Sequence[str]],
+    relations: Sequence[Relation | str] = (),
+    known: Known = NOTHING,
+    *,
+    parameters: Sequence[str],
+) -> LawConstraint:
+    """Eliminate one coefficient of the structure per relation and per known coefficient.
 
-    law: OperatingLaw
-    tests: Mapping[str, LawTest]
-
-
-def fit_law(
-    shared: SharedDiscovery, functions: Library, *, parameters: Mapping[str, Mapping[str, float]]
-) -> LawFit:
-    """Refit the chosen supports to all points at once, with coefficients tied by a law.
-
-    coef_j(point) = sum_m coef_jm f_m(parameters of the point): one least-squares problem per
-    equation with columns theta_j f_m. Rows are weighted by their covariance if it is known, and
-    every point by the residual variance of its free fit, so that neither the units nor the noise of
-    one point dominate. Compare `r2_tied` to `r2_free` and see F: a law that does not hold lowers R2
-    at the points that depart from it. Rows that are not independent (`Differential`) make F too
-    large.
-    functions: of the parameters. parameters: point -> {variable of the law: value}, in any units.
-    Raises ValueError for points or variables that are missing or unknown, and for points that
-    cannot tell the functions apart.
+    relations: as for `constraint`. known: coefficients as sums of functions of the parameters, in
+    SI, such as `{"n_n": {"1": {"mdot_mg_s": 4.6e22}}}` for an inflow of neutrals.
+    Raises ValueError for relations that `constraint` refuses, for a function that is not of the
+    parameters or has no finite factor, or if no coefficient is left free.
     """
-    names = list(shared.models)
-    if set(parameters) != set(names):
+    given = relations_of(relations)
+    functions = named_terms(list(parameters), ["1"])
+    told = {}
+    for state, terms in known.items():
+        for term, factors in terms.items():
+            own = _known_functions(parameters, f"{state}: {term}", factors)
+            functions = functions + own
+            told[state, str(term)] = dict(zip(own.names, factors.values(), strict=True))
+    columns = []
+    for name in functions.names:
+        # Relations are linear in their values: one function of the parameters at a time.
+        values = [replace(r, value=r.value if name == "1" else 0.0) for r in given]
+        values += [
+            Relation(((1.0, state, term),), factors.get(name, 0.0), _text(state, term, factors))
+            for (state, term), factors in told.items()
+        ]
+        columns.append(constraint(library, structure, values))
+    common = replace(columns[0], d=np.zeros(len(columns[0].d)))
+    texts = [r.text for r in given] + [_text(*pair, factors) for pair, factors in told.items()]
+    if texts and not len(common.free):
+        raise ValueError(f"a law needs a free coefficient: {texts} leave none; drop one of them")
+    return LawConstraint(common, functions, np.column_stack([c.d for c in columns]), tuple(texts))
+
+
+def read_coefficients(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
+    """Coefficients of a model in the order of the constraint's."""
+    index, states = model.library.index, model.states.index
+    return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])
+
+
+def _known_functions(
+    parameters: Sequence[str], coefficient: str, factors: Mapping[str, float]
+) -> Library:
+    try:
+        return named_terms(list(parameters), list(map(str, factors)))
+    except ValueError as error:
         raise ValueError(
-            f"every point needs parameters, and no other: the points are {names}, parameters "
-            f"came for {list(parameters)}"
-        )
-    points = _values_at(functions, {name: parameters[name] for name in names})
-    basis = law_basis(functions, points)
-    law_at = dict(zip(names, basis.values, strict=True))
-    tied = {state: _tied(front, shared, law_at) for state, front in shared.fronts.items()}
-    blocks = [equation.covariance for equation in tied.values() if equation.covariance is not None]
-    model = shared.models[names[0]]
-    law = OperatingLaw(
-        functions=functions,
-        library=model.library,
-        states=tuple(tied),
-        coefficients=tuple((state, term) for state, each in tied.items() for term in each.terms),
-        coef=np.concatenate([equation.coef for equation in tied.values()]),
-        points=points,
-        covariance=block_diag(*blocks) if len(blocks) == len(tied) else None,
-        units=model.units,
-        provenance={"law": f"least squares, {len(names)} points"},
-    )
-    return LawFit(law, {state: equation.test for state, equation in tied.items()})
+            f"the known coefficient {coefficient} must be a sum of functions of "
+            f"{list(parameters)}, such as {{{parameters[-1]}: 2.0}}: {error}"
+        ) from error
 
 
-def _values_at(
-    functions: Library, parameters: Mapping[str, Mapping[str, float]]
-) -> Float[np.ndarray, "points parameters"]:
-    names = list(functions.variables)
-    for point, known in parameters.items():
-        if set(known) != set(names) or not np.isfinite(list(known.values())).all():
-            raise ValueError(
-                f"{point!r} needs one finite value for each of {names}: {dict(known)} came"
-            )
-    return np.array([[float(known[name]) for name in names] for known in parameters.values()])
-
-
-@dataclass(frozen=True, eq=False)
-class _Tied:
-    """One equation's part of a law. covariance: None if the noise of the rows is unknown."""
-
-    terms: tuple[str, ...]
-    coef: Float[np.ndarray, "support functions"]
-    covariance: Float[np.ndarray, "coefs coefs"] | None
-    test: LawTest
-
-
-def _tied(
-    front: SharedFront,
-    shared: SharedDiscovery,
-    law_at: Mapping[str, Float[np.ndarray, " functions"]],
-) -> _Tied:
-    """Fit one equation by least squares over the rows of all points."""
-    terms = shared.chosen[front.equation]
-    fits = {
-        p: _FreeFit.of(each, front.supports.index(terms), terms) for p, each in front.points.items()
-    }
-    design = np.concatenate([np.kron(own.theta, law_at[p][None]) for p, own in fits.items()])
-    target = np.concatenate([own.target for own in fits.values()])
-    fit = LeastSquares.of_rows(design, target)
-    if not fit.is_determined:
-        raise ValueError(
-            f"too few points show the terms {list(terms)} of {front.equation!r} to tie them by a "
-            "law of this many terms; use a smaller law"
-        )
-    coef = fit.coef.reshape(len(terms), len(next(iter(law_at.values()))))
-    growth = fit.squares - sum(each.squares for each in fits.values())
-    n_free = sum(own.n_terms for own in fits.values())
-    n_given_up, n_left = n_free - coef.size, len(target) - n_free
-    F = max(float(growth), 0.0) / n_given_up if n_given_up > 0 else np.nan
-    known = all(each.rows.noisy is not None for each in front.points.values())
-    test = LawTest(
-        r2_free={
-            p: _r2(each, shared.models[p].terms(front.equation)) for p, each in front.points.items()
-        },
-        r2_tied={
-            p: _r2(each, dict(zip(terms, coef @ law_at[p], strict=True)))
-            for p, each in front.points.items()
-        },
-        F=F,
-        p_value=float(f_distribution.sf(F, n_given_up, n_left)) if n_given_up > 0 else np.nan,
-    )
-    return _Tied(terms, coef, fit.root @ fit.root.T if known else None, test)
-
-
-@dataclass(frozen=True, eq=False)
-class _FreeFit:
-    """Rows of one point for coefficients in SI, scaled to unit residual variance of its free fit.
-
-    n_terms: terms that the point determines. squares: of the residuals of its free fit.
-    """
-
-    theta: Float[np.ndarray, "rows support"]
-    target: Float[np.ndarray, " rows"]
-    n_terms: int
-    squares: float
-
-    @staticmethod
-    def of(front: ParetoFront, k: int, terms: Sequence[str]) -> _FreeFit:
-        problem, candidate = front.rows, front.candidates[k]
-        equation = problem.equations.index(front.equation)
-        scale = problem.coef_scale(equation)
-        theta, target = problem.train_theta, problem.train_target(equation)
-        if problem.noisy is not None:
-            coef = coef_matrix(problem.library, [candidate.coef_by_term])[:, 0] / scale
-            mask = np.isin(problem.term_names, candidate.terms)
-            white = whiten_rows(problem, mask, coef, n_steps=N_STEPS)
-            theta, target = white.theta, white.target
-        columns = [problem.library.index(name) for name in terms]
-        theta = theta[:, columns]
-        left = LeastSquares.of_rows(theta, target).squares
-        # For rows without noise the residuals are rounding, which is no scale to judge by.
-        squares = max(left, FLOOR * float(target @ target))
-        spread = np.sqrt(squares / max(len(target) - candidate.n_terms, 1))
-        return _FreeFit(
-            theta=theta / scale[columns] / spread,
-            target=target / spread,
-            n_terms=candidate.n_terms,
-            squares=left / spread**2,
-        )
-
-
-def _r2(front: ParetoFront, coef: Mapping[str, float]) -> float:
-    """R2 of SI coefficients on the training rows of one point."""
-    problem = front.rows
-    equation = problem.equations.index(front.equation)
-    scale = problem.coef_scale(equation)
-    scaled = coef_matrix(problem.library, [coef])[:, 0] / scale
-    truth, prediction = problem.train_target(equation), scaled @ problem.train_theta.T
-    return float(r2(truth=truth, prediction=prediction[None])[0])
+def _text(state: str, term: str, factors: Mapping[str, float]) -> str:
+    """`n_n: 1 == 4.6e+22 * mdot_mg_s`, each number in its shortest exact form."""
+    addends = [repr(v) if name == "1" else f"{v!r} * {name}" for name, v in factors.items()]
+    return f"{state}: {term} == {' + '.join(addends)}"

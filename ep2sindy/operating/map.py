@@ -16,7 +16,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import CycleStability, limit_cycle
 from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.operating.records import OperatingRecord, values_of
+from ep2sindy.operating.records import OperatingRecord, read_points
 from ep2sindy.signals.oscillation import SIMULATED, relative_amplitude
 
 # Least decay rate per period of a fixed point at which a diverging run counts as resting: e-fold in
@@ -90,7 +90,7 @@ def law_map(
     law: OperatingLaw, records: Sequence[OperatingRecord], points: Sequence[Mapping[str, float]]
 ) -> list[MapPoint]:
     """The law's models at given operating points, each started from the nearest record."""
-    values = values_of(records)
+    values = read_points(records)
     scale = zero_to_one(np.ptp(values, axis=0))
     found = []
     for point in points:

@@ -16,8 +16,8 @@ from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.scores import r2
-from ep2sindy.operating.law import LawFit, fit_law
+from ep2sindy.operating.fit_rows import LawFit, fit_law, score_rows
+from ep2sindy.operating.law import read_coefficients
 from ep2sindy.operating.quantities import (
     FITTED,
     REFINED,
@@ -25,10 +25,10 @@ from ep2sindy.operating.quantities import (
     Fitted,
     PointResult,
     Quantity,
-    estimates_of_covariance,
-    estimates_of_draws,
+    estimate_from_covariance,
+    estimate_from_draws,
 )
-from ep2sindy.operating.records import OperatingRecord, check_alike, naming
+from ep2sindy.operating.records import OperatingRecord, check_alike, name_point
 from ep2sindy.operating.shared_support import SharedDiscovery, discover_shared
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import RefinementSettings
@@ -43,6 +43,9 @@ from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
 from ep2sindy.signals.spectrum import dominant_frequency, samples_in_periods
+
+# Directions that the rows of a draw hold to less than this share of their squares count as absent.
+UNSEEN = 1e-14
 
 MIN_BLOCKS = 5  # fewest blocks in a record: with fewer, draws differ too little from one another
 
@@ -126,7 +129,7 @@ def _fit_point(
     piece: tuple[OperatingRecord, np.random.Generator], *, study: PointStudy
 ) -> PointResult:
     point, rng = piece
-    with naming(point.parameters):
+    with name_point(point.parameters):
         return _point_result(point, study, rng=rng)
 
 
@@ -182,9 +185,9 @@ def _least_squares(
         n_draws=study.bootstrap.n_draws,
         rng=rng,
     )
-    coef = coefficients_of(model, case.constraint)
+    coef = read_coefficients(model, case.constraint)
     covariance = np.atleast_2d(np.cov(draws[:, coef != 0.0], rowvar=False))
-    estimates, drawn = estimates_of_draws(
+    estimates, drawn = estimate_from_draws(
         coef, draws, case.quantities, case.constraint, study.library
     )
     return Fitted(
@@ -221,7 +224,7 @@ def _refined(
         status=found.status,
         r2=_r2(problems, found.model),
         loss=found.loss,
-        estimates=estimates_of_covariance(
+        estimates=estimate_from_covariance(
             found.model, case.quantities, case.constraint, study.library
         )
         if known
@@ -239,14 +242,11 @@ def _search_point(run: Trajectory, study: PointStudy, *, rng: np.random.Generato
 
 def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, float]:
     """R2 of the derivative, by state, on the unweighted training rows."""
-    found = {}
-    for problem in problems:
-        rows = ~problem.test
-        for number, state in enumerate(problem.equations):
-            predicted = problem.theta[rows] @ model.coef[:, model.states.index(state)]
-            truth = problem.target[rows, number]
-            found[state] = float(r2(truth=truth, prediction=predicted[None])[0])
-    return found
+    return {
+        state: score_rows(problem, model, state)
+        for problem in problems
+        for state in problem.equations
+    }
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,8 @@ def resample_coefficients(
     has on all rows, and rows of known noise stay whitened as under `model`. model: result of
     `constrained_fit` on these problems. block: number of consecutive groups in a block.
     Returns one column per coefficient of the constraint. The draws are shifted so that their mean
-    is the fit: blocks seldom reach the ends of the record, which would bias them.
+    is the fit: blocks seldom reach the ends of the record, which would bias them. Before the shift,
+    a coefficient whose terms are zero on all rows of a draw is zero in this draw.
     Raises ValueError for blocks that leave fewer than five to draw from, or several trajectories.
     Source: Kuensch 1989, doi:10.1214/aos/1176347265; Lahiri 2003, Resampling Methods for Dependent
     Data, 2.5, for the centre.
@@ -290,7 +291,7 @@ def resample_coefficients(
             f"next: {len(problems[0].trajectories)} came"
         )
     equations = weigh_equations(problems, constraint)
-    coef = coefficients_of(model, constraint)
+    coef = read_coefficients(model, constraint)
     rows = [_free_rows(equation, constraint, coef) for equation in equations]
     groups = [e.problem.groups[~e.problem.test] for e in equations]
     numbers = np.unique(np.concatenate(groups))
@@ -322,12 +323,6 @@ def _check_blocks(n_groups: int, block: int) -> None:
         )
 
 
-def coefficients_of(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
-    """Coefficients of a model in the order of the constraint's."""
-    index, states = model.library.index, model.states.index
-    return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])
-
-
 def _free_rows(
     equation: WeightedEquation, constraint: Constraint, coef: Float[np.ndarray, " coefs"]
 ) -> Float[np.ndarray, "rows columns"]:
@@ -342,14 +337,14 @@ class SharedResult:
     """Result of one search over all points that oscillate.
 
     fitted: for each point that oscillates, the support with the point's own coefficients; None at
-    the others. tied: the coefficients as polynomials of the parameters; None if the points do not
-    suffice, for the reason in `why_not_tied`.
+    the others. fit: the coefficients as polynomials of the parameters; None if the points do not
+    suffice, for the reason in `why_no_law`.
     """
 
     found: SharedDiscovery
     fitted: Sequence[Fitted | None]
-    tied: LawFit | None
-    why_not_tied: str = ""
+    fit: LawFit | None
+    why_no_law: str = ""
 
 
 def search_shared(
@@ -363,8 +358,8 @@ def search_shared(
 ) -> SharedResult | None:
     """Search all points that oscillate at once; None for fewer than two of them.
 
-    law: functions of the points' parameters that tie the coefficients. Also None for a search that
-    cannot weigh several points: only BestSubset can.
+    law: functions of the points' parameters that give the coefficients. Also None for a search
+    that cannot weigh several points: only BestSubset can.
     """
     used = {
         point.label: point
@@ -372,27 +367,27 @@ def search_shared(
         if result.fits and point.trajectory is not None
     }
     method = study.method
-    if len(used) < 2:
+    if len(used) < 2 or not isinstance(method, Regression):
         return None
-    if not (isinstance(method, Regression) and isinstance(method.search, BestSubset)):
+    if not isinstance(method.search, BestSubset):
         return None
     found = discover_shared(
-        {label: [point.trajectory] for label, point in used.items() if point.trajectory},
+        {label: [point.run] for label, point in used.items()},
         study.searched,
         replace(method, bootstraps=Bootstraps(n=0)),
         seed=rng,
         progress=progress,
     )
-    tied, reason = None, ""
+    fit, reason = None, ""
     try:
         parameters = {label: point.parameters for label, point in used.items()}
-        with progress.stage(None, "", "coefficients tied by a law"):
-            tied = fit_law(found, law, parameters=parameters)
+        with progress.stage(None, "", "one law of all coefficients"):
+            fit = fit_law(found, law, parameters=parameters)
     except ValueError as error:
         reason = str(error)
     labels = [point.label for point in points]
     fitted = [_fitted(found, label) if label in used else None for label in labels]
-    return SharedResult(found, fitted, tied, reason)
+    return SharedResult(found, fitted, fit, reason)
 
 
 def _fitted(found: SharedDiscovery, label: str) -> Fitted:

@@ -1,21 +1,32 @@
-"""Physical quantities read from coefficients, with intervals, and the results of one point."""
+"""Physical quantities read from coefficients at each point, and their laws and trends."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
+from ep2sindy.data.numbers import least_squares
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, place_of
 from ep2sindy.library.units import unit_product
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.scores import r2
+from ep2sindy.operating.records import check_varying
+from ep2sindy.regression.pooled import Basis
+from ep2sindy.runtime.values import check_count, read_only
 
 LEVEL = 0.95  # level of all intervals in this file
 FITTED, SEARCHED, CONVERGED = "fitted", "searched", "converged"
 REFINED = "_refined"  # suffix of the name of a case's refinement
+
+# Share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
+ROUNDING = 1e-10
 
 
 @dataclass(frozen=True)
@@ -48,7 +59,7 @@ class Quantity:
     def term(self) -> str:
         return self.coefficient.split(":")[1].strip()
 
-    def of(self, coef: Float[np.ndarray, " coefs"]) -> Float[np.ndarray, " coefs"]:
+    def evaluate(self, coef: Float[np.ndarray, " coefs"]) -> Float[np.ndarray, " coefs"]:
         """Values of the quantity for an array of values of the coefficient."""
         return self.factor * coef**self.power
 
@@ -118,7 +129,7 @@ class PointResult:
         return fit in self.fits and self.fits[fit].status in (FITTED, CONVERGED)
 
 
-def estimates_of_draws(
+def estimate_from_draws(
     coef: Float[np.ndarray, " coefs"],
     draws: Float[np.ndarray, "draws coefs"],
     quantities: Mapping[str, Quantity],
@@ -134,18 +145,18 @@ def estimates_of_draws(
     estimates, drawn = {}, {}
     for name, quantity in quantities.items():
         k = quantity.place(constraint, library)
-        drawn[name] = quantity.of(draws[:, k])
+        drawn[name] = quantity.evaluate(draws[:, k])
         ends = (50 * (1 - LEVEL), 50 * (1 + LEVEL))
         low, high = np.percentile(drawn[name], ends)
         if quantity.power < 0 and np.prod(np.sign(np.percentile(draws[:, k], ends))) <= 0:
             low, high = -np.inf, np.inf
         estimates[name] = QuantityEstimate(
-            float(quantity.of(coef[k : k + 1])[0]), float(low), float(high)
+            float(quantity.evaluate(coef[k : k + 1])[0]), float(low), float(high)
         )
     return estimates, drawn
 
 
-def estimates_of_covariance(
+def estimate_from_covariance(
     model: SparseModel,
     quantities: Mapping[str, Quantity],
     constraint: Constraint,
@@ -158,6 +169,198 @@ def estimates_of_covariance(
         coef = model.terms(state)[term]
         low, _ = model.intervals(state, level=LEVEL)[term]
         reach = abs(quantity.slope(coef)) * (coef - low)
-        value = float(quantity.of(np.array([coef]))[0])
+        value = float(quantity.evaluate(np.array([coef]))[0])
         estimates[name] = QuantityEstimate(value, value - reach, value + reach)
     return estimates
+
+
+@dataclass(frozen=True, eq=False)
+class ControlLaw:
+    """One quantity as a function of the operating point p: y(p) = w f(p), with its errors.
+
+    functions: f, of the parameters. coef: w, in the units of the quantity over those of f. r2: on
+    the points of the fit; NaN for a quantity that does not vary. loo_error: leave-one-out RMS error
+    with these functions, relative to the absolute mean of the quantity. search_error: the same with
+    the functions searched again without the point.
+    """
+
+    functions: Library
+    coef: Float[np.ndarray, " functions"]
+    r2: float
+    loo_error: float
+    search_error: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "coef", read_only(self.coef))
+
+    @property
+    def coef_by_term(self) -> dict[str, float]:
+        return dict(zip(self.functions.names, self.coef.tolist(), strict=True))
+
+    def predict(
+        self, parameters: Float[np.ndarray, "points parameters"]
+    ) -> Float[np.ndarray, " points"]:
+        """The quantity at given points; columns in the order of the functions' variables."""
+        return self.functions.evaluate(parameters) @ self.coef
+
+
+def fit_control_law(
+    values: Float[np.ndarray, " points"],
+    parameters: Float[np.ndarray, "points parameters"],
+    library: Library,
+    *,
+    max_terms: int | None = None,
+) -> ControlLaw:
+    """Find the terms of a library that predict best at points left out of their fit.
+
+    Minimises the mean square of r_p / (1 - h_p) over all supports of up to `max_terms` terms, with
+    r_p the residual of the point p in a least-squares fit, h_p its diagonal of the hat matrix, and
+    so r_p / (1 - h_p) its residual in the fit to the other points.
+    Assumes errors of equal variance at all points.
+    max_terms: None allows as many terms as leave two points over; never more than that, nor more
+    than the library has. A support to which one point is indispensable is left out.
+    Raises ValueError for under three points, another number of parameters than variables, values
+    that are not finite, or a parameter that never varies.
+    Source: Allen 1974, doi:10.1080/00401706.1974.10489157.
+    """
+    _check(values, parameters, library, max_terms)
+    theta = library.evaluate(parameters)
+    support, coef, left_out = _search(values, theta, max_terms)
+    fitted = theta[:, support] @ coef
+    searched = np.empty_like(values)
+    for k in range(len(values)):
+        others, own, _ = _search(np.delete(values, k), np.delete(theta, k, axis=0), max_terms)
+        searched[k] = theta[k, others] @ own
+    varies = np.ptp(values) > 0.0
+    return ControlLaw(
+        functions=library.take(np.array(support)),
+        coef=coef,
+        r2=float(r2(truth=values, prediction=fitted[None])[0]) if varies else float("nan"),
+        loo_error=_relative(values - left_out, values),
+        search_error=_relative(values - searched, values),
+    )
+
+
+def _check(
+    values: np.ndarray, parameters: np.ndarray, library: Library, max_terms: int | None
+) -> None:
+    names = list(library.variables)
+    if len(values) < 3:
+        raise ValueError(f"a law needs three points or more: {len(values)} came")
+    if parameters.shape[1] != len(names):
+        raise ValueError(
+            f"parameters must have one column for each of {names}: {parameters.shape[1]} came"
+        )
+    if not (np.isfinite(values).all() and np.isfinite(parameters).all()):
+        raise ValueError("values and parameters must be finite: leave out points that are not")
+    check_varying(parameters, names, remedy="leave it out of the library")
+    if max_terms is not None:
+        check_count("max_terms", max_terms)
+
+
+def _search(
+    values: np.ndarray, theta: np.ndarray, max_terms: int | None
+) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Columns of least leave-one-out error, their coefficients, and values at points left out.
+
+    Of supports that are equal up to rounding, the one of fewest columns is taken.
+    """
+    n_points, n_terms = theta.shape
+    largest = max(1, min(n_terms, n_points - 2, max_terms or n_terms))
+    floor = ROUNDING * np.sqrt(np.square(values).mean())
+    best, lowest = ([0], np.full_like(values, np.inf)), np.inf
+    for size in range(1, largest + 1):
+        for support in map(list, combinations(range(n_terms), size)):
+            with suppress(ValueError):  # the points do not tell these columns apart
+                left_out = Basis(theta[:, support]).predict_left_out(values)
+                error = max(_rms(values - left_out), floor)
+                if error < lowest:
+                    best, lowest = (support, left_out), error
+    return best[0], least_squares(theta[:, best[0]], values), best[1]
+
+
+def _rms(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.square(errors).mean()))
+
+
+def _relative(errors: np.ndarray, values: np.ndarray) -> float:
+    mean = abs(float(values.mean()))
+    return _rms(errors) / mean if mean else float("nan")
+
+
+def fit_names(results: Sequence[PointResult]) -> list[str]:
+    """Names of all fits, in the order of the study."""
+    return list(dict.fromkeys(name for result in results for name in result.fits))
+
+
+def fit_control_laws(
+    results: Sequence[PointResult], library: Library, *, max_terms: int | None = None
+) -> dict[str, dict[str, ControlLaw]]:
+    """A control law per fit and quantity, from the points at which the fit finished.
+
+    Fits with under three such points, or with a parameter that does not vary over them, are left
+    out.
+    """
+    found = {}
+    for fit in fit_names(results):
+        usable = [result for result in results if result.usable(fit)]
+        values = np.array([[each.parameters[v] for v in library.variables] for each in usable])
+        if len(usable) < 3 or not np.ptp(values, axis=0).all():
+            continue
+        found[fit] = {
+            name: fit_control_law(_values(usable, fit, name), values, library, max_terms=max_terms)
+            for name in usable[0].fits[fit].estimates
+        }
+    return found
+
+
+def fit_trends(
+    results: Sequence[PointResult], *, along: str, at: Mapping[str, float]
+) -> pd.DataFrame:
+    """Exponents p of |quantity| ~ parameter^p along one parameter, the others held.
+
+    One row per fit and quantity: the slope of logarithms, by least squares over the points. r2: of
+    that line; it tells whether the points follow a power law at all, and is also near zero without
+    a trend. low and high: 95 % interval of the slope by the bootstraps of least-squares fits,
+    points independent. It says how well the slope is known, not whether the points lie on a line.
+    With two points, which are always on a line, r2, low and high are NaN; low and high are also NaN
+    for refined fits.
+    """
+    held = [each for each in results if all(each.parameters[k] == v for k, v in at.items())]
+    rows = []
+    for fit in fit_names(results):
+        usable = [each for each in held if each.usable(fit)]
+        x = np.array([each.parameters[along] for each in usable])
+        for name in usable[0].fits[fit].estimates if usable else ():
+            low, high = np.nan, np.nan
+            if len(usable) > 2 and all(each.fits[fit].draws for each in usable):
+                draws = np.stack([each.fits[fit].draws[name] for each in usable], axis=1)
+                slopes = [fit_power_law(x, draw)[0] for draw in draws]
+                low, high = np.percentile(slopes, (2.5, 97.5))
+            row = {"fit": fit, "quantity": name, "along": along, "n_points": len(usable)}
+            slope, share = fit_power_law(x, _values(usable, fit, name))
+            row |= {"exponent": slope, "r2": share}
+            rows.append(row | {"low": low, "high": high})
+    return pd.DataFrame(rows)
+
+
+def fit_power_law(
+    x: Float[np.ndarray, " points"], values: Float[np.ndarray, " points"]
+) -> tuple[float, float]:
+    """Slope of log |values| against log x by least squares, and the R2 of this line.
+
+    Both are NaN unless x is positive and has two different values; R2 also for under three points
+    or for equal values.
+    """
+    if len(x) < 2 or np.ptp(x) == 0.0 or x.min() <= 0.0:
+        return float("nan"), float("nan")
+    logs, centred = np.log(np.abs(values)), np.log(x) - np.log(x).mean()
+    slope = float(centred @ logs / np.square(centred).sum())
+    if len(x) < 3 or np.ptp(logs) == 0.0:
+        return slope, float("nan")
+    line = logs.mean() + slope * centred
+    return slope, float(r2(truth=logs, prediction=line[None])[0])
+
+
+def _values(usable: Sequence[PointResult], fit: str, name: str) -> np.ndarray:
+    return np.array([each.fits[fit].estimates[name].value for each in usable])

@@ -10,8 +10,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.data.numbers import column_norms, least_squares, zero_to_one
+from ep2sindy.data.numbers import least_squares, zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement
+from ep2sindy.regression.pooled import Basis
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
 from ep2sindy.signals.spectrum import steps_in
@@ -121,7 +122,7 @@ def point_label(parameters: Mapping[str, float]) -> str:
 
 
 @contextmanager
-def naming(parameters: Mapping[str, float]) -> Iterator[None]:
+def name_point(parameters: Mapping[str, float]) -> Iterator[None]:
     """Put the name of the operating point before errors raised inside."""
     try:
         yield
@@ -133,7 +134,7 @@ def check_alike(records: Sequence[OperatingRecord], variables: Sequence[str]) ->
     """Raise ValueError, naming the point, unless all have the same states, variables and units."""
     known = [record for record in records if record.trajectory is not None]
     for record in known:
-        with naming(record.parameters):
+        with name_point(record.parameters):
             check_agreement([known[0].run, record.run], variables)
 
 
@@ -170,47 +171,37 @@ def check_records(records: Sequence[OperatingRecord]) -> None:
             f"a law needs more than one operating point: {records[0].label} came alone; add "
             "points near it"
         )
-    check_varying(values_of(records), names)
+    check_varying(read_points(records), names)
     check_alike(records, records[0].run.state_names)
 
 
-def values_of(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records parameters"]:
+def read_points(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records parameters"]:
     """Parameters of the records, columns in the order of the first record's."""
     names = list(records[0].parameters)
     return np.array([[record.parameters[name] for name in names] for record in records])
 
 
+def read_point(
+    names: Sequence[str], parameters: Mapping[str, float]
+) -> Float[np.ndarray, " parameters"]:
+    """Values of the parameters of these names at a point; ValueError unless they are finite."""
+    if set(parameters) != set(names) or not np.isfinite(list(parameters.values())).all():
+        raise ValueError(
+            f"an operating point must have one finite value for each of {list(names)}, and no "
+            f"other: {dict(parameters)} came"
+        )
+    return np.array([float(parameters[name]) for name in names])
+
+
 def most_central(records: Sequence[OperatingRecord]) -> OperatingRecord:
     """The record whose parameters are nearest to the mean of all."""
-    values = values_of(records)
+    values = read_points(records)
     off = (values - values.mean(axis=0)) / zero_to_one(np.ptp(values, axis=0))
     return records[int(np.argmin(np.linalg.norm(off, axis=1)))]
 
 
-# A point with this leverage alone determines some coefficient: without it there is no fit.
-FULL_LEVERAGE = 1.0 - 1e-9
-
-# Smallest singular value of unit columns, relative to the largest, at which they are independent.
-INDEPENDENT = 1e-10
-
-
-def left_out_predictions(
-    values: Float[np.ndarray, "records ..."], basis: Float[np.ndarray, "records functions"]
-) -> tuple[Float[np.ndarray, "records ..."], Float[np.ndarray, "records ..."]]:
-    """Values at every point by the least-squares fit to all points, and by that to the others.
-
-    The second is infinite if one point is indispensable, or if the functions depend on each other.
-    """
-    left, singular, _ = np.linalg.svd(basis / column_norms(basis), full_matrices=False)
-    leverage = np.square(left).sum(axis=1)
-    fitted = left @ (left.T @ values)
-    if singular[-1] <= INDEPENDENT * singular[0] or leverage.max() > FULL_LEVERAGE:
-        return fitted, np.full_like(fitted, np.inf)
-    return fitted, values - ((values - fitted).T / (1.0 - leverage)).T
-
-
 def interpolation_errors(
-    records: Sequence[OperatingRecord], basis: Float[np.ndarray, "records functions"]
+    records: Sequence[OperatingRecord], basis: Basis
 ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:
     """Leave-one-out errors of interpolating frequency and amplitude by functions of the parameters.
 
@@ -221,7 +212,7 @@ def interpolation_errors(
     """
     f = np.log([[record.cycle.frequency_Hz] for record in records])
     logs = np.hstack([f, np.log([record.cycle.std for record in records])])
-    off = np.abs(np.expm1(left_out_predictions(logs, basis)[1] - logs))
+    off = np.abs(np.expm1(basis.predict_left_out(logs) - logs))
     return off[:, 0], off[:, 1:].max(axis=1)
 
 
@@ -233,7 +224,7 @@ def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records
     with the spread on either side of it.
     """
     amplitude = np.log([record.relative_amplitude for record in records])
-    left = _off_plane(values_of(records), amplitude)
+    left = _off_plane(read_points(records), amplitude)
     order = np.argsort(left)
     gaps = np.diff(left[order])
     nothing = np.zeros(len(records), dtype=np.int64)

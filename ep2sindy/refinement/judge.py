@@ -79,7 +79,7 @@ def is_flat(
 
 @dataclass(frozen=True, eq=False)
 class RefinementVerdict:
-    """Assessment of one operating point of a fit, or of all points tied by a law.
+    """Assessment of one operating point of a fit, or of all points of a law.
 
     window_loss: mean square of (trajectory - data) / std in each window, point after point.
     covariance, covariance_naive: covariances of the unknowns, which are the scalings of a point or
@@ -99,7 +99,7 @@ def fit_and_judge(
 ) -> tuple[RefinementFit, list[RefinementVerdict]]:
     """Fit, halving the time step as long as necessary, and judge the integrated trajectories.
 
-    Returns the fit, and a verdict for each point or a single one if a law ties the points.
+    Returns the fit, and a verdict for each point or a single one if the points share a law.
     """
     fit = method.fit(problem)
     closed, verdicts = judge(problem, fit)
@@ -118,8 +118,8 @@ def judge(
 ) -> tuple[RefinementFit, list[RefinementVerdict]]:
     """Integrate the fit again, and return it with verdicts on its points.
 
-    There is one verdict for each point, or a single one if a law ties the points. If one point
-    blows up, all points that a law ties to it count as not finite.
+    There is one verdict for each point, or a single one if the points share a law. If one point
+    blows up, all points that share its law count as not finite.
     """
     fit, maps = follow(problem, fit)
     n_start, window = problem.n_start, fit.nodes.shape[2]

@@ -22,9 +22,9 @@ from ep2sindy.refinement.problem import (
     RefinementSettings,
     record,
 )
-from ep2sindy.refinement.refine import with_coef
-from ep2sindy.refinement.weighted_law import Basis, weighted_law
+from ep2sindy.refinement.refine import resolve_constraints, with_coef
 from ep2sindy.refinement.windows import WindowBatch
+from ep2sindy.regression.pooled import Basis, pool_coefficients
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 
@@ -36,6 +36,11 @@ SETTINGS = RefinementSettings(n_windows=20, n_reweights=0)
 class LawRefinement:
     """A law fitted to the trajectories of all points, with its uncertainty.
 
+    The law W minimises the sum over the points p and their windows w of |(x_w(t) - data) / std_p|^2
+    with x_w(t) integrated from a start that is fitted too, under c_p = C W f(p) + d_p: a constraint
+    whose matrix depends on the point, through its basis f(p). In separate refinements some
+    directions of the coefficients are poorly determined; here a point influences the law only in
+    the directions that its data determine.
     coefficients: (state, term) of each free coefficient. law: the coefficients at a point are
     law @ basis at this point, in SI.
     covariance: covariance of law.ravel(), a sandwich with the windows of all points as clusters.
@@ -71,59 +76,44 @@ def refine_law(
     callback: Callable[[Iteration], None] | None = None,
     progress: Progress | bool = False,
 ) -> LawRefinement:
-    """Fit one law to windows of all points, by least squares: coef_p = law @ basis[p].
+    """Fit one law to windows of all points, by least squares: z_p = law @ basis[p].
 
-    One Gauss-Newton iteration solves for the law, with the windows of every point condensed as in
-    `refine`; residuals are in units of each point's own standard deviations. In separate
-    refinements some directions of the coefficients are poorly determined; here a point influences
-    the law only in the directions that its data determine.
+    See `LawRefinement` for the objective. Assumes white noise of the states, and a law that holds.
     models: one per point, all with the same terms, refined or discovered; they set the scales of
-    the coefficients. settings: as for `refine`, with MultipleShooting only. n_windows is the
-    number at every point; the default is 20 windows without reweighting. constraints: one per
-    point, of the same relations, in which known coefficients have the point's own values; None
-    takes that of the settings for all. start: initial law; None takes one through the coefficients
-    of the models.
+    the coefficients. settings: as for `refine`, with MultipleShooting only; n_windows is the number
+    at every point. constraints: one per point, of the same relations, in which known coefficients
+    have the point's own values; None takes that of the settings for all. start: initial law; None
+    takes one through the coefficients of the models.
     Raises ValueError for models with different terms, constraints with different ones, a basis
     whose terms the points cannot tell apart, a window that fits no trajectory, or points with
     different numbers of windows.
+    Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_7, for multiple shooting.
+
+    >>> systems = [ep.lotka_volterra(a=a) for a in (0.5, 0.7, 0.9)]
+    >>> runs = [[system.trajectory(noise=0.01, rng=0)] for system in systems]
+    >>> basis = np.array([[1.0, 0.5], [1.0, 0.7], [1.0, 0.9]])  # 1 and a
+    >>> law = ep.refinement.refine_law([s.model for s in systems], runs, basis).law
     """
     known = Basis(basis)
     _check_structure(models, len(basis), len(trajectories))
-    relations = _one_for_each(models, settings.constraint, constraints)
-    method = _multiple_shooting(settings)
-    batches = settings.cut(models, trajectories, np.random.default_rng(seed))
-    _check_counts(batches)
-    with as_progress(progress).stage(None, "iteration", "refinement of a law") as advance:
-        history, observe = record(callback, advance)
-        problem = RefinementProblem.of(
-            models,
-            batches,
-            relations,
-            free_start=settings.free_start,
-            n_reweights=settings.n_reweights,
-            observe=observe,
-        )
-        free0 = np.stack([each.free0 for each in problem.equations])
-        begin = weighted_law(free0, None, basis) if start is None else start
-        law = LawMap.of(free0, known, begin)
-        problem = replace(problem, law=law)
-        fit, (verdict,) = fit_and_judge(problem, method)
-    return _result(models, relations, law, fit, verdict, known, tuple(history))
-
-
-def _multiple_shooting(settings: RefinementSettings) -> MultipleShooting:
+    own = resolve_constraints(settings, models, constraints)
+    relations = [each or unconstrained(models[0]) for each in own]
     method = MultipleShooting() if settings.method is None else settings.method
     if not isinstance(method, MultipleShooting):
         raise ValueError(f"a law is refined by MultipleShooting alone: {method} came")
-    return method
-
-
-def _check_counts(batches: Sequence[WindowBatch]) -> None:
-    if len(counts := {len(batch.start) for batch in batches}) > 1:
-        raise ValueError(
-            f"all points must hold as many windows: {sorted(counts)} came; shorten the window or "
-            "ask for fewer"
-        )
+    batches = settings.cut(models, trajectories, np.random.default_rng(seed))
+    _check_alike(relations, batches)
+    with as_progress(progress).stage(None, "iteration", "refinement of a law") as advance:
+        history, observe = record(callback, advance)
+        problem = RefinementProblem.of(
+            models, batches, relations, observe=observe,
+            free_start=settings.free_start, n_reweights=settings.n_reweights,
+        )  # fmt: skip
+        free0 = np.stack([each.free0 for each in problem.equations])
+        begin = pool_coefficients(free0, None, known) if start is None else start
+        law = LawMap.of(free0, known, begin)
+        fit, (verdict,) = fit_and_judge(replace(problem, law=law), method)
+    return _result(models, relations, law, fit, verdict, known, tuple(history))
 
 
 def _check_structure(models: Sequence[SparseModel], n_basis: int, n_runs: int) -> None:
@@ -137,30 +127,26 @@ def _check_structure(models: Sequence[SparseModel], n_basis: int, n_runs: int) -
     }
     if len(structures) > 1:
         raise ValueError(
-            f"models that a law ties must have the same terms: {len(structures)} structures came"
+            f"models that share a law must have the same terms: {len(structures)} structures came"
         )
 
 
-def _one_for_each(
-    models: Sequence[SparseModel], common: Constraint | None, own: Sequence[Constraint] | None
-) -> list[Constraint]:
-    """The relations at every point; ValueError unless they differ in known values alone."""
-    if own is None:
-        return [unconstrained(models[0]) if common is None else common] * len(models)
-    if common is not None:
+def _check_alike(relations: Sequence[Constraint], batches: Sequence[WindowBatch]) -> None:
+    """Relations must differ in the values of known coefficients alone, points in no numbers."""
+    first = relations[0]
+    if not all(
+        own.coefficients == first.coefficients and np.array_equal(own.C, first.C)
+        for own in relations
+    ):
         raise ValueError(
-            "constraints came for every point, and one for all in the settings: leave out one"
+            "the constraints of a law's points must be alike but for the values of known "
+            "coefficients: those that came are not alike"
         )
-    same = all(
-        each.coefficients == own[0].coefficients and np.array_equal(each.C, own[0].C)
-        for each in own
-    )
-    if len(own) != len(models) or not same:
+    if len(counts := {len(batch.start) for batch in batches}) > 1:
         raise ValueError(
-            f"a law needs one constraint for each of its {len(models)} points, alike but for the "
-            f"values of known coefficients: {len(own)} came{'' if same else ', not alike'}"
+            f"all points must hold as many windows: {sorted(counts)} came; shorten the window or "
+            "ask for fewer"
         )
-    return list(own)
 
 
 def _result(

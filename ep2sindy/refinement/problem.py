@@ -18,7 +18,6 @@ from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.ode import ODE, Drive, ScaledEquations
 from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
-from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.refinement.windows import (
     PERIODS,
     WindowBatch,
@@ -26,6 +25,7 @@ from ep2sindy.refinement.windows import (
     cut_windows,
     dominant_window,
 )
+from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.runtime.values import read_only, set_counts
 
@@ -162,11 +162,13 @@ def ignore(iteration: Iteration) -> None:
 
 @dataclass(frozen=True, eq=False)
 class LawMap:
-    """Linear map from theta to scalings and law: scalings of point p are spread[p] @ theta.
+    """Coefficients that follow a law, as scalings: scalings of point p are spread[p] @ theta.
 
-    theta: factors of an orthonormal basis, coefficient by coefficient, in units of the
-    coefficient's RMS over the points. to_law: to_law @ theta gives the law in SI, in the same
-    order: the factors of the given basis. start: initial theta of a fit.
+    With coefficients z_p = W f(p), the row of coefficient k in spread[p] holds size_k q(p) / z0_pk
+    for the factors of that coefficient, with q the orthonormal basis of f and z0 the coefficients
+    at a scaling of one. theta: factors of q, coefficient by coefficient, in units of the
+    coefficient's RMS over the points. to_law: W.ravel() = to_law @ theta, in SI. start: initial
+    theta of a fit.
     """
 
     spread: Float[np.ndarray, "points free theta"]
@@ -181,23 +183,18 @@ class LawMap:
     def of(
         free0: Float[np.ndarray, "points free"],
         basis: Basis,
-        law: Float[np.ndarray, "free terms"],
+        law: Float[np.ndarray, "free functions"],
     ) -> LawMap:
         """Map for a basis and the initial values of a fit.
 
         free0: values of the free coefficients at a scaling of one. law: the initial law. Both are
         in SI.
         """
-        n_points, n_free = free0.shape
-        n_terms = basis.values.shape[1]
         size = zero_to_one(np.sqrt(np.square(free0).mean(axis=0)))
-        spread = np.zeros((n_points, n_free, n_free, n_terms))
-        each = np.arange(n_free)
-        by_point = (size / free0)[..., None] * basis.orthonormal[:, None]
-        spread[:, each, each] = by_point
-        to_law = np.kron(np.diag(size), basis.back)
-        start = np.linalg.solve(to_law, law.ravel())
-        return LawMap(spread.reshape(n_points, n_free, -1), to_law, start)
+        pairs = zip(free0, basis.orthonormal, strict=True)
+        spread = np.stack([np.kron(np.diag(size / own), q) for own, q in pairs])
+        to_law = basis.to_law(size)
+        return LawMap(spread, to_law, np.linalg.solve(to_law, law.ravel()))
 
     @staticmethod
     def identity(n_free: int) -> LawMap:
@@ -232,8 +229,8 @@ class RefinementProblem:
 
     equations: of each model in the units of its windows; `ode` is their module. free_start: true if
     the initial state of each window is fitted; otherwise it is the data's. n_reweights: number of
-    passes with weights 1/std of the residuals, after weights 1/std of the data. law: ties the
-    scalings of all points to the few unknowns of a law; None gives each point its own scalings.
+    passes with weights 1/std of the residuals, after weights 1/std of the data. law: gives the
+    scalings of all points by the few unknowns of a law; None gives each point its own scalings.
     correction: a term that is trained along, of the only point.
     """
 
@@ -304,7 +301,7 @@ class RefinementProblem:
         return replace(self, equations=(self.equations[point],), batches=(self.batches[point],))
 
     def agree(self, values: Values, reduce: Callable[[Values], Any]) -> Values:
-        """Values by point; if a law ties the points, all get the value given by `reduce`."""
+        """Values by point; if the points share a law, all get the value given by `reduce`."""
         return values if self.law is None else np.full_like(values, reduce(values))
 
     def _drive(self, *, one: bool) -> Drive:

@@ -166,7 +166,7 @@ def refine(
     }  # fmt: skip
     settings = settings.override(changes)
     models, records = _by_model(model, trajectories)
-    relations = _by_constraint(settings, models, constraints)
+    relations = resolve_constraints(settings, models, constraints)
     batches = settings.cut(models, records, np.random.default_rng(seed))
     with as_progress(progress).stage(None, "iteration", "refinement") as advance:
         refinements: list[Refinement] = []
@@ -199,7 +199,7 @@ def _by_model(
     return models, [[run.complete() for run in runs] for runs in records]
 
 
-def _by_constraint(
+def resolve_constraints(
     settings: RefinementSettings,
     models: Sequence[SparseModel],
     constraints: Sequence[Constraint | None] | None,

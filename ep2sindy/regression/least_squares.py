@@ -63,10 +63,10 @@ class LeastSquares:
         target: Float[np.ndarray, " rows"],
         bounds: Float[np.ndarray, "2 terms"] | None = None,
     ) -> LeastSquares:
-        """Fit as many rows as terms or more."""
         n, norms, size = theta.shape[1], column_norms(theta), np.linalg.norm(target) or 1.0
         columns = np.column_stack([theta / norms, target / size])
         triangle = np.asarray(np.linalg.qr(columns, mode="r"))
+        triangle = np.pad(triangle, ((0, n + 1 - len(triangle)), (0, 0)))  # of fewer rows
         upper, right, beyond = triangle[:n, :n], triangle[:n, n], triangle[n:, n]
         is_whole = bool((np.square(np.diag(upper)) > DEPENDENT).all())
         coef, _, rank, _ = np.linalg.lstsq(upper, right, rcond=None if is_whole else CUTOFF)

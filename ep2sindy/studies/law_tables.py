@@ -8,17 +8,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import ndtri
 
 from ep2sindy.figures.operating import frequency_scale
 from ep2sindy.forecasting.skill import AUTOREGRESSION, MODEL, ForecastSkill
-from ep2sindy.operating.choice import Branch, StructureCase, StructureTrial
-from ep2sindy.operating.constraint import Known, law_constraint
+from ep2sindy.operating.branch import Branch, StructureCase, StructureTrial
 from ep2sindy.operating.fit import LeaveOneOut, error_statistics
+from ep2sindy.operating.law import Known, constrain_law
 from ep2sindy.operating.map import Fate, MapPoint
 from ep2sindy.operating.point_fits import Case
-from ep2sindy.operating.quantities import PointResult
-from ep2sindy.operating.quantity_law import ControlLaw
+from ep2sindy.operating.quantities import ControlLaw, PointResult
 from ep2sindy.operating.records import OperatingRecord, point_label
 from ep2sindy.report.document import Equation, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
@@ -49,7 +47,7 @@ class LawModel:
                 f"{key}"
             )
         try:
-            law_constraint(library, structure, self.relations, self.known, parameters=parameters)
+            constrain_law(library, structure, self.relations, self.known, parameters=parameters)
         except ValueError as error:
             raise ValueError(
                 f"models.{name} cannot hold: {error} (or leave it out: ~models.{name})"
@@ -107,13 +105,11 @@ def laws_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
     rows = []
     for name, branch in branches.items():
         law = branch.law
-        reach = np.full(law.coef.shape, np.nan)
-        if law.covariance is not None:
-            std = np.sqrt(np.maximum(np.diag(law.covariance), 0.0)).reshape(law.coef.shape)
-            reach = ndtri(0.975) * std
-        for (state, term), row, half in zip(law.coefficients, law.coef, reach, strict=True):
-            for function, value, r in zip(law.functions.names, row, half, strict=True):
-                rows.append((name, state, term, function, value, value - r, value + r))
+        known = {} if law.covariance is None else law.intervals()
+        for (state, term), row in zip(law.coefficients, law.coef, strict=True):
+            for function, value in zip(law.functions.names, row, strict=True):
+                ends = known.get((state, term), {}).get(function, (np.nan, np.nan))
+                rows.append((name, state, term, function, value, *ends))
     columns = ["branch", "state", "term", "function", "value", "low", "high"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -122,13 +118,13 @@ def coefficients_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
     """Coefficients at every point, refined alone and from the law, each with 95 % intervals."""
     rows = []
     for name, branch in branches.items():
-        pairs = zip(branch.fit.records, branch.fit.fits, branch.tied.models, strict=True)
-        for record, alone, tied in pairs:
-            for state in tied.states:
-                for term, value in tied.terms(state).items():
+        pairs = zip(branch.fit.records, branch.fit.fits, branch.refinement.models, strict=True)
+        for record, alone, pooled in pairs:
+            for state in pooled.states:
+                for term, value in pooled.terms(state).items():
                     row = {**record.parameters, "branch": name, "state": state, "term": term}
                     row |= {"alone": alone.model.terms(state)[term], "law": value}
-                    for kind, model in (("alone", alone.model), ("law", tied)):
+                    for kind, model in (("alone", alone.model), ("law", pooled)):
                         if model.covariance is not None:
                             low, high = model.intervals(state)[term]
                             row |= {f"{kind}_low": low, f"{kind}_high": high}
@@ -244,20 +240,17 @@ def structure_metrics(name: str, branch: Branch) -> list[Metric[StructureTrial]]
         Metric("degree", lambda trial: trial.degree, View.SHOWN),
         Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
         Metric("error", lambda trial: float(trial.errors.mean()), View.SHOWN),
-        Metric("f_error", _median_f_error, View.SHOWN, format=percent(2)),
         Metric(
-            "diverging",
-            lambda trial: sum(point.run.rollout.diverged for point in trial.found),
+            "f_error",
+            lambda trial: error_statistics(trial.left_out)["f_median"],
             View.SHOWN,
+            format=percent(2),
+        ),
+        Metric(
+            "diverging", lambda trial: error_statistics(trial.left_out)["diverging"], View.SHOWN
         ),
         Metric("chosen", is_chosen),
     ]
-
-
-def _median_f_error(trial: StructureTrial) -> float:
-    """Median over the points left out; a run without a frequency counts as infinitely far off."""
-    errors = np.array([abs(point.run.f_error) for point in trial.found])
-    return float(np.median(np.where(np.isnan(errors), np.inf, errors)))
 
 
 def map_table(branches: Mapping[str, Branch], which: str) -> pd.DataFrame:

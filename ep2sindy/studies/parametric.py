@@ -25,8 +25,15 @@ from ep2sindy.operating.point_fits import (
     fit_points,
     search_shared,
 )
-from ep2sindy.operating.quantities import REFINED, Fitted, PointResult, Quantity
-from ep2sindy.operating.quantity_law import exponent, laws, trends
+from ep2sindy.operating.quantities import (
+    REFINED,
+    Fitted,
+    PointResult,
+    Quantity,
+    fit_control_laws,
+    fit_power_law,
+    fit_trends,
+)
 from ep2sindy.operating.records import point_label
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import (
@@ -211,7 +218,7 @@ class Study:
         return Outcome(
             study=how,
             results=results,
-            laws=laws(results, law, max_terms=self.law.max_terms),
+            laws=fit_control_laws(results, law, max_terms=self.law.max_terms),
             joint=search_shared(points, results, how, tying, rng=together, progress=run.watch),
             along=[(each.along, each.at) for each in self.trends],
             published=published,
@@ -364,8 +371,8 @@ class Outcome:
         """Sections on all points together: laws, trends, common support."""
         shown = self._tables
         tied = _table(shown["tied"], ["state"], TIED)
-        if self.joint and self.joint.why_not_tied:
-            tied = [Text(f"Not tied by a law: {self.joint.why_not_tied}.")]
+        if self.joint and self.joint.why_no_law:
+            tied = [Text(f"Not tied by a law: {self.joint.why_no_law}.")]
         laws = _table(shown["laws"], ["fit"], LEFT_OUT)
         if not self.laws:
             n = max(sum(each.usable(fit) for each in self.results) for fit in self.study.fits)
@@ -500,12 +507,12 @@ def supports_table(
 
 
 def tied_table(joint: SharedResult | None) -> pd.DataFrame:
-    """R2 at every point, with coefficients tied over all points and without."""
+    """R2 at every point, with coefficients by one law and with its own."""
     rows = []
-    if joint and joint.tied:
-        for state, test in joint.tied.tests.items():
-            terms = ", ".join(joint.tied.law.numbers[state])
-            rows += [(state, terms, p, r2, test.r2_tied[p]) for p, r2 in test.r2_free.items()]
+    if joint and joint.fit:
+        for state, test in joint.fit.tests.items():
+            terms = ", ".join(joint.fit.law.numbers[state])
+            rows += [(state, terms, p, r2, test.r2_law[p]) for p, r2 in test.r2_free.items()]
     return pd.DataFrame(rows, columns=["state", "terms", "point", "r2_free", "r2_tied"])
 
 
@@ -517,12 +524,11 @@ def trends_table(
     """Exponents along each parameter with the others fixed, for our and the published values."""
     tables = [pd.DataFrame()]
     for parameter, at in along:
-        table = trends(results, along=parameter, at=at)
+        table = fit_trends(results, along=parameter, at=at)
         for index, row in table.iterrows():
             known = rows_at(published, {**at, "fit": row["fit"], "quantity": row["quantity"]})
-            table.loc[index, "thesis"] = exponent(
-                known[parameter].to_numpy(dtype=float), known["value"].to_numpy(dtype=float)
-            )
+            x, values = (known[c].to_numpy(dtype=float) for c in (parameter, "value"))
+            table.loc[index, "thesis"], _ = fit_power_law(x, values)
         tables.append(table)
     return pd.concat(tables, ignore_index=True)
 
@@ -573,8 +579,8 @@ def shared_summary(joint: SharedResult | None) -> dict[str, Any] | None:
         return None
     return {
         "terms": {state: list(terms) for state, terms in joint.found.chosen.items()},
-        "tied": joint.tied and joint.tied.law.numbers,
-        "why_not_tied": joint.why_not_tied or None,
+        "tied": joint.fit and joint.fit.law.numbers,
+        "why_not_tied": joint.why_no_law or None,
     }
 
 

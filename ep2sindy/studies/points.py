@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from ep2sindy.data.quantities import STEP_DOUBT
 from ep2sindy.data.trajectory import ConstantStateError
 from ep2sindy.operating.file_names import FilePattern
-from ep2sindy.operating.records import OperatingRecord, naming, point_label
+from ep2sindy.operating.records import OperatingRecord, name_point, point_label
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.oscillation import Oscillation
@@ -100,7 +100,7 @@ class PointSource:
 
         A state that stays exactly constant makes a point steady, as no trajectory may hold it.
         """
-        with naming(self.parameters):
+        with name_point(self.parameters):
             try:
                 field = self.source.field()
                 if (status := field.attrs.get("status")) in WITHOUT_BREATHING:

@@ -14,9 +14,9 @@ from ep2sindy.figures.operating import cycle_figure, laws_figure, left_out_figur
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.choice import Branch, BranchSettings, find_branch, group_by_cycle
+from ep2sindy.operating.branch import Branch, BranchSettings, find_branch, group_by_cycle
 from ep2sindy.operating.fit import SETTINGS, error_statistics
-from ep2sindy.operating.law import law_basis
+from ep2sindy.operating.law import make_basis
 from ep2sindy.operating.map import Fate
 from ep2sindy.operating.records import OperatingRecord, most_central, point_label
 from ep2sindy.report.document import Block, Captioned, Picture, Result, Section, Table, Text
@@ -64,7 +64,7 @@ INTERVALS = (
     "number, not how far a law of this form is from the truth; for that see the points left out."
 )
 LEFT_OUT = (
-    "Each point in turn read off the law of the others, tied in one refinement, and run freely "
+    "Each point in turn read off the law of the others, refined over all of them, and run freely "
     "from one sample of its record, where the states move least. Errors are those against the "
     "record's cycle; a model lives within 1 % of frequency, 10 % of amplitude and 0.2 standard "
     "deviations of waveform; enclosed: whether the others enclose it; forecast, AR: half a period."
@@ -147,7 +147,7 @@ class Study:
         given = self._given
         sources, names = given.sources(self.source), given.names
         # Points too few for a law, even if all oscillate, are refused before any simulation.
-        law_basis(
+        make_basis(
             polynomial(names, degree=min(self.degrees)),
             np.array([[source.parameters[name] for name in names] for source in sources]),
             n_spare=1,
@@ -249,7 +249,7 @@ class Outcome:
         return {
             f"{name}_{number}": model
             for name, branch in self.branches.items()
-            for number, model in enumerate(branch.tied.models)
+            for number, model in enumerate(branch.refinement.models)
         }
 
     def tables(self) -> dict[str, pd.DataFrame]:
@@ -376,7 +376,7 @@ class Outcome:
         return Section(title, [Table(shown, bold=bold, note=TRIED)])
 
     def _law(self, name: str, branch: Branch) -> Section:
-        law, found = branch.law, branch.tied
+        law, found = branch.law, branch.refinement
         middle = most_central(branch.fit.records)
         model = law.model_at(middle.parameters)
         equations: list[Block] = [display_equation(model, state) for state in model.states]
@@ -441,8 +441,8 @@ class Outcome:
                     "structure": {s: list(t) for s, t in branch.fit.structure.items()},
                     "exact": list(branch.fit.relations.texts),
                     "degree": branch.choice.degree,
-                    "status": branch.tied.status,
-                    "loss": float(branch.tied.loss.mean()),
+                    "status": branch.refinement.status,
+                    "loss": float(branch.refinement.loss.mean()),
                     "left_out": error_statistics(branch.left_out),
                     "forecast": (each := TypicalSkill.of(self.skills[name])) and asdict(each),
                 }

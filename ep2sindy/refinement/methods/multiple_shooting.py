@@ -68,7 +68,7 @@ class MultipleShooting:
     A step must lower the sum of squared residuals plus a price times the gaps; if it does not, it
     is undone and the next one is damped (Levenberg-Marquardt), in units of what each scaling
     does to the trajectories. So no iteration leaves the finite numbers.
-    Each point has its own steps and leaves once it has converged. Points tied by a law
+    Each point has its own steps and leaves once it has converged. Points that share a law
     move together: the point with the shortest allowed step sets the step of all. They have
     converged when every point has, and failed when any point has.
     tolerance: convergence requires the relative change of every scaling, and the gaps, to be
@@ -395,7 +395,7 @@ def newton_step(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Change of the unknowns, of the scalings (points, free) and of the nodes, by least squares.
 
-    The unknowns are theta if a law ties the points, otherwise the scalings. damping: by point;
+    The unknowns are theta if the points share a law, otherwise the scalings. damping: by point;
     None holds the unknowns and moves the nodes alone.
     NaN at points whose tangents overflow.
     """

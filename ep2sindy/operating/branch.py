@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
@@ -12,7 +13,6 @@ from jaxtyping import Float
 
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library
-from ep2sindy.operating.constraint import Known
 from ep2sindy.operating.fit import (
     LeaveOneOut,
     OperatingFit,
@@ -20,7 +20,7 @@ from ep2sindy.operating.fit import (
     leave_one_out,
     operating_fit,
 )
-from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.law import Known, OperatingLaw, make_basis
 from ep2sindy.operating.map import MapPoint, law_map, map_points
 from ep2sindy.operating.records import (
     OperatingRecord,
@@ -65,7 +65,7 @@ class StructureTrial:
     case: StructureCase
     fit: OperatingFit
     degree: int
-    found: Sequence[LeaveOneOut]
+    left_out: Sequence[LeaveOneOut]
 
     @property
     def n_numbers(self) -> int:
@@ -74,7 +74,7 @@ class StructureTrial:
 
     @property
     def errors(self) -> np.ndarray:
-        return np.maximum([each.error for each in self.found], CLOSE)
+        return np.maximum([each.error for each in self.left_out], CLOSE)
 
 
 def candidate_structures(
@@ -102,13 +102,29 @@ def candidate_structures(
     ]
 
 
+@dataclass(frozen=True, eq=False)
+class BranchSettings:
+    """Settings for finding the law of a branch.
+
+    cases: structures to choose from; if there is none, supports of two to `max_terms` terms of the
+    library in each equation. degrees: of the polynomials, tried in turn. n_map: points of the map
+    along each parameter.
+    """
+
+    library: Library
+    cases: Sequence[StructureCase]
+    max_terms: int
+    degrees: Sequence[int]
+    settings: RefinementSettings
+    n_map: int
+    seed: int
+
+
 def try_structures(
     records: Sequence[OperatingRecord],
     cases: Sequence[StructureCase],
-    degrees: Sequence[int],
+    how: BranchSettings,
     *,
-    settings: RefinementSettings,
-    seed: int = 0,
     workers: Workers | None = None,
     progress: Progress = SILENT,
 ) -> list[StructureTrial]:
@@ -116,15 +132,15 @@ def try_structures(
 
     Raises ValueError if they suffice for none.
     """
-    one = partial(_try_structure, records=records, degrees=degrees, settings=settings, seed=seed)
     stage = progress.stage(len(cases), "structure", "laws at points left out")
+    one = partial(_try_structure, records=records, how=how)
     by_structure = collect(workers or Serial(), one, cases, stage)
     found = [trial for trials in by_structure for trial in trials]
     if not found:
         n = len(records)
         raise ValueError(
-            f"{n} operating points suffice for no law of degree {min(degrees)}, each left out in "
-            "turn: add points, or lower the degree"
+            f"{n} operating points suffice for no law of degree {min(how.degrees)}, each left out "
+            "in turn: add points, or lower the degree"
         )
     return found
 
@@ -145,12 +161,7 @@ def choose(found: Sequence[StructureTrial]) -> StructureTrial:
 
 
 def _try_structure(
-    case: StructureCase,
-    *,
-    records: Sequence[OperatingRecord],
-    degrees: Sequence[int],
-    settings: RefinementSettings,
-    seed: int,
+    case: StructureCase, *, records: Sequence[OperatingRecord], how: BranchSettings
 ) -> list[StructureTrial]:
     fit = operating_fit(
         records,
@@ -158,35 +169,16 @@ def _try_structure(
         case.structure,
         relations=case.relations,
         known=case.known,
-        settings=settings,
-        seed=seed,
+        settings=how.settings,
+        seed=how.seed,
     )
     found = []
-    for degree in degrees:
-        try:
-            left_out = leave_one_out(fit, fit.functions(degree))
-        except ValueError:
-            continue  # too few points for this degree
-        found.append(StructureTrial(case, fit, degree, left_out))
+    for degree in how.degrees:
+        with suppress(ValueError):  # too few points for this degree
+            found.append(
+                StructureTrial(case, fit, degree, leave_one_out(fit, fit.functions(degree)))
+            )
     return found
-
-
-@dataclass(frozen=True, eq=False)
-class BranchSettings:
-    """Settings for finding the law of a branch.
-
-    cases: structures to choose from; if there is none, supports of two to `max_terms` terms of the
-    library in each equation. degrees: of the polynomials, tried in turn. n_map: points of the map
-    along each parameter.
-    """
-
-    library: Library
-    cases: Sequence[StructureCase]
-    max_terms: int
-    degrees: Sequence[int]
-    settings: RefinementSettings
-    n_map: int
-    seed: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +194,7 @@ class Branch:
     trials: Sequence[StructureTrial]
     choice: StructureTrial
     law: OperatingLaw
-    tied: LawRefinement
+    refinement: LawRefinement
     left_out: Sequence[LeaveOneOut]
     smooth: tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]
     at_points: Sequence[MapPoint]
@@ -243,29 +235,21 @@ def find_branch(
     cases = how.cases or candidate_structures(
         records, how.library, max_terms=how.max_terms, progress=progress
     )
-    trials = try_structures(
-        records,
-        cases,
-        how.degrees,
-        settings=how.settings,
-        seed=how.seed,
-        workers=workers,
-        progress=progress,
-    )
+    trials = try_structures(records, cases, how, workers=workers, progress=progress)
     choice = choose(trials)
     functions = choice.fit.functions(choice.degree)
-    law, found = choice.fit.tied(functions, progress=progress)
+    law, refinement = choice.fit.refine_law(functions, progress=progress)
     grid = map_points(points, how.n_map)
     return Branch(
         name=name,
         trials=trials,
         choice=choice,
         law=law,
-        tied=found,
+        refinement=refinement,
         left_out=leave_one_out(
             choice.fit, functions, start=law, workers=workers, progress=progress
         ),
-        smooth=interpolation_errors(records, choice.fit.basis(functions)),
+        smooth=interpolation_errors(records, make_basis(functions, choice.fit.points)),
         at_points=_follow(law, records, points, workers, progress),
         map=_follow(law, records, grid, workers, progress),
     )

@@ -1,0 +1,160 @@
+"""Least squares over the rows of several points, with coefficients that are functions of the point.
+
+A law says coef(p) = W f(p), with f the functions of the operating parameters. Whatever a law is
+fitted to (rows of a regression, coefficients that were fitted to each point, one measured quantity)
+it minimises the same sum of squares over the points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.data.numbers import column_norms, zero_to_one
+from ep2sindy.regression.least_squares import LeastSquares
+from ep2sindy.runtime.values import read_only
+
+# Functions whose columns of unit norm have a singular value below this share of the largest cannot
+# be told apart at the points. They are exact numbers, so this is far below what rows allow.
+RANK = 1e-10
+
+# A point with this leverage alone determines some coefficient: without it there is no fit.
+FULL_LEVERAGE = 1.0 - 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Functions of the operating parameters at the points, with an orthonormal basis of them.
+
+    A solution in the orthonormal basis does not depend on the units of the parameters.
+    Raises ValueError if the points cannot tell the functions apart.
+    """
+
+    values: Float[np.ndarray, "points functions"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", read_only(self.values))
+        n_points, n_terms = self.values.shape
+        if not np.isfinite(self.values).all():
+            raise ValueError(f"a basis must be finite: {self.values.tolist()} came")
+        if n_points < n_terms:
+            raise ValueError(
+                f"a law of {n_terms} terms needs as many points: {n_points} came; use one of "
+                "fewer terms"
+            )
+        strength = np.linalg.svd(self.values / column_norms(self.values), compute_uv=False)
+        if strength[-1] <= RANK * strength[0]:
+            raise ValueError(
+                f"{n_points} points do not tell the {n_terms} terms of a law apart: let every "
+                "parameter take more values, or use a law of fewer terms"
+            )
+
+    @cached_property
+    def _factors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        size = column_norms(self.values)
+        return *np.linalg.qr(self.values / size), size
+
+    @property
+    def orthonormal(self) -> Float[np.ndarray, "points functions"]:
+        return self._factors[0]
+
+    def to_law(self, size: Float[np.ndarray, " coefs"]) -> Float[np.ndarray, "unknowns unknowns"]:
+        """Matrix from the unknowns of a fit to the law W.ravel().
+
+        The unknowns are factors of the orthonormal basis, coefficient by coefficient, in units of
+        the coefficient's size.
+        """
+        _, triangle, norms = self._factors
+        return np.kron(np.diag(size), np.linalg.inv(triangle) / norms[:, None])
+
+    def predict_left_out(
+        self, values: Float[np.ndarray, "points ..."]
+    ) -> Float[np.ndarray, "points ..."]:
+        """Values at every point by the least-squares fit to all other points.
+
+        They are y - r / (1 - h), with r the residual and h the diagonal of the hat matrix; infinite
+        if one point is indispensable.
+        Source: Allen 1974, doi:10.1080/00401706.1974.10489157.
+        """
+        q = self.orthonormal
+        leverage = np.square(q).sum(axis=1)
+        if leverage.max() > FULL_LEVERAGE:
+            return np.full_like(values, np.inf)
+        left = values - q @ (q.T @ values)
+        return values - (left.T / (1.0 - leverage)).T
+
+
+@dataclass(frozen=True, eq=False)
+class PooledFit:
+    """A law fitted by `pool_rows`: `fit` of the unknowns, and their matrix `to_law`."""
+
+    fit: LeastSquares
+    to_law: Float[np.ndarray, "unknowns unknowns"]
+    n_functions: int
+
+    @property
+    def law(self) -> Float[np.ndarray, "coefs functions"]:
+        return (self.to_law @ self.fit.coef).reshape(-1, self.n_functions)
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "unknowns unknowns"]:
+        """Covariance of law.ravel(), for rows of variance 1."""
+        root = self.to_law @ self.fit.root
+        return root @ root.T
+
+
+def pool_rows(
+    rows: Sequence[tuple[Float[np.ndarray, "_ coefs"], Float[np.ndarray, " _"]]],
+    basis: Basis,
+    size: Float[np.ndarray, " coefs"],
+) -> PooledFit:
+    """Fit one law to the rows (theta_p, y_p) of all points p.
+
+    The law W minimises the sum over p of |theta_p W f(p) - y_p|^2 (`LeastSquares`). Assumes that
+    all rows have equal variances: divide each point's by its own.
+    """
+    # Row r of point p holds theta_p[r, k] q_p[m] in the column of coefficient k and function m.
+    blocks = zip(rows, basis.orthonormal, strict=True)
+    design = np.concatenate([np.kron(theta * size, q[None]) for (theta, _), q in blocks])
+    fit = LeastSquares.of_rows(design, np.concatenate([y for _, y in rows]))
+    return PooledFit(fit, basis.to_law(size), basis.values.shape[1])
+
+
+def pool_coefficients(
+    coefficients: Float[np.ndarray, "points coefs"],
+    information: Float[np.ndarray, "points coefs coefs"] | None,
+    basis: Basis,
+) -> Float[np.ndarray, "coefs functions"]:
+    """Law whose coefficients are closest to those of the points, weighted by their information.
+
+    With the deviation miss at each point, the sum over the points of miss @ information @ miss is
+    minimised. Each information (an inverse covariance) is divided by its trace in relative
+    coefficients, so that points have equal weight. information: None weights all coefficients
+    equally.
+    """
+    n_points, n_coefs = coefficients.shape
+    size = zero_to_one(np.sqrt(np.square(coefficients).mean(axis=0)))
+    if information is None:
+        information = np.broadcast_to(np.diag(size**-2.0), (n_points, n_coefs, n_coefs))
+    roots = [_root(each * np.outer(size, size)) / size for each in information]
+    rows = [(root, root @ own) for root, own in zip(roots, coefficients, strict=True)]
+    return pool_rows(rows, basis, size).law
+
+
+def invert_covariance(
+    covariance: Float[np.ndarray, "coefs coefs"],
+) -> Float[np.ndarray, "coefs coefs"]:
+    """Inverse of a covariance; directions with variance below rounding get no weight."""
+    size = zero_to_one(np.sqrt(np.diag(covariance)))
+    return np.linalg.pinv(covariance / np.outer(size, size), hermitian=True) / np.outer(size, size)
+
+
+def _root(information: np.ndarray) -> np.ndarray:
+    """Root R with R^T R = information / trace; R is not triangular."""
+    values, vectors = np.linalg.eigh(information / zero_to_one(np.array(np.trace(information))))
+    root: np.ndarray = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    return root
