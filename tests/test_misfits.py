@@ -162,7 +162,7 @@ def test_what_explains_more_comes_first_then_the_simpler() -> None:
     ]
     assert [each.explained.tolist() for each in order] == [[True] * 2, [True] * 2, [True, False],
                                                            [False] * 2]  # fmt: skip
-    assert sorted(order[::-1], key=lambda each: each.rank) == order
+    assert sorted(reversed(order), key=lambda each: each.rank) == order
     assert replace(right, tests=(fails, half)).signs == [
         "x is off by 2", "y is off by nan", "both are off",
     ]  # fmt: skip
