@@ -16,6 +16,7 @@ from ep2sindy.data.gaps import between_gaps
 from ep2sindy.estimation import explanation
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit
 from ep2sindy.estimation.noise import ALIKE_SAMPLES, Noise, noise_beside
+from ep2sindy.estimation.observation import LackOfFit
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.systems.systems import System
@@ -140,3 +141,29 @@ def test_a_delay_at_three_standard_errors_is_none() -> None:
     found = ep.estimate([run], system.model.library)
     assert not found.misfit
     np.testing.assert_array_equal(found.model.coef != 0.0, system.model.coef != 0.0)
+
+
+def test_what_explains_more_comes_first_then_the_simpler() -> None:
+    """An exact trajectory explains all states or none; under process noise each by itself."""
+    run = ep.lotka_volterra().trajectory(noise=0.05, rng=0).window(0, 300)
+    right = from_smooth(
+        scale_problem([run], ep.polynomial(run.state_names, degree=2)), None, max_terms=7
+    )
+    fails = LackOfFit(np.array([2.0, np.nan]), 1.0, "{state} is off by {value:g}")
+    half = LackOfFit(np.array([0.0, 2.0]), 1.0, "both are off")
+    observed = replace(right.observation, process=np.ones(2))
+    likelier = replace(right, deviance=right.deviance - 1e3)
+    moved = replace(likelier, observation=observed)
+    order = [
+        right,
+        moved,  # as well, by more
+        replace(moved, tests=(half,)),
+        replace(likelier, tests=(half,)),
+    ]
+    explained = [each.explained.tolist() for each in order]
+    assert explained == [[True, True], [True, True], [True, False], [False, False]]
+    ranks = [each.rank for each in order]
+    assert ranks == sorted(ranks)
+    assert replace(right, tests=(fails, half)).signs == [
+        "x is off by 2", "y is off by nan", "both are off",
+    ]  # fmt: skip
