@@ -160,9 +160,10 @@ def test_what_explains_more_comes_first_then_the_simpler() -> None:
         replace(moved, tests=(half,)),
         replace(likelier, tests=(half,)),
     ]
-    assert [each.explained.tolist() for each in order] == [[True] * 2, [True] * 2, [True, False],
-                                                           [False] * 2]  # fmt: skip
-    assert sorted(reversed(order), key=lambda each: each.rank) == order
+    explained = [each.explained.tolist() for each in order]
+    assert explained == [[True, True], [True, True], [True, False], [False, False]]
+    ranks = [each.rank for each in order]
+    assert ranks == sorted(ranks)
     assert replace(right, tests=(fails, half)).signs == [
         "x is off by 2", "y is off by nan", "both are off",
     ]  # fmt: skip
