@@ -8,7 +8,14 @@ import ep2sindy as ep
 from ep2sindy.model import stability
 from ep2sindy.model.stability import LimitCycle, share_reaching
 from ep2sindy.model.vector_field import VectorField
-from ep2sindy.refinement.kernels import gap_sizes, squares, triangles
+from ep2sindy.refinement.kernels import (
+    condense,
+    gap_sizes,
+    propagate,
+    squares,
+    starts,
+    triangles,
+)
 from ep2sindy.refinement.ode import ODE, Drive, ScaledEquations
 from ep2sindy.refinement.steps import FusedRungeKutta, RungeKutta, fastest_step
 from tests.models import model_of
@@ -102,3 +109,46 @@ def test_each_start_takes_no_more_steps_than_allowed() -> None:
     np.testing.assert_allclose(y[:, 0], np.cos(1.0 / 16.0) + np.sin(1.0 / 16.0), rtol=1e-9)
     y, *_ = stability._approach(field, np.ones((3, 2)), np.zeros(2), 1.2, 1.0, 40)
     assert y.shape == (0, 2)
+
+
+@pytest.mark.parametrize("block", [7, 3])
+@pytest.mark.parametrize("free_start", [True, False])
+def test_condensed_windows_are_the_least_squares_of_their_linearised_paths(
+    block: int, free_start: bool
+) -> None:
+    """Rows of W (dx_k + x_k - data_k), dx_(k+1) = F_x dx_k + F_s ds + F - x_(k+1), written out."""
+    rng, n, p, n_samples = np.random.default_rng(0), 2, 3, 7
+    maps = rng.normal(size=(1, 1, n_samples - 1, n, n + p + 1))
+    nodes, data = rng.normal(size=(2, 1, 1, n_samples, n))
+    weights, change = np.array([[1.5, 0.5]]), rng.normal(size=(1, p))
+    n_start = n if free_start else 0
+    found = condense(maps, nodes, data, weights, block, n_start)[0, 0]
+    held = (data - nodes)[:, :, ::block]
+    first = starts(found[None, None], change, n) if free_start else held
+    moved = propagate(maps, nodes, np.ascontiguousarray(first), change, block)[0, 0]
+    for b, triangle in enumerate(found):
+        samples = range(b * block, min((b + 1) * block, n_samples))
+        columns = np.zeros((n, n_start + p + 1))  # dx by the start, ds and one
+        columns[:, :n_start] = np.eye(n, n_start)
+        if not free_start:
+            columns[:, -1] = (data - nodes)[0, 0, samples[0]]
+        rows, paths = [], []
+        for k in samples:
+            left = columns.copy()
+            left[:, -1] += (nodes - data)[0, 0, k]
+            rows.append(weights[0][:, None] * left)
+            paths.append(columns)
+            if k + 1 < n_samples:
+                step, ahead = maps[0, 0, k], np.zeros_like(columns)
+                ahead[:, n_start:] = step[:, n:]
+                ahead[:, -1] -= nodes[0, 0, k + 1]
+                columns = ahead + step[:, :n] @ columns
+        dense = np.concatenate(rows)
+        np.testing.assert_allclose(triangle.T @ triangle, dense.T @ dense, atol=1e-10)
+        unknowns = np.append(change[0], 1.0)
+        if free_start:
+            target = -dense[:, n:] @ unknowns
+            best = np.linalg.lstsq(dense[:, :n], target, rcond=None)[0]
+            np.testing.assert_allclose(first[0, 0, b], best, rtol=1e-9)
+            unknowns = np.append(best, unknowns)
+        np.testing.assert_allclose(moved[samples], [x @ unknowns for x in paths], atol=1e-9)
