@@ -1,4 +1,4 @@
-"""Estimating states and coefficients together: exact elimination, supports, noise, bad input."""
+"""Estimating states and coefficients together: exact marginals, supports, noise, bad input."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from benchmarks.known_systems import noisy
 from ep2sindy.data.sensor import Bounds
 from ep2sindy.discovery.method import method_of
 from ep2sindy.estimation import cost, explanation, kernels, likelihood
-from ep2sindy.estimation.kernels import departures, eliminate, filtered
+from ep2sindy.estimation.kernels import filter_states, marginalise, smooth_corrections
 from ep2sindy.estimation.likelihood import (
     Gram,
     Level,
@@ -80,10 +80,12 @@ def dense_rows(
     return np.concatenate(rows), np.concatenate(targets)
 
 
-def test_eliminated_states_leave_the_squares_of_the_dense_problem(rng: np.random.Generator) -> None:
+def test_marginal_squares_are_those_of_the_dense_problem(
+    rng: np.random.Generator,
+) -> None:
     case = linear_case(rng)
     rows, targets = dense_rows(*case, 10.0)
-    hessian, gradient, least, _ = eliminate(*case, 10.0)
+    hessian, gradient, least, _ = marginalise(*case, 10.0)
     n_states = rows.shape[1] - len(gradient)
     states, own = rows[:, :n_states], rows[:, n_states:]
     off = np.eye(len(rows)) - states @ np.linalg.pinv(states)
@@ -99,7 +101,7 @@ def test_the_spread_of_innovations_is_the_determinant_of_the_samples(
     """Products of many small variances would leave the range of numbers."""
     flow, defects, residuals, variance, process = linear_case(rng, n=n, p=0)
     flow, variance, process = flow / 3.0, size * variance, size * process
-    _, _, _, log_spread = eliminate(flow, defects, residuals, variance, process, 10.0)
+    _, _, _, log_spread = marginalise(flow, defects, residuals, variance, process, 10.0)
     n, d = residuals.shape
     # Covariance of all states, from the first one's and the steps'.
     to = np.zeros((n * d, n * d))
@@ -119,10 +121,10 @@ def test_squares_add_up_over_pieces_of_a_record(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flow, *case = linear_case(rng, n=50)
-    whole = eliminate(flow / 3.0, *case, 10.0)
+    whole = marginalise(flow / 3.0, *case, 10.0)
     monkeypatch.setattr(kernels, "FEWEST", 14)  # seven samples of two states
     monkeypatch.setattr(kernels, "PIECE", 0)
-    for found, expected in zip(eliminate(flow / 3.0, *case, 10.0), whole, strict=True):
+    for found, expected in zip(marginalise(flow / 3.0, *case, 10.0), whole, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
@@ -131,19 +133,19 @@ def test_the_last_state_of_the_filter_is_that_of_the_dense_problem(
 ) -> None:
     case = linear_case(rng, p=0)
     rows, targets = dense_rows(*case, 10.0)
-    innovations, mean, cov = filtered(*case, 10.0)
+    innovations, mean, cov = filter_states(*case, 10.0)
     d = len(mean)
     np.testing.assert_allclose(mean, np.linalg.lstsq(rows, targets, rcond=None)[0][-d:], rtol=1e-9)
     np.testing.assert_allclose(cov, np.linalg.inv(rows.T @ rows)[-d:, -d:], rtol=1e-9)
     assert np.array_equal(np.isnan(innovations), np.isnan(case[2]))
-    assert np.nansum(innovations**2) == pytest.approx(eliminate(*case, 10.0)[2])
+    assert np.nansum(innovations**2) == pytest.approx(marginalise(*case, 10.0)[2])
 
 
-def test_departures_are_those_of_the_dense_problem(rng: np.random.Generator) -> None:
+def test_smooth_corrections_are_those_of_the_dense_problem(rng: np.random.Generator) -> None:
     flow, defects, residuals, variance, process = linear_case(rng, p=0)
     rows, targets = dense_rows(flow, defects, residuals, variance, process, 10.0)
     expected = np.linalg.lstsq(rows, targets, rcond=None)[0].reshape(residuals.shape)
-    found = departures(flow, defects, residuals, variance, process, 10.0)
+    found = smooth_corrections(flow, defects, residuals, variance, process, 10.0)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
@@ -620,9 +622,9 @@ def test_a_pass_over_many_runs_is_a_single_call(
 
     def tell(flow: np.ndarray, *rest: np.ndarray) -> tuple:
         calls.append(len(flow))
-        return eliminate(flow, *rest)
+        return marginalise(flow, *rest)
 
-    monkeypatch.setattr(likelihood, "eliminate", tell)
+    monkeypatch.setattr(likelihood, "marginalise", tell)
     gram(fit)
     assert calls == [len(fit.path) - 1]
 

@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.estimation.kernels import departures, eliminate
+from ep2sindy.estimation.kernels import marginalise, smooth_corrections
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 from ep2sindy.model.flow import Flow
 
@@ -127,7 +127,7 @@ class TrajectoryFit:
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """The squares as a quadratic function of all free coefficients, the states eliminated.
+    """The squares as a quadratic function of all free coefficients, the states marginalised.
 
     squares(z) = offset - 2 linear' z + z' quadratic z, exact where the fit is linear.
     """
@@ -238,7 +238,7 @@ def _move(
     """Change of the path, for a change of the coefficients."""
     d = about.defects.shape[1]
     defects = about.defects + about.slopes[:, :, d:] @ change
-    return departures(*about.of_states._replace(defects=defects))
+    return smooth_corrections(*about.of_states._replace(defects=defects))
 
 
 def divergence_rate(fit: TrajectoryFit) -> float:
@@ -262,13 +262,13 @@ def innovations(fit: TrajectoryFit) -> tuple[Linearised, float, float]:
     sum of the logarithms of their variances.
     """
     about = linearise(fit)
-    _, _, least, logs = eliminate(*about)
+    _, _, least, logs = marginalise(*about)
     return about, least, logs
 
 
 @np.errstate(over="ignore", invalid="ignore")  # `Gram.finite` says whether the result counts
 def gram(fit: TrajectoryFit) -> Gram:
-    """Linearise about a fit: all free coefficients of all equations, the states eliminated."""
+    """Linearise about a fit: all free coefficients of all equations, the states marginalised."""
     quadratic, gradient, least, _ = hessian_on(fit, np.ones_like(fit.support))
     linear = quadratic @ fit.free + gradient
     offset = least + fit.free @ quadratic @ fit.free + 2.0 * fit.free @ gradient
@@ -302,7 +302,7 @@ def enough_substeps(fit: TrajectoryFit, *, share: float = 0.1) -> int:
 
 
 class Linearised(NamedTuple):
-    """The objective about a fit, as the kernels take it: `eliminate`, `filtered`, `departures`.
+    """The objective about a fit, as the three functions of `kernels` take it.
 
     slopes: derivatives of the flow by the state, then by the parameters; zero between records, as
     are the defects, what the flow from each sample misses of the next state of the path. residuals,
@@ -352,13 +352,13 @@ def flow_by(fit: TrajectoryFit, support: Bool[np.ndarray, " free"], *, n_more: i
 def hessian_on(
     fit: TrajectoryFit, support: Bool[np.ndarray, " free"]
 ) -> tuple[np.ndarray, np.ndarray, float, Linearised]:
-    """Derivatives of the squares by the coefficients of a support, the states eliminated.
+    """Derivatives of the squares by the coefficients of a support, the states marginalised.
 
     Returns half the second derivatives, minus half the first, the least squares with these
     coefficients unchanged, and the linearisation.
     """
     about = linearise(fit, flow_by(fit, support))
-    return *eliminate(*about)[:3], about
+    return *marginalise(*about)[:3], about
 
 
 def within_bounds(

@@ -20,7 +20,7 @@ from math import inf, log
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.estimation.kernels import eliminate
+from ep2sindy.estimation.kernels import marginalise
 from ep2sindy.estimation.likelihood import Gram, TrajectoryFit, flow_by, linearise
 from ep2sindy.estimation.noise import Noise
 from ep2sindy.estimation.problem import EstimationProblem
@@ -192,7 +192,7 @@ def delayed_gram(fit: TrajectoryFit) -> DelayedGram:
     rates = problem.rates(problem.all_records, fit.path, fit.free)
     flow.slopes[:, :, -d:] = flow.slopes[:, :, :d] * rates[:-1, None, :]
     flow.slopes[:, np.arange(d), np.arange(-d, 0)] -= rates[1:]
-    quadratic, gradient, least, _ = eliminate(*linearise(fit, flow))
+    quadratic, gradient, least, _ = marginalise(*linearise(fit, flow))
     linear = quadratic[:, :n] @ fit.free + gradient
     own = quadratic[:n, :n]
     offset = least + fit.free @ own @ fit.free + 2.0 * fit.free @ gradient[:n]

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.estimation.kernels import eliminate, filtered
+from ep2sindy.estimation.kernels import filter_states, marginalise
 from ep2sindy.estimation.likelihood import TrajectoryFit, linearise
 from ep2sindy.estimation.noise import (
     MORE_DEGREES,
@@ -82,7 +82,7 @@ def likely_errors(fit: TrajectoryFit) -> Errors:
         bounded = np.clip(logs, low, np.log(MOST))
         variance = np.square(tried.level.noise)
         case = about._replace(variance=variance, process=tried.process)
-        return float(np.square(logs - bounded).sum() + sum(eliminate(*case)[2:]))
+        return float(np.square(logs - bounded).sum() + sum(marginalise(*case)[2:]))
 
     assert level.process_noise is not None
     start = np.log(np.append(level.noise[0, measured], level.process_noise))
@@ -157,7 +157,7 @@ def _test_innovations(fit: TrajectoryFit) -> list[LackOfFit]:
     explains beside the terms of the equation, and the share that all of them explain: what an
     equation lacks is a function of the states, and lasts as long as these.
     """
-    problem, found = fit.problem, np.nan_to_num(filtered(*linearise(fit))[0])
+    problem, found = fit.problem, np.nan_to_num(filter_states(*linearise(fit))[0])
     new = [part[SETTLING:] for part in problem.split(found)]
     joined = np.concatenate(new)
     if not (np.abs(joined) < RUNAWAY).all():

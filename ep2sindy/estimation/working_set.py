@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.cost import SMALL
-from ep2sindy.estimation.kernels import departures, eliminate
+from ep2sindy.estimation.kernels import marginalise, smooth_corrections
 from ep2sindy.estimation.likelihood import (
     FREE_START,
     Level,
@@ -195,7 +195,7 @@ def _own_squares(
     residuals, apparent, _ = observe(record, path, np.square(fit.level.noise))
     defects = -np.diff(path[:, one], axis=0)
     flow[record.breaks] = defects[record.breaks] = 0.0
-    quadratic, linear, offset, _ = eliminate(
+    quadratic, linear, offset, _ = marginalise(
         np.ascontiguousarray(flow), defects, np.ascontiguousarray(residuals[:, one]),
         np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(fit.process[:, one]),
         FREE_START,
@@ -264,7 +264,7 @@ def _weighted_defects(
     d, states = noise.shape[1], about.of_states
     moved = about.slopes[:, :, d:] @ change
     draw = np.where(np.isfinite(about.residuals), noise, np.nan)
-    off = departures(*states._replace(defects=moved, residuals=draw))
+    off = smooth_corrections(*states._replace(defects=moved, residuals=draw))
     return (np.einsum("kij,kj->ki", states.slopes, off[:-1]) + moved - off[1:]) / about.process
 
 

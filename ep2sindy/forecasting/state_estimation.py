@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import with_guess_by
-from ep2sindy.estimation.kernels import filtered
+from ep2sindy.estimation.kernels import filter_states
 from ep2sindy.estimation.likelihood import (
     FREE_START,
     Level,
@@ -111,7 +111,7 @@ class StateEstimator:
         """
         record = self.problem.record(_select_variables(self.model, history)).end(self.memory)
         fit = self.fit_path(record, record.samples)
-        _, mean, covariance = filtered(*linearise(fit))
+        _, mean, covariance = filter_states(*linearise(fit))
         end, scale = fit.path[-1] + mean, self.problem.scale
         if not (np.isfinite(end).all() and np.isfinite(covariance).all()):
             # The model runs away between two samples: they tell no more than a guess does.
