@@ -25,13 +25,14 @@ from ep2sindy.estimation.likelihood import (
     TrajectoryFit,
     divergence_rate,
     fit_paths,
+    flow_by,
     gram,
     innovations,
 )
 from ep2sindy.estimation.noise import _shown_by_samples
 from ep2sindy.estimation.observation import LackOfFit, Solution
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states, squares_of_steps
+from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
@@ -163,7 +164,7 @@ def test_the_flow_is_the_models_integral_between_samples() -> None:
     system = ep.lorenz()
     problem, run = lorenz_problem()
     (record,) = problem.records
-    ends = problem.ends(record, record.samples[:-1], truth(problem, system.model), 8)
+    ends = problem.ends(record.samples[:-1], truth(problem, system.model), 8)
     for k in (0, 50, 198):
         exact = solve_ivp(
             lambda _, x: system.model.derivative(x, np.empty(0)),
@@ -179,10 +180,8 @@ def test_the_flow_converges_with_the_fourth_order() -> None:
     problem, _ = lorenz_problem()
     (record,) = problem.records
     free = truth(problem, ep.lorenz().model)
-    fine = problem.ends(record, record.samples[:-1], free, 64)
-    errors = [
-        np.abs(problem.ends(record, record.samples[:-1], free, n) - fine).max() for n in (1, 2, 4)
-    ]
+    fine = problem.ends(record.samples[:-1], free, 64)
+    errors = [np.abs(problem.ends(record.samples[:-1], free, n) - fine).max() for n in (1, 2, 4)]
     slopes = -np.diff(np.log2(errors))
     np.testing.assert_allclose(slopes, 4.0, atol=0.2)
 
@@ -195,16 +194,17 @@ def test_sensitivities_are_derivatives_of_the_flow(relations: Sequence[str]) -> 
     support = np.zeros(len(free), dtype=np.bool_)
     support[[1, 4, 12, -1]] = True
     states = record.samples[:-1]
-    flow = problem.flow(record, states, free, support, 2)
-    np.testing.assert_allclose(flow.ends, problem.ends(record, states, free, 2), rtol=1e-12)
+    level = Level(np.ones_like(record.samples), 1.0, n_substeps=2)
+    flow = flow_by(TrajectoryFit(problem, level, record.samples, free, support), support)
+    np.testing.assert_allclose(flow.ends, problem.ends(states, free, 2), rtol=1e-12)
     h = 1e-6
     for column, j in enumerate(np.flatnonzero(support)):
         step = h * (np.arange(len(free)) == j)
-        up, down = (problem.ends(record, states, free + s * step, 2) for s in (1, -1))
+        up, down = (problem.ends(states, free + s * step, 2) for s in (1, -1))
         np.testing.assert_allclose(flow.slopes[:, :, 3 + column], (up - down) / (2 * h), atol=1e-7)
     for i in range(3):
         step = h * (np.arange(3) == i)
-        up, down = (problem.ends(record, states + s * step, free, 2) for s in (1, -1))
+        up, down = (problem.ends(states + s * step, free, 2) for s in (1, -1))
         np.testing.assert_allclose(flow.slopes[:, :, i], (up - down) / (2 * h), atol=1e-7)
 
 
@@ -259,8 +259,8 @@ def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
 def test_block_by_block_finds_the_best_support_of_all() -> None:
     problem, fit = fitted_lorenz(0.1)
     pair, prices = gram(fit), term_prices(problem, 200.0)
-    full = best_support(problem, pair, prices, np.ones_like(fit.support), max_terms=10)
-    empty = best_support(problem, pair, prices, np.zeros_like(fit.support), max_terms=10)
+    full = best_support(problem, pair, prices, np.ones_like(fit.support))
+    empty = best_support(problem, pair, prices, np.zeros_like(fit.support))
     assert full.score == pytest.approx(empty.score)
     for j in range(len(prices)):
         changed = full.support ^ (np.arange(len(prices)) == j)
@@ -279,8 +279,8 @@ def test_alternatives_hold_an_exchange_between_equations_that_neither_wants_alon
     pair = Gram(columns.T @ columns, columns.T @ target, float(target @ target))
     prices = np.full(n, 3.0)
     chosen, true = np.arange(n) == first, np.arange(n) == other
-    assert np.array_equal(best_support(problem, pair, prices, chosen, max_terms=7).support, chosen)
-    found = alternatives(problem, pair, prices, chosen, within=3.0, max_terms=7)
+    assert np.array_equal(best_support(problem, pair, prices, chosen).support, chosen)
+    found = alternatives(problem, pair, prices, chosen, within=3.0)
     assert np.array_equal(found[0].support, true)
     assert found[0].score == pytest.approx(3.0)
     assert all(each.score <= 4.0 + 3.0 for each in found)
@@ -382,8 +382,8 @@ def test_noise_that_grows_with_the_state_is_weighed_so() -> None:
 def test_what_fits_comes_before_what_scores_lower(monkeypatch: pytest.MonkeyPatch) -> None:
     """The score of states that leave the flow is no likelihood."""
 
-    def leaves(*given: object, max_terms: int) -> Solution:
-        found = from_smooth(*given, max_terms=max_terms)
+    def leaves(*given: object) -> Solution:
+        found = from_smooth(*given)
         error = LackOfFit(np.full(2, 0.1), 0.0, "the states leave the model")
         return replace(found, deviance=found.deviance - 1e4, tests=(error,), flow_error=0.1)
 
@@ -598,7 +598,9 @@ def test_runs_are_joined_without_a_way_from_one_to_the_next(
         return pair.quadratic, pair.linear, least, logs, fit.squares
 
     def move_of(fit: TrajectoryFit) -> np.ndarray:
-        return likelihood._move(likelihood.hessian_on(fit, fit.support)[3], change)
+        about = likelihood.hessian_on(fit, fit.support)[3]
+        defects = about.defects + about.slopes[:, :, 2:] @ change
+        return smooth_corrections(*about.of_states._replace(defects=defects))
 
     totals = [0.0] * 5
     for record, path, noise, move in zip(
@@ -813,8 +815,8 @@ def test_a_path_that_misses_the_steps_of_its_model_is_no_trajectory() -> None:
 def test_right_models_meet_their_steps() -> None:
     run = LORENZ.trajectory(noise=0.2, rng=0)
     problem = scale_problem([run], LORENZ.model.library)
-    found = from_smooth(problem, None, max_terms=7)
-    missed = squares_of_steps(found.fit)[0]
+    found = from_smooth(problem, None)
+    missed = found.fit.squared_defects
     assert found.flow_error == 0.0
     assert (np.sqrt(missed / problem.n_samples) < 1e-2 * EXACT * found.noise.std).all()
 

@@ -127,7 +127,7 @@ def test_a_delay_competes_with_products_of_one_degree_more(draw: str, lacks: boo
         scale_problem([run], ep.polynomial(["x", "y"], degree=degree)) for degree in (2, 3)
     )
     problem = replace(problem, widen=lambda: wider)
-    found = from_smooth(problem, None, max_terms=7)
+    found = from_smooth(problem, None)
     late = explanation._align(found, 7)
     if lacks:  # whatever delay its false equations may have
         late = found
@@ -146,9 +146,7 @@ def test_a_delay_at_three_standard_errors_is_none() -> None:
 def test_what_explains_more_comes_first_then_the_simpler() -> None:
     """An exact trajectory explains all states or none; under process noise each by itself."""
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0).window(0, 300)
-    right = from_smooth(
-        scale_problem([run], ep.polynomial(run.state_names, degree=2)), None, max_terms=7
-    )
+    right = from_smooth(scale_problem([run], ep.polynomial(run.state_names, degree=2)), None)
     fails = LackOfFit(np.array([2.0, np.nan]), 1.0, "{state} is off by {value:g}")
     half = LackOfFit(np.array([0.0, 2.0]), 1.0, "both are off")
     observed = replace(right.observation, process=np.ones(2))

@@ -85,9 +85,7 @@ def test_the_sizes_of_process_noise_and_noise_are_found() -> None:
 def test_what_a_library_lacks_is_no_process_noise(noise: float) -> None:
     """x' lacks x^3."""
     run = ep.systems.van_der_pol().trajectory(noise=noise, rng=0)
-    found = solve_with_process_noise(
-        scale_problem([run], ep.polynomial(run.state_names, degree=2)), max_terms=7
-    )
+    found = solve_with_process_noise(scale_problem([run], ep.polynomial(run.state_names, degree=2)))
     _, _, single, _ = found.tests
     assert single.statistic.max() > 6.0
     assert not found.fits

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby, product
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.coerce import Task
@@ -234,23 +234,14 @@ def _insert_states(run: Trajectory, known: Columns, units: Mapping[str, str]) ->
     )
 
 
-def _powers_of(library: Library, name: str) -> Int[np.ndarray, " terms"]:
-    """How often each term holds a variable, alone or within a function."""
-    n, own = len(library.variables), [library.variables.index(name)]
-    own += [n + k for k, function in enumerate(library.functions) if function.variable == name]
-    return np.asarray(library.exponents[:, own].sum(axis=1))
-
-
 def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.ndarray, " terms"]:
     """Terms that are this variable times others alone; for no name, terms of the others."""
-    found = np.ones(len(library), dtype=np.bool_)
-    for variable in library.variables:
-        if variable not in (name, *others):
-            found &= _powers_of(library, variable) == 0
-    if name:
-        found &= library.exponents[:, library.variables.index(name)] == 1
-        found &= _powers_of(library, name) == 1
-    return found
+    of = np.array([*library.variables, *(function.variable for function in library.functions)])
+    found = ~library.exponents[:, ~np.isin(of, [name, *others])].any(axis=1)
+    if name:  # itself and not within a function
+        own = library.exponents[:, of == name]
+        found &= (own[:, 0] == 1) & (own.sum(axis=1) == 1)
+    return np.asarray(found)
 
 
 def _evaluate(

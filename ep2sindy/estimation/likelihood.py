@@ -32,8 +32,16 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.kernels import marginalise, smooth_corrections
-from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
-from ep2sindy.model.flow import Flow
+from ep2sindy.estimation.problem import (
+    ByCoefficient,
+    BySample,
+    ByState,
+    EstimationProblem,
+    ScaledRecord,
+    Support,
+)
+from ep2sindy.model.flow import Flow, flow
+from ep2sindy.regression.gram_kernels import invert_gram
 
 FREE_START = 100.0  # prior variance of the first state: ten times its RMS, squared
 HELD_START = 1e-24  # the same of one that starts at zero
@@ -47,6 +55,7 @@ RIDGE = 1e-12  # added to a Hessian of unit diagonal
 # Samples that resolve the motion never need more substeps. Runaway coefficients may ask for more,
 # and each substep costs as much as the first.
 MAX_SUBSTEPS, MIN_ALLOWED, MAX_IN_ALL = 32, 4, 20_000
+SUBSTEP_ERROR = 0.1  # RMS error of the substeps, as a share of the flow's
 FAR_OUT = 1e3  # distance beyond a limit, in noise, from which the limit acts as a value
 TELLS = 1e-3  # weight, relative to a value's, below which limits carry no information
 LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
@@ -60,14 +69,12 @@ class Level:
     the flow, as a share of the noise. process_noise: (d,), the flow's error itself, if it is known.
     """
 
-    noise: Float[np.ndarray, "samples d"]
+    noise: BySample
     model_error: float
     n_substeps: int = 1
-    process_noise: Float[np.ndarray, " d"] | None = None
+    process_noise: ByState | None = None
 
-    def with_errors(
-        self, noise: Float[np.ndarray, " d"], process_noise: Float[np.ndarray, " d"]
-    ) -> Level:
+    def with_errors(self, noise: ByState, process_noise: ByState) -> Level:
         """The same samples with other errors, alike at all of them."""
         return Level(np.tile(noise, (len(self.noise), 1)), 1.0, process_noise=process_noise)
 
@@ -82,28 +89,40 @@ class TrajectoryFit:
 
     problem: EstimationProblem
     level: Level
-    path: Float[np.ndarray, "samples d"]
-    free: Float[np.ndarray, " free"]
-    support: Bool[np.ndarray, " free"]
+    path: BySample
+    free: ByCoefficient
+    support: Support
     at_zero: Bool[np.ndarray, "records d"] | None = None
 
     @property
-    def paths(self) -> list[Float[np.ndarray, "samples d"]]:
+    def paths(self) -> list[BySample]:
         """The path of each record."""
         return self.problem.split(self.path)
 
     @cached_property
-    def squares(self) -> Float[np.ndarray, " d"]:
+    def squares(self) -> ByState:
         """The objective (see the module), by state; infinite if the flow is not finite."""
         self.problem.monitor.look()
-        record, level = self.problem.all_records, self.level
         with np.errstate(over="ignore", invalid="ignore"):
-            defects = self.problem.ends(record, self.path[:-1], self.free, level.n_substeps)
-            defects -= self.path[1:]
-            defects[record.breaks] = 0.0
-            total = observe(record, self.path, np.square(level.noise)).squares.sum(axis=0)
-            total = total + (np.square(defects) / self.process).sum(axis=0)
+            record, variance = self.problem.all_records, np.square(self.level.noise)
+            total = observe(record, self.path, variance).squares.sum(axis=0)
+            total = total + (np.square(self.defects) / self.process).sum(axis=0)
         return np.where(np.isfinite(total), total, np.inf)
+
+    @cached_property
+    @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
+    def defects(self) -> Float[np.ndarray, "steps d"]:
+        """What the flow from each state misses of the next one; zero between records."""
+        ends = self.problem.ends(self.path[:-1], self.free, self.level.n_substeps)
+        defects = ends - self.path[1:]
+        defects[self.problem.all_records.breaks] = 0.0
+        return defects
+
+    @property
+    @np.errstate(over="ignore", invalid="ignore")
+    def squared_defects(self) -> ByState:
+        """Sums of the squares of the defects, by state."""
+        return np.square(self.defects).sum(axis=0)
 
     @property
     def total(self) -> float:
@@ -127,19 +146,34 @@ class TrajectoryFit:
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """The squares as a quadratic function of all free coefficients, the states marginalised.
+    """The squares as a quadratic function of some unknowns z, the states marginalised.
 
     squares(z) = offset - 2 linear' z + z' quadratic z, exact where the fit is linear.
+    z: all free coefficients, and what a flow was differentiated by beside them.
     """
 
-    quadratic: Float[np.ndarray, "free free"]
-    linear: Float[np.ndarray, " free"]
+    quadratic: Float[np.ndarray, "z z"]
+    linear: Float[np.ndarray, " z"]
     offset: float
 
     @property
     def finite(self) -> bool:
         """False if terms outside the present support overflow between two samples."""
         return bool(np.isfinite(self.quadratic).all() and np.isfinite(self.linear).all())
+
+    def select(self, kept: Bool[np.ndarray, " z"]) -> Gram:
+        """The same with the other unknowns at zero."""
+        return Gram(self.quadratic[np.ix_(kept, kept)], self.linear[kept], self.offset)
+
+    def minimise(self, over: Bool[np.ndarray, " z"]) -> Gram:
+        """The least squares over some of the unknowns, as a function of the rest."""
+        rest, inverse = ~over, invert_gram(self.quadratic[np.ix_(over, over)])
+        share = self.quadratic[np.ix_(rest, over)] @ inverse
+        return Gram(
+            self.quadratic[np.ix_(rest, rest)] - share @ self.quadratic[np.ix_(over, rest)],
+            self.linear[rest] - share @ self.linear[over],
+            self.offset - float(self.linear[over] @ inverse @ self.linear[over]),
+        )
 
 
 def fit_paths(fit: TrajectoryFit) -> TrajectoryFit:
@@ -211,7 +245,7 @@ def _descend(fit: TrajectoryFit) -> TrajectoryFit:
 
 def _step(
     fit: TrajectoryFit,
-) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "samples d"]]:
+) -> tuple[ByCoefficient, BySample]:
     """One Gauss-Newton step: changes of the free coefficients and of the path.
 
     The states are marginalised, so that the normal equations of the coefficients alone remain; the
@@ -229,16 +263,8 @@ def _step(
     change[:] = 0.0
     change[fit.support] = step
     # Back-substitution into the states' block, which is block tridiagonal.
-    return change, _move(about, step)
-
-
-def _move(
-    about: Linearised, change: Float[np.ndarray, " support"]
-) -> Float[np.ndarray, "samples d"]:
-    """Change of the path, for a change of the coefficients."""
-    d = about.defects.shape[1]
-    defects = about.defects + about.slopes[:, :, d:] @ change
-    return smooth_corrections(*about.of_states._replace(defects=defects))
+    defects = about.defects + about.slopes[:, :, fit.path.shape[1] :] @ step
+    return change, smooth_corrections(*about.of_states._replace(defects=defects))
 
 
 def divergence_rate(fit: TrajectoryFit) -> float:
@@ -267,12 +293,16 @@ def innovations(fit: TrajectoryFit) -> tuple[Linearised, float, float]:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # `Gram.finite` says whether the result counts
-def gram(fit: TrajectoryFit) -> Gram:
-    """Linearise about a fit: all free coefficients of all equations, the states marginalised."""
-    quadratic, gradient, least, _ = hessian_on(fit, np.ones_like(fit.support))
-    linear = quadratic @ fit.free + gradient
-    offset = least + fit.free @ quadratic @ fit.free + 2.0 * fit.free @ gradient
-    return Gram(quadratic, linear, float(offset))
+def gram(fit: TrajectoryFit, along: Flow | None = None) -> Gram:
+    """Linearise about a fit: all free coefficients of all equations, the states marginalised.
+
+    along: the flow on its path, if it is differentiated by more than the coefficients.
+    """
+    along = along or flow_by(fit, np.ones_like(fit.support))
+    hessian, gradient, least, _ = marginalise(*linearise(fit, along))
+    free, n = fit.free, len(fit.free)
+    offset = least + free @ hessian[:n, :n] @ free + 2.0 * free @ gradient[:n]
+    return Gram(hessian, hessian[:, :n] @ free + gradient, float(offset))
 
 
 def covariance(fit: TrajectoryFit) -> Float[np.ndarray, "support support"] | None:
@@ -284,18 +314,18 @@ def covariance(fit: TrajectoryFit) -> Float[np.ndarray, "support support"] | Non
     return np.linalg.pinv(hessian / np.outer(size, size), hermitian=True) / np.outer(size, size)
 
 
-def enough_substeps(fit: TrajectoryFit, *, share: float = 0.1) -> int:
-    """Number of Runge-Kutta steps between samples for an error below a share of the flow's."""
+def enough_substeps(fit: TrajectoryFit) -> int:
+    """Number of Runge-Kutta steps between samples for an error below a tenth of the flow's."""
     problem, n = fit.problem, fit.level.n_substeps
     most = min(MAX_SUBSTEPS, max(MIN_ALLOWED, MAX_IN_ALL // problem.n_samples))
-    record, starts = problem.all_records, fit.path[:-1]
+    starts = fit.path[:-1]
     while 2 * n <= most:
         problem.monitor.look()
         with np.errstate(over="ignore", invalid="ignore"):
-            change = problem.ends(record, starts, fit.free, n)
-            change -= problem.ends(record, starts, fit.free, 2 * n)
-            errors = np.delete(np.square(change) / fit.process, record.breaks, axis=0)
-        if (errors.mean(axis=0) <= share**2).all():
+            change = problem.ends(starts, fit.free, n) - problem.ends(starts, fit.free, 2 * n)
+            errors = np.square(change) / fit.process
+            errors = np.delete(errors, problem.all_records.breaks, axis=0)
+        if (errors.mean(axis=0) <= SUBSTEP_ERROR**2).all():
             break
         n *= 2
     return n
@@ -312,10 +342,10 @@ class Linearised(NamedTuple):
 
     slopes: Float[np.ndarray, "steps d columns"]
     defects: Float[np.ndarray, "steps d"]
-    residuals: Float[np.ndarray, "samples d"]
-    variance: Float[np.ndarray, "samples d"]
+    residuals: BySample
+    variance: BySample
     process: Float[np.ndarray, "steps d"]
-    start: Float[np.ndarray, " d"]
+    start: ByState
 
     @property
     def of_states(self) -> Linearised:
@@ -325,14 +355,14 @@ class Linearised(NamedTuple):
 
 
 @np.errstate(over="ignore", invalid="ignore")  # callers look whether the result is finite
-def linearise(fit: TrajectoryFit, flow: Flow | None = None) -> Linearised:
-    """The objective about a fit. flow: along its path; None for one with slopes by the state."""
+def linearise(fit: TrajectoryFit, along: Flow | None = None) -> Linearised:
+    """The objective about a fit. along: the flow on its path; None: with slopes by the state."""
     problem, record = fit.problem, fit.problem.all_records
     problem.monitor.look()
-    flow = flow or flow_by(fit, np.zeros_like(fit.support))
+    along = along or flow_by(fit, np.zeros_like(fit.support))
     # Rows of the steps: what the flow from each state misses of the next one.
-    defects = flow.ends - fit.path[1:]
-    defects[record.breaks] = flow.slopes[record.breaks] = 0.0
+    defects = along.ends - fit.path[1:]
+    defects[record.breaks] = along.slopes[record.breaks] = 0.0
     # Rows of the samples: residuals, and the variances of their noise.
     residuals, variance, _ = observe(record, fit.path, np.square(fit.level.noise))
     # Weights of the steps, and of the first states, of which nothing is known unless held at zero.
@@ -340,17 +370,30 @@ def linearise(fit: TrajectoryFit, flow: Flow | None = None) -> Linearised:
     if fit.at_zero is not None:
         first, *others = np.where(fit.at_zero, HELD_START, FREE_START)
         process[record.breaks], start = np.reshape(others, (-1, len(start))), first
-    return Linearised(flow.slopes, defects, residuals, variance, process, start)
+    return Linearised(along.slopes, defects, residuals, variance, process, start)
 
 
-def flow_by(fit: TrajectoryFit, support: Bool[np.ndarray, " free"], *, n_more: int = 0) -> Flow:
-    """The flow along the path of a fit, with derivatives by the coefficients of a support."""
-    problem, n = fit.problem, fit.level.n_substeps
-    return problem.flow(problem.all_records, fit.path[:-1], fit.free, support, n, n_more=n_more)
+@np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
+def flow_by(fit: TrajectoryFit, support: Support, *, n_more: int = 0) -> Flow:
+    """The flow along the path of a fit, with derivatives by the coefficients of a support.
+
+    n_more: columns of zeros behind them, for derivatives by something else.
+    """
+    problem = fit.problem
+    own, steps = problem.field(fit.free), problem.all_records.divided(fit.level.n_substeps)
+    involved = np.flatnonzero(support if problem.C is None else problem.C[:, support].any(axis=1))
+    by = problem.equation[involved], problem.column[involved]
+    found = flow(own, fit.path[:-1], steps, by, n_more=n_more)
+    if problem.C is None:
+        return found
+    d, p = len(problem.states), len(problem.states) + len(involved)
+    by_free = found.slopes[:, :, d:p] @ problem.C[np.ix_(involved, support)]
+    slopes = [found.slopes[:, :, :d], by_free, found.slopes[:, :, p:]]
+    return replace(found, slopes=np.concatenate(slopes, axis=2))
 
 
 def hessian_on(
-    fit: TrajectoryFit, support: Bool[np.ndarray, " free"]
+    fit: TrajectoryFit, support: Support
 ) -> tuple[np.ndarray, np.ndarray, float, Linearised]:
     """Derivatives of the squares by the coefficients of a support, the states marginalised.
 
@@ -391,26 +434,19 @@ class LinearisedObservation(NamedTuple):
     squares: contributions to the objective, zero for a sample that the path meets.
     """
 
-    residuals: Float[np.ndarray, "samples d"]
-    variance: Float[np.ndarray, "samples d"]
-    squares: Float[np.ndarray, "samples d"]
+    residuals: BySample
+    variance: BySample
+    squares: BySample
 
 
-def observe(
-    record: ScaledRecord,
-    path: Float[np.ndarray, "samples d"],
-    variance: Float[np.ndarray, "samples d"],
-) -> LinearisedObservation:
+def observe(record: ScaledRecord, path: BySample, variance: BySample) -> LinearisedObservation:
     """Compare the samples of a record with a path, given the variance of the noise."""
-    residuals = record.samples - path
-    squares = np.square(residuals) / variance
-    if record.missing is not None:
-        residuals = np.where(record.missing, np.nan, residuals)
-        squares = np.where(record.missing, 0.0, squares)
-    if record.limits is None:
+    residuals = np.where(record.missing, np.nan, record.samples - path)
+    squares = np.where(record.missing, 0.0, np.square(record.samples - path) / variance)
+    at = record.limits.at & ~record.missing
+    if not at.any():
         return LinearisedObservation(residuals, variance, squares)
-    residuals, variance = residuals.copy(), variance.copy()
-    at = record.limits.at & record.at_hand
+    variance = variance.copy()
     noise = np.sqrt(variance[at])
     lower = (record.limits.lower - path)[at] / noise
     upper = (record.limits.upper - path)[at] / noise

@@ -28,12 +28,11 @@ from ep2sindy.estimation.noise import (
     powers_of,
 )
 from ep2sindy.estimation.observation import LackOfFit, Observation, Solution
-from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.problem import BySample, ByState, EstimationProblem
 from ep2sindy.estimation.solver import (
     EXACT,
     at_level,
     exchange_terms,
-    squares_of_steps,
     start_from_smooth,
 )
 from ep2sindy.estimation.supports import term_prices
@@ -55,8 +54,8 @@ SETTLING = 5  # samples from whose start on innovations count
 class Errors(NamedTuple):
     """Standard deviations of noise and process noise, by state; deviance: -2 log likelihood."""
 
-    noise: Float[np.ndarray, " d"]
-    process: Float[np.ndarray, " d"]
+    noise: ByState
+    process: ByState
     deviance: float
 
 
@@ -100,13 +99,13 @@ def likely_errors(fit: TrajectoryFit) -> Errors:
     return Errors(*sizes(found.x), float(found.fun))
 
 
-def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> Solution:
+def solve_with_process_noise(problem: EstimationProblem) -> Solution:
     """Errors and sparse coefficients in turn, from smoothed states with all coefficients free."""
     fit = start_from_smooth(problem, None)
     std, prices = fit.level.noise[0], term_prices(problem, float(problem.n_samples))
     level = fit.level.with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
     for share in SHARES:
-        fit = exchange_terms(at_level(fit, level), share * prices, max_terms)
+        fit = exchange_terms(at_level(fit, level), share * prices)
         errors = likely_errors(fit)
         level = level.with_errors(errors.noise, errors.process)
     fit = at_level(fit, level)
@@ -133,7 +132,7 @@ def _test_defects(fit: TrajectoryFit) -> LackOfFit:
 
     Infinite for a state without a law: one whose equation has no term, which noise alone moves.
     """
-    defects = squares_of_steps(fit)[0] / len(fit.path)
+    defects = fit.squared_defects / len(fit.path)
     allowed = MAX_DEFECT**2 * fit.process[0] + np.square(EXACT * fit.level.noise[0])
     moves = fit.problem.coef(fit.free).any(axis=0)
     return LackOfFit(np.where(moves, np.sqrt(defects / allowed), np.inf), 1.0)
@@ -170,11 +169,8 @@ def _test_innovations(fit: TrajectoryFit) -> list[LackOfFit]:
 
 
 def _largest_share(
-    fit: TrajectoryFit,
-    before: Float[np.ndarray, "samples d"],
-    powers: Float[np.ndarray, "samples _"],
-    new: Float[np.ndarray, "samples d"],
-) -> Float[np.ndarray, " d"]:
+    fit: TrajectoryFit, before: BySample, powers: Float[np.ndarray, "samples _"], new: BySample
+) -> ByState:
     """The most that one of the powers explains of innovations beside an equation's terms."""
     unit = np.sqrt(len(new)) * new / np.maximum(np.linalg.norm(new, axis=0), 1e-150)
     problem, found = fit.problem, np.zeros(unit.shape[1])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.problem import BySample, EstimationProblem
 from ep2sindy.estimation.solver import smooth_states
 
 CLEAR = 4.0  # steps between the points of a path, in standard deviations of the noise
@@ -24,8 +24,8 @@ def unobserved_state(problem: EstimationProblem) -> str:
     d = len(problem.states)
     if problem.driven or d > 2 or not problem.measured.all():
         return ""
-    start = smooth_states(problem, None)
-    paths = [_clear_steps(path) for path in problem.split(start.path / start.noise)]
+    smooth, _, noise = smooth_states(problem, None)
+    paths = [_clear_steps(path) for path in problem.split(smooth / noise)]
     name = problem.states[0]
     if d == 1 and sum(_turns(path[:, 0]) for path in paths) >= LEAST_CROSSINGS:
         return f"{name} passes the same values up and down, which no law of {name} alone does"
@@ -35,7 +35,7 @@ def unobserved_state(problem: EstimationProblem) -> str:
     return ""
 
 
-def _clear_steps(path: Float[np.ndarray, "samples d"]) -> Float[np.ndarray, "points d"]:
+def _clear_steps(path: BySample) -> Float[np.ndarray, "points d"]:
     """Points of a path that lie clearly apart; in units of the noise."""
     kept = [0]
     for k in range(1, len(path)):

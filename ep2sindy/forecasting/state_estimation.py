@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.runs import Run, trajectory_of
+from ep2sindy.data.sensor import Bounds
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import with_guess_by
 from ep2sindy.estimation.kernels import filter_states
@@ -251,7 +252,8 @@ def _fix(
 
     Clipped and rounded samples are taken as they are: forecasts are compared with them.
     """
-    problem = replace(problem, records=tuple(replace(each, limits=None) for each in records))
+    exact = [replace(each, limits=Bounds(each.samples, each.samples, ())) for each in records]
+    problem = replace(problem, records=tuple(exact))
     fixed = np.zeros(len(free), dtype=np.bool_)
     return TrajectoryFit(problem, level, np.concatenate(paths), free, fixed)
 
