@@ -85,17 +85,10 @@ def likely_errors(fit: TrajectoryFit) -> Errors:
 
     assert level.process_noise is not None
     start = np.log(np.append(level.noise[0, measured], level.process_noise))
-    found = minimize(
-        unlikely,
-        start,
-        method="Nelder-Mead",
-        options={
-            "initial_simplex": np.vstack([start, start + 1.5 * np.eye(len(start))]),
-            "maxfev": MAX_TRIALS * len(start),
-            "fatol": 0.1,
-            "xatol": 0.05,
-        },
-    )
+    simplex = np.vstack([start, start + 1.5 * np.eye(len(start))])
+    budget = {"maxfev": MAX_TRIALS * len(start), "fatol": 0.1, "xatol": 0.05}
+    options = {"initial_simplex": simplex, **budget}
+    found = minimize(unlikely, start, method="Nelder-Mead", options=options)
     return Errors(*sizes(found.x), float(found.fun))
 
 
@@ -111,12 +104,7 @@ def solve_with_process_noise(problem: EstimationProblem) -> Solution:
     fit = at_level(fit, level)
     noise, none = noise_beside(fit), np.zeros(len(problem.states))
     explained = replace(
-        noise,
-        std=errors.noise,
-        memory=none,
-        unexplained=none,
-        patterned=none > 0.0,
-        deviance=errors.deviance,
+        noise, std=errors.noise, memory=none, unexplained=none, patterned=none > 0.0
     )
     return Solution(
         fit=fit,
