@@ -1,6 +1,6 @@
 """Joint estimation of states and sparse coefficients, and the report of its result.
 
-Besides the model, the result explained_states remarks: sentences about the samples and their noise.
+Besides the model, the result holds remarks: sentences about the samples and their noise.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import SearchMonitor, check_limit_s, check_size, growing_parts
 from ep2sindy.estimation.explanation import Explanation, explain
 from ep2sindy.estimation.hidden import Entrance, with_guesses
-from ep2sindy.estimation.likelihood import Gram, covariance, gram
+from ep2sindy.estimation.likelihood import Gram, gram, hessian_on
 from ep2sindy.estimation.noise import remark
 from ep2sindy.estimation.observation import Solution
 from ep2sindy.estimation.problem import (
@@ -36,6 +36,7 @@ from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Constraint, Relation, relations_of
 from ep2sindy.library.roles import Roles, constraint_of
 from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.gram_kernels import invert_gram
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
 from ep2sindy.runtime.values import check_count
 
@@ -309,7 +310,7 @@ def _report(
         growth=found.noise.growth,
         delays_s=answer.delays * problem.step_s,
         process_noise_std=found.observation.process * problem.scale,
-        explained_states=answer.explained_states,
+        explained_states=() if found.fits else tuple(compress(problem.states, found.explained)),
     )
 
 
@@ -351,10 +352,10 @@ def _model(
     order = np.lexsort((column[used], problem.equation[used]))
     C = np.eye(problem.n_free) if problem.C is None else problem.C
     rows = (C[used][:, fit.support] * problem.to_SI[used, None])[order]
+    hessian, cov = hessian_on(fit, fit.support)[0], None
     # If the residuals exceed the noise, intervals would not cover the truth.
-    known = found.fits and not answer.misfit
-    free_cov = covariance(fit) if known else None
-    cov = None if free_cov is None else rows @ free_cov @ rows.T
+    if found.fits and not answer.misfit and np.isfinite(hessian).all():
+        cov = rows @ invert_gram(hessian) @ rows.T
     courses = dict(zip(problem.inputs, problem.courses, strict=True))
     return SparseModel(library, problem.states, coef, units, provenance, cov, courses=courses)
 

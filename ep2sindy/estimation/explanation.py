@@ -81,12 +81,6 @@ class Explanation:
         return self.solution.problem
 
     @property
-    def explained_states(self) -> tuple[str, ...]:
-        """States whose equations explain their samples although others do not."""
-        solution = self.solution
-        return () if solution.fits else tuple(compress(self.problem.states, solution.explained))
-
-    @property
     def rank(self) -> tuple[bool, tuple[int, bool, int, float]]:
         """Order between ways in which hidden states may enter: least is best."""
         return bool(self.misfit), self.solution.rank

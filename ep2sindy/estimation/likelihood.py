@@ -305,15 +305,6 @@ def gram(fit: TrajectoryFit, along: Flow | None = None) -> Gram:
     return Gram(hessian, hessian[:, :n] @ free + gradient, float(offset))
 
 
-def covariance(fit: TrajectoryFit) -> Float[np.ndarray, "support support"] | None:
-    """Covariance of the support's free coefficients, scaled; None if the fit is not finite."""
-    hessian = hessian_on(fit, fit.support)[0]
-    if not np.isfinite(hessian).all():
-        return None
-    size = unit_sizes(hessian)
-    return np.linalg.pinv(hessian / np.outer(size, size), hermitian=True) / np.outer(size, size)
-
-
 def enough_substeps(fit: TrajectoryFit) -> int:
     """Number of Runge-Kutta steps between samples for an error below a tenth of the flow's."""
     problem, n = fit.problem, fit.level.n_substeps

@@ -70,20 +70,15 @@ def search_within(problem: EstimationProblem) -> Solution:
     linear = problem.restricted(problem.required | (problem.degrees <= 1))
     few = problem.n_samples < SAMPLES_PER_COEFFICIENT * len(problem.library)
     if few and linear.n_free < problem.n_free > part.n_free:
-        found = _linear_solution(linear)
+        with problem.monitor.stage(_weighed(linear)):
+            tried = [from_smooth(linear, log10_ratio) for log10_ratio in (None, *OTHER_STARTS)]
+        found = min(tried, key=lambda each: each.rank)
         if found.fits and admit_terms(found) is found:
             return found
     with problem.monitor.stage(_weighed(part)):
         found = from_smooth(part, None)
     # About a solution that does not fit first order tells little, and other starts cost less.
     return admit_terms(found) if found.fits else found
-
-
-def _linear_solution(linear: EstimationProblem) -> Solution:
-    """The likeliest solution of the linear terms alone that fits, from any start."""
-    with linear.monitor.stage(_weighed(linear)):
-        tried = [from_smooth(linear, log10_ratio) for log10_ratio in (None, *OTHER_STARTS)]
-    return min(tried, key=lambda each: each.rank)
 
 
 def admit_terms(found: Solution) -> Solution:
