@@ -21,7 +21,6 @@ from ep2sindy.estimation import cost, explanation, kernels, likelihood
 from ep2sindy.estimation.kernels import filter_states, marginalise, smooth_corrections
 from ep2sindy.estimation.likelihood import (
     Gram,
-    Level,
     TrajectoryFit,
     divergence_rate,
     fit_paths,
@@ -194,8 +193,9 @@ def test_sensitivities_are_derivatives_of_the_flow(relations: Sequence[str]) -> 
     support = np.zeros(len(free), dtype=np.bool_)
     support[[1, 4, 12, -1]] = True
     states = record.samples[:-1]
-    level = Level(np.ones_like(record.samples), 1.0, n_substeps=2)
-    flow = flow_by(TrajectoryFit(problem, level, record.samples, free, support), support)
+    ones = np.ones_like(record.samples)
+    fit = TrajectoryFit(problem, ones, 1.0, record.samples, free, support, n_substeps=2)
+    flow = flow_by(fit, support)
     np.testing.assert_allclose(flow.ends, problem.ends(states, free, 2), rtol=1e-12)
     h = 1e-6
     for column, j in enumerate(np.flatnonzero(support)):
@@ -212,9 +212,7 @@ def fit_of_truth(
     problem: EstimationProblem, model: ep.SparseModel, process: float
 ) -> TrajectoryFit:
     free, path = truth(problem, model), problem.all_records.samples.copy()
-    return TrajectoryFit(
-        problem, Level(np.full(path.shape, 0.05), process), path, free, free != 0.0
-    )
+    return TrajectoryFit(problem, np.full(path.shape, 0.05), process, path, free, free != 0.0)
 
 
 def fitted_lorenz(process: float) -> tuple[EstimationProblem, TrajectoryFit]:
@@ -581,8 +579,9 @@ def three_runs(rng: np.random.Generator) -> TrajectoryFit:
     problem = replace(problem, records=(first, second, last))
     samples = problem.all_records.samples
     path, noise = samples + 0.1 * rng.normal(size=samples.shape), rng.uniform(0.2, 0.5, (63, 2))
-    free, level = 0.1 * rng.normal(size=problem.n_free), Level(noise, 0.3, n_substeps=2)
-    return TrajectoryFit(problem, level, path, free, np.ones(len(free), dtype=bool))
+    free = 0.1 * rng.normal(size=problem.n_free)
+    support = np.ones(len(free), dtype=bool)
+    return TrajectoryFit(problem, noise, 0.3, path, free, support, n_substeps=2)
 
 
 @pytest.mark.parametrize("process_noise", [None, np.array([0.1, 0.2])])
@@ -590,8 +589,8 @@ def test_runs_are_joined_without_a_way_from_one_to_the_next(
     rng: np.random.Generator, process_noise: np.ndarray | None
 ) -> None:
     fit = three_runs(rng)
-    problem, level = fit.problem, replace(fit.level, process_noise=process_noise)
-    fit, change = replace(fit, level=level), 0.1 * rng.normal(size=problem.n_free)
+    problem, fit = fit.problem, replace(fit, process_noise=process_noise)
+    change = 0.1 * rng.normal(size=problem.n_free)
 
     def parts_of(fit: TrajectoryFit) -> tuple:
         pair, (_, least, logs) = gram(fit), innovations(fit)
@@ -604,11 +603,11 @@ def test_runs_are_joined_without_a_way_from_one_to_the_next(
 
     totals = [0.0] * 5
     for record, path, noise, move in zip(
-        problem.records, fit.paths, problem.split(level.noise), problem.split(move_of(fit)),
+        problem.records, fit.paths, problem.split(fit.noise), problem.split(move_of(fit)),
         strict=True,
     ):  # fmt: skip
-        alone, its = replace(problem, records=(record,)), replace(level, noise=noise)
-        own = replace(fit, problem=alone, level=its, path=path)
+        alone = replace(problem, records=(record,))
+        own = replace(fit, problem=alone, noise=noise, path=path)
         np.testing.assert_allclose(move, move_of(own), rtol=1e-9, atol=1e-12)
         totals = [total + part for total, part in zip(totals, parts_of(own), strict=True)]
     joined = parts_of(fit)
@@ -707,9 +706,9 @@ def test_the_time_is_looked_at_within_a_step_of_a_fit() -> None:
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 100)
     monitor = cost.SearchMonitor(limit_s=1.0, clock=clock, advance=advance)
     problem = scale_problem([run], ep.polynomial(run.state_names, degree=2), monitor=monitor)
-    level = Level(np.full(run.states.shape, 0.1), 0.1)
+    noise = np.full(run.states.shape, 0.1)
     free, support = np.zeros(problem.n_free), np.ones(problem.n_free, dtype=bool)
-    fit = TrajectoryFit(problem, level, problem.records[0].samples, free, support)
+    fit = TrajectoryFit(problem, noise, 0.1, problem.records[0].samples, free, support)
     now, monitor.best = 2, fit
     for one_pass in (
         lambda: fit.squares,

@@ -14,7 +14,7 @@ from benchmarks.known_systems import KINDS, noisy
 from benchmarks.spoilt import spoilt
 from ep2sindy.data.gaps import between_gaps
 from ep2sindy.estimation import explanation
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit
+from ep2sindy.estimation.likelihood import TrajectoryFit
 from ep2sindy.estimation.noise import ALIKE_SAMPLES, Noise, noise_beside
 from ep2sindy.estimation.observation import LackOfFit
 from ep2sindy.estimation.problem import scale_problem
@@ -28,9 +28,7 @@ def noise_of(
     """The noise beside given paths, in SI, of a model of no terms."""
     problem = scale_problem(runs, library or ep.polynomial(runs[0].state_names, degree=2))
     path, none = np.concatenate(paths) / problem.scale, np.zeros(problem.n_free)
-    return noise_beside(
-        TrajectoryFit(problem, Level(np.ones(path.shape), 1.0), path, none, none > 0.0)
-    )
+    return noise_beside(TrajectoryFit(problem, np.ones(path.shape), 1.0, path, none, none > 0.0))
 
 
 def at_rest(run: ep.Trajectory) -> np.ndarray:

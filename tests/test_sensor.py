@@ -15,7 +15,7 @@ import ep2sindy as ep
 from benchmarks.spoilt import spoilt
 from ep2sindy.data.coerce import check_repeats
 from ep2sindy.data.sensor import bounds_of
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit, between, gram, observe
+from ep2sindy.estimation.likelihood import TrajectoryFit, between, gram, observe
 from ep2sindy.estimation.observation import (
     best_delays,
     delayed_gram,
@@ -176,7 +176,7 @@ def fit_of_samples(problem: EstimationProblem, system: System) -> TrajectoryFit:
     free = system.model.coef[problem.column, problem.equation] / problem.to_SI
     path = problem.all_records.samples
     return TrajectoryFit(
-        problem, Level(np.full(path.shape, 1e-2), 1e-2, 2), path, free, free != 0.0
+        problem, np.full(path.shape, 1e-2), 1e-2, path, free, free != 0.0, n_substeps=2
     )
 
 
@@ -186,7 +186,7 @@ def test_delays_are_found_to_second_order_beside_the_true_equations() -> None:
         delays = (0.0, size, -0.5 * size)
         problem, system = late_record(delays)
         fit = fit_of_samples(problem, system)
-        fit = replace(fit, level=replace(fit.level, n_substeps=4))
+        fit = replace(fit, n_substeps=4)
         late = np.array([False, True, True])
         found, std = best_delays(delayed_gram(fit), fit.support, late)
         errors.append(np.abs(found - delays).max())

@@ -15,7 +15,7 @@ from ep2sindy.estimation import working_set
 from ep2sindy.estimation.explanation import explain
 from ep2sindy.estimation.likelihood import Gram, gram
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import COMPARED_AT, Solution, at_level, from_smooth
+from ep2sindy.estimation.solver import COMPARED_AT, Solution, from_smooth, refit
 from ep2sindy.estimation.supports import term_prices
 from ep2sindy.estimation.working_set import first_set
 from ep2sindy.regression import searches
@@ -197,8 +197,7 @@ def test_scores_tell_what_a_term_would_bring() -> None:
     true = mask_of(problem, system)
     part = problem.restricted(true)
     found = from_smooth(part, None)
-    fit = at_level(found.fit, found.fit.level)
-    fit = at_level(fit, replace(fit.level, model_error=COMPARED_AT))
+    fit = refit(replace(refit(found.fit), model_error=COMPARED_AT))
     every = working_set._spread(fit.free, true)
     gains = working_set._gains(problem, fit)
     whole = replace(fit, problem=problem, free=every, support=true)

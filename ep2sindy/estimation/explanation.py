@@ -33,8 +33,8 @@ from ep2sindy.estimation.process_noise import process_noise_words, solve_with_pr
 from ep2sindy.estimation.solver import (
     ENOUGH_SAMPLES,
     OTHER_STARTS,
-    at_level,
     from_smooth,
+    refit,
     settle,
     smooth_states,
     start_from_smooth,
@@ -318,10 +318,7 @@ def on_likeliest_courses(problem: EstimationProblem) -> EstimationProblem:
 
     @cache
     def unlikely(courses: tuple[str, ...]) -> float:
-        fit = at_level(
-            replace(start, problem=part.on_courses(courses)),
-            replace(start.level, model_error=COURSES_AT),
-        )
+        fit = refit(replace(start, problem=part.on_courses(courses), model_error=COURSES_AT))
         return part.n_squares * log(max(fit.total, np.finfo(np.float64).tiny))
 
     best = problem.courses

@@ -62,37 +62,30 @@ LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
-    """How closely states must follow the samples and the flow.
-
-    noise: (samples, d), standard deviations of the samples of all records, scaled. model_error: of
-    the flow, as a share of the noise. process_noise: (d,), the flow's error itself, if it is known.
-    """
-
-    noise: BySample
-    model_error: float
-    n_substeps: int = 1
-    process_noise: ByState | None = None
-
-    def with_errors(self, noise: ByState, process_noise: ByState) -> Level:
-        """The same samples with other errors, alike at all of them."""
-        return Level(np.tile(noise, (len(self.noise), 1)), 1.0, process_noise=process_noise)
-
-
-@dataclass(frozen=True, eq=False)
 class TrajectoryFit:
-    """States and coefficients of a problem, fitted at a level of errors.
+    """States and coefficients of a problem, fitted under some noise and error of the flow.
 
-    path: states at the samples of all records, one after the other, scaled. free: zero outside the
-    support. at_zero: states that start at zero, and would start below it; None for none.
+    noise: standard deviations of the samples of all records, scaled. model_error: of the flow, as a
+    share of the noise. path: states at the samples of all records, one after the other, scaled.
+    free: zero outside the support. n_substeps: Runge-Kutta steps between two samples.
+    process_noise: the flow's error itself, if it is known. at_zero: states that start at zero, and
+    would start below it; None for none.
     """
 
     problem: EstimationProblem
-    level: Level
+    noise: BySample
+    model_error: float
     path: BySample
     free: ByCoefficient
     support: Support
+    n_substeps: int = 1
+    process_noise: ByState | None = None
     at_zero: Bool[np.ndarray, "records d"] | None = None
+
+    def with_errors(self, noise: ByState, process_noise: ByState) -> TrajectoryFit:
+        """The same states under other errors, alike at all samples."""
+        noise = np.tile(noise, (len(self.path), 1))
+        return replace(self, noise=noise, n_substeps=1, process_noise=process_noise)
 
     @property
     def paths(self) -> list[BySample]:
@@ -104,7 +97,7 @@ class TrajectoryFit:
         """The objective (see the module), by state; infinite if the flow is not finite."""
         self.problem.monitor.look()
         with np.errstate(over="ignore", invalid="ignore"):
-            record, variance = self.problem.all_records, np.square(self.level.noise)
+            record, variance = self.problem.all_records, np.square(self.noise)
             total = observe(record, self.path, variance).squares.sum(axis=0)
             total = total + (np.square(self.defects) / self.process).sum(axis=0)
         return np.where(np.isfinite(total), total, np.inf)
@@ -113,7 +106,7 @@ class TrajectoryFit:
     @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
     def defects(self) -> Float[np.ndarray, "steps d"]:
         """What the flow from each state misses of the next one; zero between records."""
-        ends = self.problem.ends(self.path[:-1], self.free, self.level.n_substeps)
+        ends = self.problem.ends(self.path[:-1], self.free, self.n_substeps)
         defects = ends - self.path[1:]
         defects[self.problem.all_records.breaks] = 0.0
         return defects
@@ -136,10 +129,9 @@ class TrajectoryFit:
         Those between records are of states of which nothing is known, so that a filter whose slopes
         and defects are zero there begins each record anew.
         """
-        level = self.level
-        error = level.process_noise
-        error = level.model_error * level.noise[:-1] if error is None else error
-        found = np.square(np.broadcast_to(error, level.noise[:-1].shape))
+        noise, error = self.noise[:-1], self.process_noise
+        error = self.model_error * noise if error is None else error
+        found = np.square(np.broadcast_to(error, noise.shape))
         found[self.problem.all_records.breaks] = FREE_START
         return found
 
@@ -307,7 +299,7 @@ def gram(fit: TrajectoryFit, along: Flow | None = None) -> Gram:
 
 def enough_substeps(fit: TrajectoryFit) -> int:
     """Number of Runge-Kutta steps between samples for an error below a tenth of the flow's."""
-    problem, n = fit.problem, fit.level.n_substeps
+    problem, n = fit.problem, fit.n_substeps
     most = min(MAX_SUBSTEPS, max(MIN_ALLOWED, MAX_IN_ALL // problem.n_samples))
     starts = fit.path[:-1]
     while 2 * n <= most:
@@ -355,7 +347,7 @@ def linearise(fit: TrajectoryFit, along: Flow | None = None) -> Linearised:
     defects = along.ends - fit.path[1:]
     defects[record.breaks] = along.slopes[record.breaks] = 0.0
     # Rows of the samples: residuals, and the variances of their noise.
-    residuals, variance, _ = observe(record, fit.path, np.square(fit.level.noise))
+    residuals, variance, _ = observe(record, fit.path, np.square(fit.noise))
     # Weights of the steps, and of the first states, of which nothing is known unless held at zero.
     process, start = fit.process, np.full(len(problem.states), FREE_START)
     if fit.at_zero is not None:
@@ -371,7 +363,7 @@ def flow_by(fit: TrajectoryFit, support: Support, *, n_more: int = 0) -> Flow:
     n_more: columns of zeros behind them, for derivatives by something else.
     """
     problem = fit.problem
-    own, steps = problem.field(fit.free), problem.all_records.divided(fit.level.n_substeps)
+    own, steps = problem.field(fit.free), problem.all_records.divided(fit.n_substeps)
     involved = np.flatnonzero(support if problem.C is None else problem.C[:, support].any(axis=1))
     by = problem.equation[involved], problem.column[involved]
     found = flow(own, fit.path[:-1], steps, by, n_more=n_more)

@@ -236,11 +236,11 @@ def flow_error(fit: TrajectoryFit, noise: Noise) -> float:
     weighed with white noise.
     Source of the likelihood by innovations: Schweppe 1965, doi:10.1109/TIT.1965.1053737.
     """
-    fit = replace(fit, level=replace(fit.level, noise=noise.white))
+    fit = replace(fit, noise=noise.white)
     by_memory = float((fit.problem.n_measured * np.log1p(-np.square(noise.memory))).sum())
     best, found = _deviance(fit) + by_memory - ERROR_SHOWS, 0.0
     for model_error in MODEL_ERRORS:
-        fit = fit_paths(replace(fit, level=replace(fit.level, model_error=model_error)))
+        fit = fit_paths(replace(fit, model_error=model_error))
         deviance = _deviance(fit)
         if deviance < best:
             best, found = deviance, model_error

@@ -31,8 +31,8 @@ from ep2sindy.estimation.observation import LackOfFit, Observation, Solution
 from ep2sindy.estimation.problem import BySample, ByState, EstimationProblem
 from ep2sindy.estimation.solver import (
     EXACT,
-    at_level,
     exchange_terms,
+    refit,
     start_from_smooth,
 )
 from ep2sindy.estimation.supports import term_prices
@@ -62,11 +62,11 @@ class Errors(NamedTuple):
 def likely_errors(fit: TrajectoryFit) -> Errors:
     """The likeliest noise and process noise about the path of a fit.
 
-    The search for them starts from those of the fit's level.
+    The search for them starts from those of the fit.
     """
     from scipy.optimize import minimize  # imported only to estimate errors
 
-    measured, level, about = fit.problem.measured, fit.level, linearise(fit)
+    measured, about = fit.problem.measured, linearise(fit)
     n, d = int(measured.sum()), len(measured)
     low = np.log(np.repeat([LEAST_NOISE, LEAST_PROCESS], [n, d]))
 
@@ -77,14 +77,14 @@ def likely_errors(fit: TrajectoryFit) -> Errors:
         return own, held[n:]
 
     def unlikely(logs: np.ndarray) -> float:
-        tried = replace(fit, level=level.with_errors(*sizes(logs)))
+        tried = fit.with_errors(*sizes(logs))
         bounded = np.clip(logs, low, np.log(MOST))
-        variance = np.square(tried.level.noise)
+        variance = np.square(tried.noise)
         case = about._replace(variance=variance, process=tried.process)
         return float(np.square(logs - bounded).sum() + sum(marginalise(*case)[2:]))
 
-    assert level.process_noise is not None
-    start = np.log(np.append(level.noise[0, measured], level.process_noise))
+    assert fit.process_noise is not None
+    start = np.log(np.append(fit.noise[0, measured], fit.process_noise))
     simplex = np.vstack([start, start + 1.5 * np.eye(len(start))])
     budget = {"maxfev": MAX_TRIALS * len(start), "fatol": 0.1, "xatol": 0.05}
     options = {"initial_simplex": simplex, **budget}
@@ -95,13 +95,13 @@ def likely_errors(fit: TrajectoryFit) -> Errors:
 def solve_with_process_noise(problem: EstimationProblem) -> Solution:
     """Errors and sparse coefficients in turn, from smoothed states with all coefficients free."""
     fit = start_from_smooth(problem, None)
-    std, prices = fit.level.noise[0], term_prices(problem, float(problem.n_samples))
-    level = fit.level.with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
+    std, prices = fit.noise[0], term_prices(problem, float(problem.n_samples))
+    fit = fit.with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
     for share in SHARES:
-        fit = exchange_terms(at_level(fit, level), share * prices)
+        fit = exchange_terms(refit(fit), share * prices)
         errors = likely_errors(fit)
-        level = level.with_errors(errors.noise, errors.process)
-    fit = at_level(fit, level)
+        fit = fit.with_errors(errors.noise, errors.process)
+    fit = refit(fit)
     noise, none = noise_beside(fit), np.zeros(len(problem.states))
     explained = replace(
         noise, std=errors.noise, memory=none, unexplained=none, patterned=none > 0.0
@@ -121,7 +121,7 @@ def _test_defects(fit: TrajectoryFit) -> LackOfFit:
     Infinite for a state without a law: one whose equation has no term, which noise alone moves.
     """
     defects = fit.squared_defects / len(fit.path)
-    allowed = MAX_DEFECT**2 * fit.process[0] + np.square(EXACT * fit.level.noise[0])
+    allowed = MAX_DEFECT**2 * fit.process[0] + np.square(EXACT * fit.noise[0])
     moves = fit.problem.coef(fit.free).any(axis=0)
     return LackOfFit(np.where(moves, np.sqrt(defects / allowed), np.inf), 1.0)
 

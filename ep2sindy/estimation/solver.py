@@ -19,7 +19,6 @@ from ep2sindy.estimation.likelihood import (
     FAR,
     MAX_DIVERGENCE,
     Gram,
-    Level,
     TrajectoryFit,
     divergence_rate,
     enough_substeps,
@@ -90,8 +89,8 @@ def settle(
     for _ in range(MAX_PASSES):
         before, noise = fit.support, noise_beside(fit)
         prices = _prices_beside(fit, noise)
-        start = replace(fit, level=replace(fit.level, noise=noise.effective))
-        fit = fit_by_continuation(start, prices, NEARLY_EXACT)
+        fit = replace(fit, noise=noise.effective)
+        fit = fit_by_continuation(fit, prices, NEARLY_EXACT)
         if np.array_equal(before, fit.support):
             break
     fit, around = polish(fit, prices)
@@ -102,7 +101,7 @@ def settle(
         squares = fit.squared_defects / np.square(noise.std)
         defect = float(np.sqrt(squares.max() / len(fit.path)))
         error = error if defect < EXACT else max(error, defect)  # it lives on the slack
-        divergence = divergence_rate(replace(fit, level=replace(fit.level, noise=noise.white)))
+        divergence = divergence_rate(replace(fit, noise=noise.white))
     return replace(_exact_solution(fit, noise, prices, error, divergence), around=around)
 
 
@@ -114,7 +113,7 @@ def _prices_beside(fit: TrajectoryFit, noise: Noise) -> ByCoefficient:
 def unfinished_solution(fit: TrajectoryFit) -> Solution:
     """What a search that was ended on its way has, whose states still leave the flow."""
     noise = noise_beside(fit)
-    return _exact_solution(fit, noise, _prices_beside(fit, noise), fit.level.model_error, 0.0)
+    return _exact_solution(fit, noise, _prices_beside(fit, noise), fit.model_error, 0.0)
 
 
 def _exact_solution(
@@ -169,12 +168,11 @@ def fit_by_continuation(
 ) -> TrajectoryFit:
     """Fit level by level; at each level, exchange terms as long as squares plus prices fall.
 
-    The noise is that of the fit's level.
+    The noise is that of the fit.
     """
-    monitor, level = fit.problem.monitor, replace(fit.level, n_substeps=1, process_noise=None)
+    monitor, fit = fit.problem.monitor, replace(fit, n_substeps=1, process_noise=None)
     for model_error, share in schedule:
-        fit = at_level(fit, replace(level, model_error=model_error))
-        level = fit.level
+        fit = refit(replace(fit, model_error=model_error))
         fit = exchange_terms(fit, share * prices)
         if not isinstance(monitor.best, Solution):
             monitor.best = fit
@@ -190,10 +188,10 @@ def polish(fit: TrajectoryFit, prices: ByCoefficient) -> tuple[TrajectoryFit, Gr
     problem = fit.problem
     if not fit.total < FAR * problem.n_squares:
         return fit, None
-    fit = at_level(fit, fit.level)
+    fit = refit(fit)
     tried = {fit.support.tobytes()}
     for _ in range(MAX_ROUNDS):
-        warm = at_level(fit, replace(fit.level, model_error=COMPARED_AT))
+        warm = refit(replace(fit, model_error=COMPARED_AT))
         around = delayed_gram(warm)
         at_rest = without_delays(around, problem.n_free)
         if not (at_rest.finite and np.isfinite(fit.total)):
@@ -202,8 +200,8 @@ def polish(fit: TrajectoryFit, prices: ByCoefficient) -> tuple[TrajectoryFit, Gr
         others = [each for each in others if each.support.tobytes() not in tried]
         for each in others[:MAX_TRIED]:
             tried.add(each.support.tobytes())
-            other = at_level(replace(warm, support=each.support, free=each.free), warm.level)
-            other = at_level(other, replace(other.level, model_error=fit.level.model_error))
+            other = refit(replace(warm, support=each.support, free=each.free))
+            other = refit(replace(other, model_error=fit.model_error))
             if _is_likelier(other, fit, prices):
                 fit = other
                 break
@@ -231,7 +229,7 @@ def restart_relaxed(
     if not fit.total < FAR * fit.problem.n_squares:
         return fit, around
     model_error, share = RELAXED
-    relaxed = at_level(fit, replace(fit.level, model_error=model_error))
+    relaxed = refit(replace(fit, model_error=model_error))
     pair, cheap = gram(relaxed), share * prices
     if not pair.finite:
         return fit, around
@@ -247,10 +245,9 @@ def restart_relaxed(
     return (again, beside) if _is_likelier(again, fit, prices) else (fit, around)
 
 
-def at_level(fit: TrajectoryFit, level: Level) -> TrajectoryFit:
-    """Fit at a level, with as many substeps as it needs."""
-    n_substeps = enough_substeps(replace(fit, level=level))
-    fit = replace(fit, level=replace(level, n_substeps=n_substeps))
+def refit(fit: TrajectoryFit) -> TrajectoryFit:
+    """Fit under the errors of a fit, with as many substeps as it needs."""
+    fit = replace(fit, n_substeps=enough_substeps(fit))
     if not np.isfinite(fit.squares).all():
         fit = replace(fit, free=np.zeros_like(fit.free))  # the zero flow is finite
     return fit_paths(fit)
@@ -279,12 +276,12 @@ def start_from_smooth(problem: EstimationProblem, log10_ratio: float | None) -> 
 
     log10_ratio: of the smoother, process to measurement noise; None takes the most likely ratio of
     each record and state. Below about twenty samples a period this ratio may take signal for noise.
-    The noise of its level is that of the residuals.
+    The noise is that of the residuals.
     """
     path, rates, noise = smooth_states(problem, log10_ratio)
     values = np.concatenate([path, problem.all_records.inputs], axis=1)
     free = _regress(problem, problem.library.evaluate(values), rates)
-    return TrajectoryFit(problem, Level(noise, 1.0), path, free, np.ones(len(free), dtype=np.bool_))
+    return TrajectoryFit(problem, noise, 1.0, path, free, np.ones(len(free), dtype=np.bool_))
 
 
 def _smooth_record(

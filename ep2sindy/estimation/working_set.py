@@ -25,7 +25,6 @@ from ep2sindy.estimation.kernels import marginalise, smooth_corrections
 from ep2sindy.estimation.likelihood import (
     FREE_START,
     Gram,
-    Level,
     Linearised,
     TrajectoryFit,
     hessian_on,
@@ -42,8 +41,8 @@ from ep2sindy.estimation.problem import (
 from ep2sindy.estimation.solver import (
     COMPARED_AT,
     OTHER_STARTS,
-    at_level,
     from_smooth,
+    refit,
     settle,
     smooth_states,
 )
@@ -95,7 +94,7 @@ def admit_terms(found: Solution) -> Solution:
         widened = replace(
             fit,
             problem=whole,
-            level=replace(fit.level, noise=found.noise.effective),
+            noise=found.noise.effective,
             free=_spread(fit.free, kept)[larger],
             support=_spread(fit.support, kept)[larger] | entering[larger],
         )
@@ -130,8 +129,7 @@ def first_set(problem: EstimationProblem) -> Support:
             kept[own] = True
             continue
         for model_error in FIRST_MODEL_ERRORS:
-            level = Level(noise, model_error)
-            fit = TrajectoryFit(problem, level, path, np.zeros(problem.n_free), kept)
+            fit = TrajectoryFit(problem, noise, model_error, path, np.zeros(problem.n_free), kept)
             pair = _own_squares(fit, steps, block, own)
             size = np.sqrt(zero_to_one(np.diag(pair.quadratic)))
             masks = exchange_terms(
@@ -187,7 +185,7 @@ def _own_squares(
     flow = np.concatenate([np.ones((len(columns), 1)), columns], axis=1)[:, None]
     defects = -np.diff(path[:, one], axis=0)
     flow[record.breaks] = defects[record.breaks] = 0.0
-    residuals, variance, _ = observe(record, path, np.square(fit.level.noise))
+    residuals, variance, _ = observe(record, path, np.square(fit.noise))
     case = (np.ascontiguousarray(each[:, one]) for each in (residuals, variance, fit.process))
     quadratic, linear, offset, _ = marginalise(flow, defects, *case, FREE_START)
     tells = np.isfinite(np.diag(quadratic)) & np.isfinite(linear)
@@ -206,7 +204,7 @@ def _would_pay(problem: EstimationProblem, kept: Support, found: Solution) -> Su
     enters = np.zeros_like(kept)
     if kept.all() or not np.isfinite(found.score):
         return enters
-    fit = at_level(found.fit, replace(found.fit.level, model_error=COMPARED_AT))
+    fit = refit(replace(found.fit, model_error=COMPARED_AT))
     gains = _gains(problem, fit) - term_prices(problem, float(problem.n_samples))
     gains[kept] = -np.inf
     for block in range(len(problem.states)):
@@ -221,7 +219,7 @@ def _gains(problem: EstimationProblem, fit: TrajectoryFit) -> ByCoefficient:
     if not np.isfinite(quadratic).all():
         return np.zeros(problem.n_free)
     # Neither terms nor slopes lead from one record to the next, whatever is missed there.
-    terms, std = _integrals(problem, fit.path), fit.level.noise
+    terms, std = _integrals(problem, fit.path), fit.noise
     score = np.square(terms.T @ (about.defects / about.process))
     with_states, with_all = np.zeros_like(score), np.zeros_like(score)
     rng, inverse = np.random.default_rng(0), invert_gram(quadratic)
