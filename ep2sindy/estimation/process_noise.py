@@ -12,7 +12,6 @@ The likelihood is that of the innovations (Schweppe 1965, doi:10.1109/TIT.1965.1
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -51,18 +50,10 @@ MAX_DEFECT = 3.0
 SETTLING = 5  # samples from whose start on innovations count
 
 
-class Errors(NamedTuple):
-    """Standard deviations of noise and process noise, by state; deviance: -2 log likelihood."""
+def likely_errors(fit: TrajectoryFit) -> tuple[ByState, ByState, float]:
+    """The likeliest noise and process noise about the path of a fit, and -2 log likelihood.
 
-    noise: ByState
-    process: ByState
-    deviance: float
-
-
-def likely_errors(fit: TrajectoryFit) -> Errors:
-    """The likeliest noise and process noise about the path of a fit.
-
-    The search for them starts from those of the fit.
+    Both are standard deviations. The search for them starts from those of the fit.
     """
     from scipy.optimize import minimize  # imported only to estimate errors
 
@@ -89,7 +80,7 @@ def likely_errors(fit: TrajectoryFit) -> Errors:
     budget = {"maxfev": MAX_TRIALS * len(start), "fatol": 0.1, "xatol": 0.05}
     options = {"initial_simplex": simplex, **budget}
     found = minimize(unlikely, start, method="Nelder-Mead", options=options)
-    return Errors(*sizes(found.x), float(found.fun))
+    return *sizes(found.x), float(found.fun)
 
 
 def solve_with_process_noise(problem: EstimationProblem) -> Solution:
@@ -99,18 +90,16 @@ def solve_with_process_noise(problem: EstimationProblem) -> Solution:
     fit = fit.with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
     for share in SHARES:
         fit = exchange_terms(refit(fit), share * prices)
-        errors = likely_errors(fit)
-        fit = fit.with_errors(errors.noise, errors.process)
+        std, process, deviance = likely_errors(fit)
+        fit = fit.with_errors(std, process)
     fit = refit(fit)
     noise, none = noise_beside(fit), np.zeros(len(problem.states))
-    explained = replace(
-        noise, std=errors.noise, memory=none, unexplained=none, patterned=none > 0.0
-    )
+    explained = replace(noise, std=std, memory=none, unexplained=none, patterned=none > 0.0)
     return Solution(
         fit=fit,
-        observation=Observation(explained, none, errors.process),
+        observation=Observation(explained, none, process),
         prices=prices,
-        deviance=errors.deviance,
+        deviance=deviance,
         tests=(_test_defects(fit), *_test_innovations(fit)),
     )
 

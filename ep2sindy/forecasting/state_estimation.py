@@ -233,9 +233,9 @@ def _with_likely_noise(
     paths = [estimator.fit_path(*pair).path for pair in zip(records, paths, strict=True)]
     samples, process = estimator.scaled_noise()
     fit = _fix(estimator.problem, records, paths, estimator.free, samples)
-    errors = likely_errors(replace(fit, n_substeps=estimator.n_substeps, process_noise=process))
-    noise = _noise_of(estimator.problem, errors.noise, errors.process)
-    return replace(estimator, noise=noise), paths
+    fit = replace(fit, n_substeps=estimator.n_substeps, process_noise=process)
+    likely = _noise_of(estimator.problem, *likely_errors(fit)[:2])
+    return replace(estimator, noise=likely), paths
 
 
 def _fix(
