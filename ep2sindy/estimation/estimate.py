@@ -217,7 +217,7 @@ def estimate_task(
     library, roles, constraint = task.library, task.roles, None
     if roles is not None:
         library = roles.with_known_terms(library, task.states)
-        played = compress(answer.problem.processes, answer.solution.fit.free != 0.0)
+        played = compress(answer.solution.problem.processes, answer.solution.fit.free != 0.0)
         constraint = constraint_of(library, task.states, list(played), roles.told)
     model = _model(answer, library, units or runs[0].units, provenance or {})
     return replace(_report(answer, model, runs, progress), constraint=constraint)
@@ -241,7 +241,7 @@ def _answer(task: Task, settings: _Settings) -> tuple[Explanation, Sequence[Traj
             tried.append(_try(task, known, ways, settings))
             if monitor.ended:
                 break
-        best.append(min(tried, key=lambda each: each[0].rank))
+        best.append(min(tried, key=lambda each: (bool(each[0].misfit), each[0].solution.rank)))
         if monitor.ended or not best[-1][0].misfit:
             break
     return min(best, key=lambda each: bool(each[0].misfit))
@@ -283,7 +283,7 @@ def _report(
     progress: Progress,
 ) -> Estimate:
     """Convert the solution to SI, and add its rivals."""
-    problem, found = answer.problem, answer.solution
+    problem, found = answer.solution.problem, answer.solution
     fit, pair = found.fit, gram(found.fit)
     supports = {
         state: _score_supports(problem, pair, found, block)
@@ -342,7 +342,7 @@ def _named_coef(problem: EstimationProblem, free: ByCoefficient, block: int) -> 
 def _model(
     answer: Explanation, library: Library, units: Mapping[str, str], provenance: Mapping[str, str]
 ) -> SparseModel:
-    problem, found = answer.problem, answer.solution
+    problem, found = answer.solution.problem, answer.solution
     fit = found.fit
     values = problem.coef_SI(fit.free)
     coef = np.zeros((len(library), len(problem.states)))

@@ -76,15 +76,6 @@ class Explanation:
     delays: ByState
     remarks: tuple[str, ...] = ()
 
-    @property
-    def problem(self) -> EstimationProblem:
-        return self.solution.problem
-
-    @property
-    def rank(self) -> tuple[bool, tuple[int, bool, int, float]]:
-        """Order between ways in which hidden states may enter: least is best."""
-        return bool(self.misfit), self.solution.rank
-
 
 def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -> Explanation:
     """The most likely support, and what beside its trajectory explains the samples, if need be.

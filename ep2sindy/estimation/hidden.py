@@ -34,7 +34,7 @@ from ep2sindy.signals.trace import is_positive
 # where the factor is small, this is little.
 LEAST_FACTOR = 0.03
 
-Columns = Mapping[str, Float[np.ndarray, " samples"]]
+Columns = dict[str, Float[np.ndarray, " samples"]]
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def with_guess(run: Trajectory, library: Library, ways: Sequence[Entrance]) -> T
         one = known | {way.hidden: np.ones(run.n_samples)}
         row = np.arange(len(library)) == library.index(way.term)
         factor = way.coefficient * _evaluate(library, row, one)[:, 0]
-        known, rates = _add_state(run, known, rates, way.hidden, _quotient(rate, factor))
+        _add_state(run, known, rates, way.hidden, _quotient(rate, factor))
     return _insert_states(run, known, units)
 
 
@@ -167,15 +167,15 @@ def with_guess_by(model: SparseModel, run: Trajectory) -> Trajectory:
     lacking = [name for name in model.states if name not in run.state_names]
     units = dict(run.units) | {name: model.units.get(name, "1") for name in lacking}
     while lacking:
-        told = {name: _infer_state(model, name, known, rates) for name in lacking}
-        shown = [(name, values) for name, values in told.items() if values is not None]
-        if not shown:
+        for name in lacking:
+            if (values := _infer_state(model, name, known, rates)) is not None:
+                break
+        else:
             raise ValueError(
                 f"states that a record lacks must show in the equations of those that it has, one "
                 f"at a time: none of {lacking} does in those of {list(rates)}; measure one of them"
             )
-        name, values = shown[0]
-        known, rates = _add_state(run, known, rates, name, values)
+        _add_state(run, known, rates, name, values)
         lacking.remove(name)
     return _insert_states(run, known, units)
 
@@ -198,7 +198,7 @@ def _infer_state(
     return None
 
 
-def _smooth(run: Trajectory) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _smooth(run: Trajectory) -> tuple[Columns, Columns]:
     """Smoothed states and the inputs, by name, and the rates of the states."""
     found = KalmanSmoother().estimate(run.t, run.states)
     known = dict(zip(run.state_names, found.smoothed.T, strict=True))
@@ -208,10 +208,9 @@ def _smooth(run: Trajectory) -> tuple[dict[str, np.ndarray], dict[str, np.ndarra
 
 def _add_state(
     run: Trajectory, known: Columns, rates: Columns, name: str, values: np.ndarray
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The known states and rates, and one state more."""
-    rate = make_interp_spline(run.t, values, k=3).derivative()(run.t)
-    return {**known, name: values}, {**rates, name: rate}
+) -> None:
+    """Add one state to those that are known, and its rate to theirs."""
+    known[name], rates[name] = values, make_interp_spline(run.t, values, k=3).derivative()(run.t)
 
 
 def _quotient(

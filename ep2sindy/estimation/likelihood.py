@@ -217,10 +217,10 @@ def _descend(fit: TrajectoryFit) -> TrajectoryFit:
         return fit  # no gradient to follow
     for _ in range(MAX_STEPS):
         fit.problem.monitor.step()
-        change, move = _step(fit)
-        if not np.isfinite(change).all():
+        step = _step(fit)
+        if step is None:
             return fit  # derivatives overflow before the flow itself does
-        share = 1.0
+        (change, move), share = step, 1.0
         while share > SHORTEST:
             tried = replace(fit, path=fit.path + share * move, free=fit.free + share * change)
             if tried.total < fit.total:
@@ -235,24 +235,21 @@ def _descend(fit: TrajectoryFit) -> TrajectoryFit:
     return fit
 
 
-def _step(
-    fit: TrajectoryFit,
-) -> tuple[ByCoefficient, BySample]:
-    """One Gauss-Newton step: changes of the free coefficients and of the path.
+def _step(fit: TrajectoryFit) -> tuple[ByCoefficient, BySample] | None:
+    """One Gauss-Newton step: changes of the free coefficients and of the path; None for no number.
 
     The states are marginalised, so that the normal equations of the coefficients alone remain; the
     change of the states follows from theirs by the smoother.
     """
-    change = np.full_like(fit.free, np.nan)
     # Reduced normal equations, H c = g: the Schur complement of the states' block.
     hessian, gradient, _, about = hessian_on(fit, fit.support)
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
-        return change, fit.path
+        return None
     # In units of H's diagonal, with a ridge for directions that the samples do not tell.
     size = unit_sizes(hessian)
     scaled = hessian / np.outer(size, size) + RIDGE * np.eye(len(size))
     step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
-    change[:] = 0.0
+    change = np.zeros_like(fit.free)
     change[fit.support] = step
     # Back-substitution into the states' block, which is block tridiagonal.
     defects = about.defects + about.slopes[:, :, fit.path.shape[1] :] @ step
