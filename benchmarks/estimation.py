@@ -356,7 +356,7 @@ def _behind(system: System, runs: Sequence[ep.Trajectory], found: ep.discovery.E
     for coef in (system.model.coef, found.model.coef):
         part = problem.restricted((coef != 0.0)[problem.column, problem.equation])
         part = replace(part, required=np.ones_like(part.required))
-        scores.append(from_smooth(part, None, max_terms=1).score)
+        scores.append(from_smooth(part, None).score)
     return scores[0] - scores[1]
 
 

@@ -1,4 +1,4 @@
-"""Estimating states and coefficients together: exact elimination, supports, noise, bad input."""
+"""Estimating states and coefficients together: exact marginals, supports, noise, bad input."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from benchmarks.known_systems import noisy
 from ep2sindy.data.sensor import Bounds
 from ep2sindy.discovery.method import method_of
 from ep2sindy.estimation import cost, explanation, kernels, likelihood
-from ep2sindy.estimation.kernels import departures, eliminate, filtered
+from ep2sindy.estimation.kernels import filter_states, marginalise, smooth_corrections
 from ep2sindy.estimation.likelihood import (
     Gram,
-    Level,
     TrajectoryFit,
     divergence_rate,
     fit_paths,
+    flow_by,
     gram,
     innovations,
 )
 from ep2sindy.estimation.noise import _shown_by_samples
 from ep2sindy.estimation.observation import LackOfFit, Solution
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states, squares_of_steps
+from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
@@ -80,10 +80,12 @@ def dense_rows(
     return np.concatenate(rows), np.concatenate(targets)
 
 
-def test_eliminated_states_leave_the_squares_of_the_dense_problem(rng: np.random.Generator) -> None:
+def test_marginal_squares_are_those_of_the_dense_problem(
+    rng: np.random.Generator,
+) -> None:
     case = linear_case(rng)
     rows, targets = dense_rows(*case, 10.0)
-    hessian, gradient, least, _ = eliminate(*case, 10.0)
+    hessian, gradient, least, _ = marginalise(*case, 10.0)
     n_states = rows.shape[1] - len(gradient)
     states, own = rows[:, :n_states], rows[:, n_states:]
     off = np.eye(len(rows)) - states @ np.linalg.pinv(states)
@@ -99,7 +101,7 @@ def test_the_spread_of_innovations_is_the_determinant_of_the_samples(
     """Products of many small variances would leave the range of numbers."""
     flow, defects, residuals, variance, process = linear_case(rng, n=n, p=0)
     flow, variance, process = flow / 3.0, size * variance, size * process
-    _, _, _, log_spread = eliminate(flow, defects, residuals, variance, process, 10.0)
+    _, _, _, log_spread = marginalise(flow, defects, residuals, variance, process, 10.0)
     n, d = residuals.shape
     # Covariance of all states, from the first one's and the steps'.
     to = np.zeros((n * d, n * d))
@@ -119,10 +121,10 @@ def test_squares_add_up_over_pieces_of_a_record(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flow, *case = linear_case(rng, n=50)
-    whole = eliminate(flow / 3.0, *case, 10.0)
+    whole = marginalise(flow / 3.0, *case, 10.0)
     monkeypatch.setattr(kernels, "FEWEST", 14)  # seven samples of two states
     monkeypatch.setattr(kernels, "PIECE", 0)
-    for found, expected in zip(eliminate(flow / 3.0, *case, 10.0), whole, strict=True):
+    for found, expected in zip(marginalise(flow / 3.0, *case, 10.0), whole, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
@@ -131,19 +133,19 @@ def test_the_last_state_of_the_filter_is_that_of_the_dense_problem(
 ) -> None:
     case = linear_case(rng, p=0)
     rows, targets = dense_rows(*case, 10.0)
-    innovations, mean, cov = filtered(*case, 10.0)
+    innovations, mean, cov = filter_states(*case, 10.0)
     d = len(mean)
     np.testing.assert_allclose(mean, np.linalg.lstsq(rows, targets, rcond=None)[0][-d:], rtol=1e-9)
     np.testing.assert_allclose(cov, np.linalg.inv(rows.T @ rows)[-d:, -d:], rtol=1e-9)
     assert np.array_equal(np.isnan(innovations), np.isnan(case[2]))
-    assert np.nansum(innovations**2) == pytest.approx(eliminate(*case, 10.0)[2])
+    assert np.nansum(innovations**2) == pytest.approx(marginalise(*case, 10.0)[2])
 
 
-def test_departures_are_those_of_the_dense_problem(rng: np.random.Generator) -> None:
+def test_smooth_corrections_are_those_of_the_dense_problem(rng: np.random.Generator) -> None:
     flow, defects, residuals, variance, process = linear_case(rng, p=0)
     rows, targets = dense_rows(flow, defects, residuals, variance, process, 10.0)
     expected = np.linalg.lstsq(rows, targets, rcond=None)[0].reshape(residuals.shape)
-    found = departures(flow, defects, residuals, variance, process, 10.0)
+    found = smooth_corrections(flow, defects, residuals, variance, process, 10.0)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
@@ -161,7 +163,7 @@ def test_the_flow_is_the_models_integral_between_samples() -> None:
     system = ep.lorenz()
     problem, run = lorenz_problem()
     (record,) = problem.records
-    ends = problem.ends(record, record.samples[:-1], truth(problem, system.model), 8)
+    ends = problem.ends(record.samples[:-1], truth(problem, system.model), 8)
     for k in (0, 50, 198):
         exact = solve_ivp(
             lambda _, x: system.model.derivative(x, np.empty(0)),
@@ -177,10 +179,8 @@ def test_the_flow_converges_with_the_fourth_order() -> None:
     problem, _ = lorenz_problem()
     (record,) = problem.records
     free = truth(problem, ep.lorenz().model)
-    fine = problem.ends(record, record.samples[:-1], free, 64)
-    errors = [
-        np.abs(problem.ends(record, record.samples[:-1], free, n) - fine).max() for n in (1, 2, 4)
-    ]
+    fine = problem.ends(record.samples[:-1], free, 64)
+    errors = [np.abs(problem.ends(record.samples[:-1], free, n) - fine).max() for n in (1, 2, 4)]
     slopes = -np.diff(np.log2(errors))
     np.testing.assert_allclose(slopes, 4.0, atol=0.2)
 
@@ -193,16 +193,18 @@ def test_sensitivities_are_derivatives_of_the_flow(relations: Sequence[str]) -> 
     support = np.zeros(len(free), dtype=np.bool_)
     support[[1, 4, 12, -1]] = True
     states = record.samples[:-1]
-    flow = problem.flow(record, states, free, support, 2)
-    np.testing.assert_allclose(flow.ends, problem.ends(record, states, free, 2), rtol=1e-12)
+    ones = np.ones_like(record.samples)
+    fit = TrajectoryFit(problem, ones, 1.0, record.samples, free, support, n_substeps=2)
+    flow = flow_by(fit, support)
+    np.testing.assert_allclose(flow.ends, problem.ends(states, free, 2), rtol=1e-12)
     h = 1e-6
     for column, j in enumerate(np.flatnonzero(support)):
         step = h * (np.arange(len(free)) == j)
-        up, down = (problem.ends(record, states, free + s * step, 2) for s in (1, -1))
+        up, down = (problem.ends(states, free + s * step, 2) for s in (1, -1))
         np.testing.assert_allclose(flow.slopes[:, :, 3 + column], (up - down) / (2 * h), atol=1e-7)
     for i in range(3):
         step = h * (np.arange(3) == i)
-        up, down = (problem.ends(record, states + s * step, free, 2) for s in (1, -1))
+        up, down = (problem.ends(states + s * step, free, 2) for s in (1, -1))
         np.testing.assert_allclose(flow.slopes[:, :, i], (up - down) / (2 * h), atol=1e-7)
 
 
@@ -210,9 +212,7 @@ def fit_of_truth(
     problem: EstimationProblem, model: ep.SparseModel, process: float
 ) -> TrajectoryFit:
     free, path = truth(problem, model), problem.all_records.samples.copy()
-    return TrajectoryFit(
-        problem, Level(np.full(path.shape, 0.05), process), path, free, free != 0.0
-    )
+    return TrajectoryFit(problem, np.full(path.shape, 0.05), process, path, free, free != 0.0)
 
 
 def fitted_lorenz(process: float) -> tuple[EstimationProblem, TrajectoryFit]:
@@ -257,8 +257,8 @@ def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
 def test_block_by_block_finds_the_best_support_of_all() -> None:
     problem, fit = fitted_lorenz(0.1)
     pair, prices = gram(fit), term_prices(problem, 200.0)
-    full = best_support(problem, pair, prices, np.ones_like(fit.support), max_terms=10)
-    empty = best_support(problem, pair, prices, np.zeros_like(fit.support), max_terms=10)
+    full = best_support(problem, pair, prices, np.ones_like(fit.support))
+    empty = best_support(problem, pair, prices, np.zeros_like(fit.support))
     assert full.score == pytest.approx(empty.score)
     for j in range(len(prices)):
         changed = full.support ^ (np.arange(len(prices)) == j)
@@ -277,8 +277,8 @@ def test_alternatives_hold_an_exchange_between_equations_that_neither_wants_alon
     pair = Gram(columns.T @ columns, columns.T @ target, float(target @ target))
     prices = np.full(n, 3.0)
     chosen, true = np.arange(n) == first, np.arange(n) == other
-    assert np.array_equal(best_support(problem, pair, prices, chosen, max_terms=7).support, chosen)
-    found = alternatives(problem, pair, prices, chosen, within=3.0, max_terms=7)
+    assert np.array_equal(best_support(problem, pair, prices, chosen).support, chosen)
+    found = alternatives(problem, pair, prices, chosen, within=3.0)
     assert np.array_equal(found[0].support, true)
     assert found[0].score == pytest.approx(3.0)
     assert all(each.score <= 4.0 + 3.0 for each in found)
@@ -380,8 +380,8 @@ def test_noise_that_grows_with_the_state_is_weighed_so() -> None:
 def test_what_fits_comes_before_what_scores_lower(monkeypatch: pytest.MonkeyPatch) -> None:
     """The score of states that leave the flow is no likelihood."""
 
-    def leaves(*given: object, max_terms: int) -> Solution:
-        found = from_smooth(*given, max_terms=max_terms)
+    def leaves(*given: object) -> Solution:
+        found = from_smooth(*given)
         error = LackOfFit(np.full(2, 0.1), 0.0, "the states leave the model")
         return replace(found, deviance=found.deviance - 1e4, tests=(error,), flow_error=0.1)
 
@@ -579,8 +579,9 @@ def three_runs(rng: np.random.Generator) -> TrajectoryFit:
     problem = replace(problem, records=(first, second, last))
     samples = problem.all_records.samples
     path, noise = samples + 0.1 * rng.normal(size=samples.shape), rng.uniform(0.2, 0.5, (63, 2))
-    free, level = 0.1 * rng.normal(size=problem.n_free), Level(noise, 0.3, n_substeps=2)
-    return TrajectoryFit(problem, level, path, free, np.ones(len(free), dtype=bool))
+    free = 0.1 * rng.normal(size=problem.n_free)
+    support = np.ones(len(free), dtype=bool)
+    return TrajectoryFit(problem, noise, 0.3, path, free, support, n_substeps=2)
 
 
 @pytest.mark.parametrize("process_noise", [None, np.array([0.1, 0.2])])
@@ -588,23 +589,25 @@ def test_runs_are_joined_without_a_way_from_one_to_the_next(
     rng: np.random.Generator, process_noise: np.ndarray | None
 ) -> None:
     fit = three_runs(rng)
-    problem, level = fit.problem, replace(fit.level, process_noise=process_noise)
-    fit, change = replace(fit, level=level), 0.1 * rng.normal(size=problem.n_free)
+    problem, fit = fit.problem, replace(fit, process_noise=process_noise)
+    change = 0.1 * rng.normal(size=problem.n_free)
 
     def parts_of(fit: TrajectoryFit) -> tuple:
         pair, (_, least, logs) = gram(fit), innovations(fit)
         return pair.quadratic, pair.linear, least, logs, fit.squares
 
     def move_of(fit: TrajectoryFit) -> np.ndarray:
-        return likelihood._move(likelihood.hessian_on(fit, fit.support)[3], change)
+        about = likelihood.hessian_on(fit, fit.support)[3]
+        defects = about.defects + about.slopes[:, :, 2:] @ change
+        return smooth_corrections(*about.of_states._replace(defects=defects))
 
     totals = [0.0] * 5
     for record, path, noise, move in zip(
-        problem.records, fit.paths, problem.split(level.noise), problem.split(move_of(fit)),
+        problem.records, fit.paths, problem.split(fit.noise), problem.split(move_of(fit)),
         strict=True,
     ):  # fmt: skip
-        alone, its = replace(problem, records=(record,)), replace(level, noise=noise)
-        own = replace(fit, problem=alone, level=its, path=path)
+        alone = replace(problem, records=(record,))
+        own = replace(fit, problem=alone, noise=noise, path=path)
         np.testing.assert_allclose(move, move_of(own), rtol=1e-9, atol=1e-12)
         totals = [total + part for total, part in zip(totals, parts_of(own), strict=True)]
     joined = parts_of(fit)
@@ -620,9 +623,9 @@ def test_a_pass_over_many_runs_is_a_single_call(
 
     def tell(flow: np.ndarray, *rest: np.ndarray) -> tuple:
         calls.append(len(flow))
-        return eliminate(flow, *rest)
+        return marginalise(flow, *rest)
 
-    monkeypatch.setattr(likelihood, "eliminate", tell)
+    monkeypatch.setattr(likelihood, "marginalise", tell)
     gram(fit)
     assert calls == [len(fit.path) - 1]
 
@@ -703,9 +706,9 @@ def test_the_time_is_looked_at_within_a_step_of_a_fit() -> None:
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 100)
     monitor = cost.SearchMonitor(limit_s=1.0, clock=clock, advance=advance)
     problem = scale_problem([run], ep.polynomial(run.state_names, degree=2), monitor=monitor)
-    level = Level(np.full(run.states.shape, 0.1), 0.1)
+    noise = np.full(run.states.shape, 0.1)
     free, support = np.zeros(problem.n_free), np.ones(problem.n_free, dtype=bool)
-    fit = TrajectoryFit(problem, level, problem.records[0].samples, free, support)
+    fit = TrajectoryFit(problem, noise, 0.1, problem.records[0].samples, free, support)
     now, monitor.best = 2, fit
     for one_pass in (
         lambda: fit.squares,
@@ -811,8 +814,8 @@ def test_a_path_that_misses_the_steps_of_its_model_is_no_trajectory() -> None:
 def test_right_models_meet_their_steps() -> None:
     run = LORENZ.trajectory(noise=0.2, rng=0)
     problem = scale_problem([run], LORENZ.model.library)
-    found = from_smooth(problem, None, max_terms=7)
-    missed = squares_of_steps(found.fit)[0]
+    found = from_smooth(problem, None)
+    missed = found.fit.squared_defects
     assert found.flow_error == 0.0
     assert (np.sqrt(missed / problem.n_samples) < 1e-2 * EXACT * found.noise.std).all()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit, divergence_rate
+from ep2sindy.estimation.likelihood import TrajectoryFit, divergence_rate
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.model.flow import Steps, _in_arrays, ends, flow
@@ -70,15 +70,15 @@ def test_paths_part_by_twice_the_positive_exponents(rate: float, expected: float
     run = ep.Trajectory(np.arange(400.0), np.exp(np.arange(400.0)[:, None] / 400.0), ["x"])
     problem = scale_problem([run], ep.polynomial(["x"], degree=1))
     free = np.array([0.0, rate])
-    level = Level(np.full((400, 1), 0.1), 1e-4, n_substeps=4)
-    fit = TrajectoryFit(problem, level, np.zeros((400, 1)), free, free != 0.0)
+    noise, path = np.full((400, 1), 0.1), np.zeros((400, 1))
+    fit = TrajectoryFit(problem, noise, 1e-4, path, free, free != 0.0, n_substeps=4)
     assert divergence_rate(fit) == pytest.approx(expected, abs=0.05)
 
 
 def test_a_model_that_could_follow_any_samples_is_a_misfit() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0).window(0, 400)
     problem = scale_problem([run], ep.polynomial(run.state_names, degree=2))
-    found = from_smooth(problem, None, max_terms=7)
+    found = from_smooth(problem, None)
     assert found.fits
     (apart,) = [test for test in found.tests if "paths beside" in test.words]
     assert (apart.statistic < np.exp(0.05 / 2.0)).all()

@@ -262,7 +262,7 @@ def test_rounded_samples_are_compared_as_they_are() -> None:
     rounded = Trajectory(run.t, step * np.round(run.states / step), run.state_names)
     estimator = tune_estimator(SPRING, rounded)
     (record,) = estimator.problem.records
-    assert record.limits is not None
+    assert record.limits.at.any()
     fit = estimator.fit_path(record, record.samples)
     residuals = linearise(fit).residuals
     np.testing.assert_allclose(residuals, record.samples - fit.path, rtol=1e-12)

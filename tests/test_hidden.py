@@ -9,7 +9,7 @@ import ep2sindy as ep
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_guess_by, with_guesses
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit, hessian_on, observe
+from ep2sindy.estimation.likelihood import TrajectoryFit, hessian_on, observe
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import MAX_HIDDEN_DEFECT, hidden_defects
@@ -107,8 +107,8 @@ def test_a_hidden_state_that_shrinks_gains_no_freedom() -> None:
     for factor in (1.0, 1e-6):
         path = problem.records[0].samples * [1.0, factor]
         free = np.zeros(problem.n_free)
-        level = Level(np.ones(path.shape), 1.0)
-        fit = TrajectoryFit(problem, level, path + np.array([0.05, 0.0]), free, free != 0.0)
+        ones, path = np.ones(path.shape), path + np.array([0.05, 0.0])
+        fit = TrajectoryFit(problem, ones, 1.0, path, free, free != 0.0)
         noise = noise_beside(fit)
         sizes.append(noise.white[0])
         assert noise.kurtosis[1] != noise.kurtosis[1]  # NaN: there is no noise of it
@@ -177,14 +177,14 @@ def test_a_hidden_state_that_follows_nothing_is_astray() -> None:
     run = PLANE.trajectory(noise=0.05, rng=0).window(0, 40)
     problem = scale_problem([run], ep.polynomial(["x", "y"], degree=1), measured=["x"])
     free, still = np.zeros(problem.n_free), np.ones(40)  # nothing moves
-    everything, cold = np.ones(len(free), dtype=bool), Level(np.ones((40, 2)), 1e-4)
+    everything, noise = np.ones(len(free), dtype=bool), np.ones((40, 2))
     for hidden, is_astray in (
         (np.sin(np.arange(40.0)), True),
         (1e-9 * np.sin(np.arange(40.0)), True),
         (still, False),
     ):
         path = np.column_stack([np.sin(np.arange(40.0)), hidden])
-        share = hidden_defects(TrajectoryFit(problem, cold, path, free, everything))
+        share = hidden_defects(TrajectoryFit(problem, noise, 1e-4, path, free, everything))
         assert (share > MAX_HIDDEN_DEFECT).tolist() == [False, is_astray]
 
 
@@ -200,8 +200,8 @@ def test_what_was_not_measured_counts_nothing() -> None:
     assert not seen.squares[:, 1].any()
     assert problem.n_squares == 40
     free = np.zeros(problem.n_free)
-    level = Level(0.1 * ones, 1.0)
-    fit = TrajectoryFit(problem, level, path, free, np.ones(len(free), dtype=bool))
+    support = np.ones(len(free), dtype=bool)
+    fit = TrajectoryFit(problem, 0.1 * ones, 1.0, path, free, support)
     least = hessian_on(fit, fit.support)[2]
     far = replace(record, samples=record.samples + np.array([0.0, 5.0]))  # a guess is no sample
     moved = replace(problem, records=(far,))

@@ -14,7 +14,7 @@ from benchmarks.known_systems import KINDS, noisy
 from benchmarks.spoilt import spoilt
 from ep2sindy.data.gaps import between_gaps
 from ep2sindy.estimation import explanation
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit
+from ep2sindy.estimation.likelihood import TrajectoryFit
 from ep2sindy.estimation.noise import ALIKE_SAMPLES, Noise, noise_beside
 from ep2sindy.estimation.observation import LackOfFit
 from ep2sindy.estimation.problem import scale_problem
@@ -28,9 +28,7 @@ def noise_of(
     """The noise beside given paths, in SI, of a model of no terms."""
     problem = scale_problem(runs, library or ep.polynomial(runs[0].state_names, degree=2))
     path, none = np.concatenate(paths) / problem.scale, np.zeros(problem.n_free)
-    return noise_beside(
-        TrajectoryFit(problem, Level(np.ones(path.shape), 1.0), path, none, none > 0.0)
-    )
+    return noise_beside(TrajectoryFit(problem, np.ones(path.shape), 1.0, path, none, none > 0.0))
 
 
 def at_rest(run: ep.Trajectory) -> np.ndarray:
@@ -127,7 +125,7 @@ def test_a_delay_competes_with_products_of_one_degree_more(draw: str, lacks: boo
         scale_problem([run], ep.polynomial(["x", "y"], degree=degree)) for degree in (2, 3)
     )
     problem = replace(problem, widen=lambda: wider)
-    found = from_smooth(problem, None, max_terms=7)
+    found = from_smooth(problem, None)
     late = explanation._align(found, 7)
     if lacks:  # whatever delay its false equations may have
         late = found
@@ -146,9 +144,7 @@ def test_a_delay_at_three_standard_errors_is_none() -> None:
 def test_what_explains_more_comes_first_then_the_simpler() -> None:
     """An exact trajectory explains all states or none; under process noise each by itself."""
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0).window(0, 300)
-    right = from_smooth(
-        scale_problem([run], ep.polynomial(run.state_names, degree=2)), None, max_terms=7
-    )
+    right = from_smooth(scale_problem([run], ep.polynomial(run.state_names, degree=2)), None)
     fails = LackOfFit(np.array([2.0, np.nan]), 1.0, "{state} is off by {value:g}")
     half = LackOfFit(np.array([0.0, 2.0]), 1.0, "both are off")
     observed = replace(right.observation, process=np.ones(2))

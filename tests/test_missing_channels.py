@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.estimation.explanation import unobserved_state
 from ep2sindy.estimation.problem import scale_problem
-from ep2sindy.estimation.unobserved import unobserved_state
 from ep2sindy.systems.systems import System, van_der_pol
 from tests.models import model_of
 

@@ -7,7 +7,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.estimation.likelihood import Level, TrajectoryFit
+from ep2sindy.estimation.likelihood import TrajectoryFit
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.process_noise import likely_errors, solve_with_process_noise
 from ep2sindy.systems.systems import System
@@ -85,9 +85,7 @@ def test_the_sizes_of_process_noise_and_noise_are_found() -> None:
 def test_what_a_library_lacks_is_no_process_noise(noise: float) -> None:
     """x' lacks x^3."""
     run = ep.systems.van_der_pol().trajectory(noise=noise, rng=0)
-    found = solve_with_process_noise(
-        scale_problem([run], ep.polynomial(run.state_names, degree=2)), max_terms=7
-    )
+    found = solve_with_process_noise(scale_problem([run], ep.polynomial(run.state_names, degree=2)))
     _, _, single, _ = found.tests
     assert single.statistic.max() > 6.0
     assert not found.fits
@@ -111,9 +109,8 @@ def test_the_likeliest_errors_of_a_random_walk_are_exact() -> None:
     run = Trajectory(np.arange(float(n)), samples[:, None], ["x"])
     problem = scale_problem([run], ep.polynomial(["x"], degree=1))
     none, guess = np.zeros(2), np.array([0.1])
-    level = Level(np.ones((n, 1)), 1.0).with_errors(guess, guess)
-    found = likely_errors(
-        TrajectoryFit(problem, level, problem.records[0].samples, none, none > 0.0)
-    )
-    assert found.noise * problem.scale == pytest.approx([0.5], rel=0.05)
-    assert found.process * problem.scale == pytest.approx([0.3], rel=0.05)
+    path = problem.records[0].samples
+    fit = TrajectoryFit(problem, np.ones((n, 1)), 1.0, path, none, none > 0.0)
+    noise, process, _ = likely_errors(fit.with_errors(guess, guess))
+    assert noise * problem.scale == pytest.approx([0.5], rel=0.05)
+    assert process * problem.scale == pytest.approx([0.3], rel=0.05)

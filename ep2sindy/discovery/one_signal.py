@@ -27,7 +27,7 @@ from ep2sindy.discovery.signal_unknowns import (
     record_of,
     search_hidden,
 )
-from ep2sindy.estimation.explanation import FIRST_MAX_TERMS
+from ep2sindy.estimation.problem import FIRST_MAX_TERMS
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.rolling import RollingStarts, spread_starts
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill, horizon_errors

@@ -1,6 +1,6 @@
 """Joint estimation of states and sparse coefficients, and the report of its result.
 
-Besides the model, the result explained_states remarks: sentences about the samples and their noise.
+Besides the model, the result holds remarks: sentences about the samples and their noise.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from ep2sindy.data.coerce import Task, check_domain
 from ep2sindy.data.runs import Runs, trajectories_of
@@ -19,16 +18,25 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import SearchMonitor, check_limit_s, check_size, growing_parts
 from ep2sindy.estimation.explanation import Explanation, explain
 from ep2sindy.estimation.hidden import Entrance, with_guesses
-from ep2sindy.estimation.likelihood import Gram, covariance, gram
+from ep2sindy.estimation.likelihood import Gram, gram, hessian_on
 from ep2sindy.estimation.noise import remark
 from ep2sindy.estimation.observation import Solution
-from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem, by_run, scale_problem
-from ep2sindy.estimation.solver import SAMPLES_PER_TERM, enough_samples
-from ep2sindy.estimation.supports import penalise, supports_by_size
+from ep2sindy.estimation.problem import (
+    MIN_SAMPLES,
+    SAMPLES_PER_TERM,
+    ByCoefficient,
+    BySample,
+    ByState,
+    EstimationProblem,
+    by_run,
+    scale_problem,
+)
+from ep2sindy.estimation.supports import offer_supports, penalise
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Constraint, Relation, relations_of
 from ep2sindy.library.roles import Roles, constraint_of
 from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.gram_kernels import invert_gram
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
 from ep2sindy.runtime.values import check_count
 
@@ -50,6 +58,11 @@ class ScoredSupport:
 
     coef: Mapping[str, float]
     deviance: float
+
+    @property
+    def odds(self) -> float:
+        """Odds against the chosen support."""
+        return float(np.exp(-0.5 * self.deviance))
 
 
 @dataclass(frozen=True)
@@ -87,20 +100,20 @@ class Estimate:
     """
 
     model: SparseModel
-    paths: tuple[Float[np.ndarray, "samples d"], ...] = field(repr=False)
+    paths: tuple[BySample, ...] = field(repr=False)
     runs: Sequence[Trajectory] = field(repr=False)
-    noise_std: Float[np.ndarray, " d"]
-    memory: Float[np.ndarray, " d"]
+    noise_std: ByState
+    memory: ByState
     flow_error: float
     misfit: str
     too_few_samples: str
     supports: Mapping[str, Sequence[ScoredSupport]] = field(repr=False)
     rivals: Sequence[Rival]
     remarks: tuple[str, ...]
-    kurtosis: Float[np.ndarray, " d"]
-    growth: Float[np.ndarray, " d"]
-    delays_s: Float[np.ndarray, " d"]
-    process_noise_std: Float[np.ndarray, " d"]
+    kurtosis: ByState
+    growth: ByState
+    delays_s: ByState
+    process_noise_std: ByState
     explained_states: tuple[str, ...]
     constraint: Constraint | None = field(default=None, repr=False)
 
@@ -194,24 +207,20 @@ def estimate_task(
             found, part = latest, larger
     assert found is not None
     answer, runs = found
-    if part is not task.runs:
-        answer = replace(answer, remarks=(_part_words(part, task.runs, limit_s), *answer.remarks))
-    library = task.library
-    if task.roles is not None:
-        library = task.roles.with_known_terms(library, task.states)
+    some, n = (sum(run.n_samples for run in each) for each in (part, task.runs))
+    if some < n:
+        words = (
+            f"the equations come from {some} of {n} samples, {len(part)} blocks spread over the "
+            f"record: limit_s={limit_s:g} leaves no time for more, or memory does not hold them"
+        )
+        answer = replace(answer, remarks=(words, *answer.remarks))
+    library, roles, constraint = task.library, task.roles, None
+    if roles is not None:
+        library = roles.with_known_terms(library, task.states)
+        played = compress(answer.solution.problem.processes, answer.solution.fit.free != 0.0)
+        constraint = constraint_of(library, task.states, list(played), roles.told)
     model = _model(answer, library, units or runs[0].units, provenance or {})
-    return replace(
-        _report(answer, model, runs, progress), constraint=_role_constraint(answer, task, library)
-    )
-
-
-def _role_constraint(answer: Explanation, task: Task, library: Library) -> Constraint | None:
-    """What the roles that are played make of the model's coefficients; None without roles."""
-    if task.roles is None:
-        return None
-    used = answer.solution.fit.free != 0.0
-    played = list(compress(answer.problem.processes, used))
-    return constraint_of(library, task.states, played, task.roles.told)
+    return replace(_report(answer, model, runs, progress), constraint=constraint)
 
 
 class _Settings(NamedTuple):
@@ -232,21 +241,10 @@ def _answer(task: Task, settings: _Settings) -> tuple[Explanation, Sequence[Traj
             tried.append(_try(task, known, ways, settings))
             if monitor.ended:
                 break
-        best.append(min(tried, key=lambda each: each[0].rank))
+        best.append(min(tried, key=lambda each: (bool(each[0].misfit), each[0].solution.rank)))
         if monitor.ended or not best[-1][0].misfit:
             break
-    answer, runs = min(best, key=lambda each: bool(each[0].misfit))
-    return answer, runs
-
-
-def _part_words(
-    part: Sequence[Trajectory], runs: Sequence[Trajectory], limit_s: float | None
-) -> str:
-    some, n = (sum(run.n_samples for run in each) for each in (part, runs))
-    return (
-        f"the equations come from {some} of {n} samples, {len(part)} blocks spread over the "
-        f"record: limit_s={limit_s:g} leaves no time for more, or memory does not hold them"
-    )
+    return min(best, key=lambda each: bool(each[0].misfit))
 
 
 def _try(
@@ -263,27 +261,19 @@ def _try(
             monitor=settings.monitor,
         )  # fmt: skip
 
-    problem = replace(
-        problem_of(known.library), widen=lambda: problem_of(_with_degree_more(known.library))
-    )
+    def widen() -> EstimationProblem:
+        more = polynomial(known.library.variables, degree=int(known.library.degrees.max()) + 1)
+        return problem_of(known.library + more)
+
+    problem = replace(problem_of(known.library), widen=widen)
     found = explain(problem, max_terms=settings.max_terms, align=settings.align)
-    ways_in = (way.words for way in ways)
-    words = (*_lonely_words(known.runs, problem), *ways_in, *found.remarks)
-    return replace(found, remarks=words), known.runs
-
-
-def _with_degree_more(library: Library) -> Library:
-    return library + polynomial(library.variables, degree=int(library.degrees.max()) + 1)
-
-
-def _lonely_words(runs: Sequence[Trajectory], problem: EstimationProblem) -> tuple[str, ...]:
-    n_samples = sum(run.n_samples for run in runs)
-    if problem.n_samples == n_samples:
-        return ()
-    return (
+    n_samples = sum(run.n_samples for run in known.runs)
+    lonely = (
         f"{n_samples - problem.n_samples} of {n_samples} samples are left out: fewer than "
-        f"{MIN_SAMPLES} stand together between gaps",
+        f"{MIN_SAMPLES} stand together between gaps"
     )
+    words = [lonely] * (problem.n_samples < n_samples) + [way.words for way in ways]
+    return replace(found, remarks=(*words, *found.remarks)), known.runs
 
 
 def _report(
@@ -293,11 +283,10 @@ def _report(
     progress: Progress,
 ) -> Estimate:
     """Convert the solution to SI, and add its rivals."""
-    problem, found = answer.problem, answer.solution
-    fit, few_terms = found.fit, answer.max_terms
-    pair = gram(fit)
+    problem, found = answer.solution.problem, answer.solution
+    fit, pair = found.fit, gram(found.fit)
     supports = {
-        state: _score_supports(problem, pair, found, block, few_terms)
+        state: _score_supports(problem, pair, found, block)
         for block, state in count_pieces(
             progress, list(enumerate(problem.states)), "equation", "rivals"
         )
@@ -313,7 +302,7 @@ def _report(
         memory=found.noise.memory,
         flow_error=found.flow_error,
         misfit=answer.misfit,
-        too_few_samples=_say_too_few(problem, few_terms) or _open_choice(problem, supports),
+        too_few_samples=_say_too_few(problem) or _open_choice(problem, supports),
         supports=supports,
         rivals=_rivals(problem, found, supports),
         remarks=(*answer.remarks, *remark(problem, found.noise)),
@@ -321,7 +310,7 @@ def _report(
         growth=found.noise.growth,
         delays_s=answer.delays * problem.step_s,
         process_noise_std=found.observation.process * problem.scale,
-        explained_states=answer.explained_states,
+        explained_states=() if found.fits else tuple(compress(problem.states, found.explained)),
     )
 
 
@@ -342,9 +331,7 @@ def check_runs(task: Task) -> None:
             )
 
 
-def _named_coef(
-    problem: EstimationProblem, free: Float[np.ndarray, " free"], block: int
-) -> dict[str, float]:
+def _named_coef(problem: EstimationProblem, free: ByCoefficient, block: int) -> dict[str, float]:
     """Term -> SI coefficient of one equation, for the coefficients that are not zero."""
     values = problem.coef_SI(free)
     own = (problem.equation == block) & (values != 0.0)
@@ -355,65 +342,62 @@ def _named_coef(
 def _model(
     answer: Explanation, library: Library, units: Mapping[str, str], provenance: Mapping[str, str]
 ) -> SparseModel:
-    problem, found = answer.problem, answer.solution
+    problem, found = answer.solution.problem, answer.solution
     fit = found.fit
     values = problem.coef_SI(fit.free)
     coef = np.zeros((len(library), len(problem.states)))
-    column = problem.places[problem.column]
+    column = problem.candidates.column[problem.places]
     coef[column, problem.equation] = values
     used = values != 0.0
     order = np.lexsort((column[used], problem.equation[used]))
     C = np.eye(problem.n_free) if problem.C is None else problem.C
     rows = (C[used][:, fit.support] * problem.to_SI[used, None])[order]
+    hessian, cov = hessian_on(fit, fit.support)[0], None
     # If the residuals exceed the noise, intervals would not cover the truth.
-    known = found.fits and not answer.misfit
-    free_cov = covariance(fit) if known else None
-    cov = None if free_cov is None else rows @ free_cov @ rows.T
+    if found.fits and not answer.misfit and np.isfinite(hessian).all():
+        cov = rows @ invert_gram(hessian) @ rows.T
     courses = dict(zip(problem.inputs, problem.courses, strict=True))
     return SparseModel(library, problem.states, coef, units, provenance, cov, courses=courses)
 
 
 def _score_supports(
-    problem: EstimationProblem, pair: Gram, found: Solution, block: int, max_terms: int
+    problem: EstimationProblem, pair: Gram, found: Solution, block: int
 ) -> list[ScoredSupport]:
     """Supports of one equation, by size and then by deviance."""
     fit = found.fit
     if not pair.finite:
         return [ScoredSupport(_named_coef(problem, fit.free, block), 0.0)]
-    chosen = penalise(pair, fit.support, found.prices).score
-    masks = supports_by_size(problem, pair, fit.support, block, max_terms=max_terms)
-    masks = [m for m in masks if not np.array_equal(m, fit.support)]
-    rows = []
-    for mask in [fit.support, *masks]:
-        each = penalise(pair, mask, found.prices)
-        free = fit.free if mask is fit.support else each.free
-        coef = _named_coef(problem, free, block)
-        rows.append(ScoredSupport(coef, max(each.score - chosen, 0.0)))
+    own = problem.block == block
+    offered = offer_supports(problem, pair, found.prices, fit.support, own)
+    others = [each.support for each in offered if not np.array_equal(each.support, fit.support)]
+    chosen, *rest = (penalise(pair, mask, found.prices) for mask in [fit.support, *others])
+    rows = [
+        ScoredSupport(_named_coef(problem, free, block), max(score - chosen.score, 0.0))
+        for free, score in [(fit.free, chosen.score), *((each.free, each.score) for each in rest)]
+    ]
     return sorted(rows, key=lambda w: (len(w.coef), w.deviance))
 
 
 def _rivals(
     problem: EstimationProblem, found: Solution, supports: Mapping[str, Sequence[ScoredSupport]]
 ) -> tuple[Rival, ...]:
-    fit = found.fit
     rivals = []
     for block, state in enumerate(problem.states):
-        chosen = set(_named_coef(problem, fit.free, block))
+        chosen = set(_named_coef(problem, found.fit.free, block))
         for each in supports[state]:
-            odds = float(np.exp(-0.5 * each.deviance))
-            if set(each.coef) != chosen and odds >= MIN_ODDS:
-                rivals.append(Rival(state, tuple(each.coef), odds))
+            if set(each.coef) != chosen and each.odds >= MIN_ODDS:
+                rivals.append(Rival(state, tuple(each.coef), each.odds))
     return tuple(sorted(rivals, key=lambda r: -r.odds)[:MAX_RIVALS])
 
 
-def _say_too_few(problem: EstimationProblem, max_terms: int) -> str:
-    if enough_samples(problem) or problem.candidates.required.all():  # or all terms are given
+def _say_too_few(problem: EstimationProblem) -> str:
+    if problem.enough_samples or problem.candidates.required.all():  # or all terms are given
         return ""
     n_terms = len(problem.candidates.library)
     return (
         f"{problem.n_samples} samples do not tell which of {n_terms} terms "
-        f"({SAMPLES_PER_TERM * n_terms} would): {max_terms} an equation at most were tried; "
-        "name the terms that you know (terms=...), or take a smaller library"
+        f"({SAMPLES_PER_TERM * n_terms} would): {problem.max_terms} an equation at most were "
+        "tried; name the terms that you know (terms=...), or take a smaller library"
     )
 
 
@@ -427,7 +411,7 @@ def _open_choice(
     """
     share = 1.0
     for weighed in supports.values():
-        share /= sum(float(np.exp(-0.5 * each.deviance)) for each in weighed)
+        share /= sum(each.odds for each in weighed)
     if share >= TOLD:
         return ""
     return (

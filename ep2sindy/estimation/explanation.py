@@ -13,7 +13,6 @@ from itertools import compress
 from math import log
 
 import numpy as np
-from jaxtyping import Float
 
 from ep2sindy.estimation.cost import OutOfTimeError
 from ep2sindy.estimation.likelihood import TrajectoryFit
@@ -21,27 +20,27 @@ from ep2sindy.estimation.observation import (
     PAYS,
     SURE,
     Solution,
+    best_delays,
     delay_misfit,
     delay_price,
     delay_words,
-    fit_delays,
+    free_delays,
     shift_channels,
     suspect_delays,
 )
-from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem
+from ep2sindy.estimation.problem import FIRST_MAX_TERMS, MIN_SAMPLES, ByState, EstimationProblem
 from ep2sindy.estimation.process_noise import process_noise_words, solve_with_process_noise
 from ep2sindy.estimation.solver import (
     ENOUGH_SAMPLES,
     OTHER_STARTS,
-    at_level,
-    enough_samples,
     from_smooth,
-    max_terms_for,
+    refit,
     settle,
+    smooth_states,
     start_from_smooth,
     unfinished_solution,
 )
-from ep2sindy.estimation.unobserved import unobserved_state
+from ep2sindy.estimation.supports import best_support
 from ep2sindy.estimation.working_set import admit_terms, first_set, search_within
 from ep2sindy.runtime.progress import SILENT
 from ep2sindy.trust.interruption import is_interruption
@@ -52,41 +51,30 @@ ADVICE = (
 # Model error of the fits that compare courses: an input half a step late shows, with all terms.
 COURSES_AT = 0.1
 BETTER = 4.0  # least fall of -2 log likelihood for which the most plausible course is left
-FIRST_MAX_TERMS, MORE_TERMS = 7, 5  # of one equation, and how many more where all are used
+MORE_TERMS = 5  # of one equation, where all allowed are used
 # Moves of late channels (the delay model is linear), and the move, in mean steps, that ends them.
 MAX_MOVES, SETTLED = 3, 0.05
 MAX_WIDER = 500  # terms of a library that a late channel competes with: more would take too long
+# Signs of an unobserved state, see `unobserved_state`.
+CLEAR = 4.0  # steps between the points of a path, in standard deviations of the noise
+MOST_POINTS = 3000  # of a path that is looked at, the first ones
+STRAIGHT = 0.95  # least cosine of the turn from one step to the next
+LEAST_SINE = 0.5  # of the angle of a crossing: noise turns a path by less
+LEAST_CROSSINGS = 3  # one may come from a gap or an outlier
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
     """The solution that is reported: of the samples as given, or of the aligned ones if asked for.
 
-    max_terms: the most terms of one equation that were tried. misfit: the reason why it does not
-    explain the samples; empty if it does. delays: (d,), in mean steps. remarks: on how the samples
-    were changed or explained.
+    misfit: the reason why it does not explain the samples; empty if it does. delays: (d,), in mean
+    steps. remarks: on how the samples were changed or explained.
     """
 
     solution: Solution
-    max_terms: int
     misfit: str
-    delays: Float[np.ndarray, " d"]
+    delays: ByState
     remarks: tuple[str, ...] = ()
-
-    @property
-    def problem(self) -> EstimationProblem:
-        return self.solution.problem
-
-    @property
-    def explained_states(self) -> tuple[str, ...]:
-        """States whose equations explain their samples although others do not."""
-        solution = self.solution
-        return () if solution.fits else tuple(compress(self.problem.states, solution.explained))
-
-    @property
-    def rank(self) -> tuple[bool, tuple[int, bool, int, float]]:
-        """Order between ways in which hidden states may enter: least is best."""
-        return bool(self.misfit), self.solution.rank
 
 
 def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -> Explanation:
@@ -99,7 +87,8 @@ def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -
     monitor = problem.monitor
     monitor.best = None
     try:
-        return _explain(problem, max_terms, align)
+        problem = replace(problem, most_terms=max_terms or FIRST_MAX_TERMS)
+        return _explain(problem, align, wider=max_terms is None)
     except (OutOfTimeError, KeyboardInterrupt, SystemError) as stop:
         late, interrupted = isinstance(stop, OutOfTimeError), is_interruption(stop)
         # Nobody follows a silent search, which may be one of many: an interruption ends them all.
@@ -110,59 +99,52 @@ def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -
             raise
         monitor.ended = True
         by = "limit_s" if late else "an interruption"
-        return _unfinished(
-            monitor.best, f"ended by {by} after {monitor.elapsed_s:.3g} s", max_terms
-        )
+        return _unfinished(monitor.best, f"ended by {by} after {monitor.elapsed_s:.3g} s")
     finally:
         monitor.best = None  # what follows is a report, which nothing ends
 
 
-def _unfinished(best: Solution | TrajectoryFit, ended: str, max_terms: int | None) -> Explanation:
+def _unfinished(best: Solution | TrajectoryFit, ended: str) -> Explanation:
     """The best so far of a search that was ended."""
     solution = best if isinstance(best, Solution) else unfinished_solution(best)
-    limit = max_terms or FIRST_MAX_TERMS
     if solution.fits:
         words = f"the search was {ended}: other starts and terms were not tried"
-        return _explanation(solution, limit, remarks=(words,))
+        return _explanation(solution, remarks=(words,))
     words = (
         f"the search was {ended}, and nothing fits as far as the noise yet: the equations are the "
         "best so far; raise limit_s, or take fewer terms"
     )
-    return _explanation(solution, limit, words)
+    return _explanation(solution, words)
 
 
 def _explanation(
-    solution: Solution, max_terms: int, misfit: str = "", remarks: tuple[str, ...] = ()
+    solution: Solution, misfit: str = "", remarks: tuple[str, ...] = ()
 ) -> Explanation:
     """A solution, which explains the samples unless there is a misfit or a limit to its terms."""
-    few_terms = max_terms_for(solution.problem, max_terms)
-    misfit = misfit or _at_limit(solution, max_terms)
-    return Explanation(solution, few_terms, misfit, solution.observation.delays, remarks)
+    misfit = misfit or _at_limit(solution)
+    return Explanation(solution, misfit, solution.observation.delays, remarks)
 
 
-def _explain(problem: EstimationProblem, max_terms: int | None, align: bool) -> Explanation:
-    """`explain` without a limit to its time."""
-    problem = on_likeliest_courses(problem, max_terms=max_terms or FIRST_MAX_TERMS)
-    first, limit = _search_by_size(problem, max_terms)
-    few_terms = max_terms_for(problem, limit)
-    exact, best = _compare(first, few_terms)
+def _explain(problem: EstimationProblem, align: bool, *, wider: bool) -> Explanation:
+    """`explain` without a limit to its time. wider: True allows equations to have more terms."""
+    first = _search_by_size(on_likeliest_courses(problem), wider=wider)
+    exact, best = _compare(first)
     observed = best.observation
     if observed.delays.any():
-        if words := _lacks_terms(best, few_terms):
-            return _explanation(exact, limit, words)
+        if words := _lacks_terms(best):
+            return _explanation(exact, words)
         if not align:
             words = delay_misfit(problem, observed.delays)
-            return replace(_explanation(exact, limit, words), delays=observed.delays)
+            return replace(_explanation(exact, words), delays=observed.delays)
         words = f"{delay_words(problem, observed.delays)}: brought together with the others"
-        return _explanation(best, limit, remarks=(words,))
+        return _explanation(best, remarks=(words,))
     if not best.fits:
-        return _explanation(best, limit, _misfit(best))
-    return _explanation(
-        best, limit, remarks=(process_noise_words(best),) if observed.process.any() else ()
-    )
+        return _explanation(best, _misfit(best))
+    remarks = (process_noise_words(best),) if observed.process.any() else ()
+    return _explanation(best, remarks=remarks)
 
 
-def _compare(first: Solution, max_terms: int) -> tuple[Solution, Solution]:
+def _compare(first: Solution) -> tuple[Solution, Solution]:
     """The best exact solution of the samples as they are, and the best under any observation.
 
     first: from smoothed states.
@@ -171,10 +153,10 @@ def _compare(first: Solution, max_terms: int) -> tuple[Solution, Solution]:
     exact = first
     if not first.fits:
         with problem.monitor.stage("process noise"):
-            under_noise = solve_with_process_noise(problem, max_terms=max_terms)
-            exact = _best(first, settle(under_noise.fit, max_terms=max_terms))
+            under_noise = solve_with_process_noise(problem)
+            exact = _best(first, settle(under_noise.fit))
         problem.monitor.best = exact
-    best = _best(exact, _align(first, max_terms))
+    best = _best(exact, _align(first))
     if best is not exact:
         return exact, best
     # Guesses of hidden states do not depend on how they are smoothed.
@@ -182,14 +164,14 @@ def _compare(first: Solution, max_terms: int) -> tuple[Solution, Solution]:
         if exact.fits and problem.n_samples >= ENOUGH_SAMPLES:
             break
         with problem.monitor.stage("another start"):
-            exact = _best(exact, from_smooth(problem, log10_ratio, max_terms=max_terms))
+            exact = _best(exact, from_smooth(problem, log10_ratio))
     if exact is not first:
-        best = _best(exact, _align(exact, max_terms))
+        best = _best(exact, _align(exact))
         if best is not exact:
             return exact, best
     # Terms outside the set were tested beside the first solution, if it fits.
     if not (exact is first if exact.fits else under_noise is not None and under_noise.fits):
-        wider = admit_terms(exact if exact.fits else first, max_terms=max_terms)
+        wider = admit_terms(exact if exact.fits else first)
         exact = wider if wider.fits else exact
     # A hidden state under process noise explains whatever there is.
     return exact, _best(exact, under_noise if problem.measured.all() else None)
@@ -200,32 +182,31 @@ def _best(one: Solution, other: Solution | None) -> Solution:
     return one if other is None else min(one, other, key=lambda each: each.rank)
 
 
-def _search_by_size(problem: EstimationProblem, max_terms: int | None) -> tuple[Solution, int]:
-    """The solution from smoothed states by a working set, and the limit of its terms."""
-    limit = max_terms or FIRST_MAX_TERMS
-    found = search_within(problem, max_terms=max_terms_for(problem, limit))
+def _search_by_size(problem: EstimationProblem, *, wider: bool) -> Solution:
+    """The solution from smoothed states by a working set, with more terms where all are used."""
+    found = search_within(problem)
     # More than half of the candidates would stand in for terms that the library lacks.
-    most = 0 if max_terms else int(np.bincount(problem.block).max()) // 2
-    while limit < most and _full(found, limit):
-        wider = min(limit + MORE_TERMS, most)
-        better = search_within(problem, max_terms=max_terms_for(problem, wider))
+    most = int(np.bincount(problem.block).max()) // 2 if wider else 0
+    while problem.most_terms < most and _full(found):
+        problem = replace(problem, most_terms=min(problem.most_terms + MORE_TERMS, most))
+        better = search_within(problem)
         if better.rank >= found.rank:
             break
-        found, limit = better, wider
+        found = better
     problem.monitor.best = found
-    return found, limit
+    return found
 
 
-def _align(found: Solution, max_terms: int) -> Solution | None:
+def _align(found: Solution) -> Solution | None:
     """A solution with late channels that fits and is likelier; None if there is none.
 
     Its samples are brought forward by their delays.
     """
     problem, around = found.problem, found.around
     # No model follows the samples, or a channel of its own rate cannot be moved onto the others.
-    if around is None or problem.partial:
+    if around is None or (problem.n_measured[problem.measured] < problem.n_samples).any():
         return None
-    step = suspect_delays(problem, around, found.fit.support, found.prices, max_terms=max_terms)
+    step = suspect_delays(problem, around, found.fit.support, found.prices)
     if step is None:
         return None
     now, late, delays = found, step != 0.0, np.zeros(len(step))
@@ -235,12 +216,12 @@ def _align(found: Solution, max_terms: int) -> Solution | None:
         if min(len(record.samples) for record in here.records) < MIN_SAMPLES:
             return None  # shifts as long as a record are no delays
         with problem.monitor.stage("channels that come late"):
-            now = from_smooth(here, None, max_terms=max_terms)
+            now = from_smooth(here, None)
         if now.around is None:
             return None
-        _, step, errors = fit_delays(
-            here, now.around, late, now.fit.support, now.prices, max_terms=max_terms
-        )
+        delayed = free_delays(now.around, late)
+        terms = best_support(here, delayed, now.prices, now.fit.support).support
+        step, errors = best_delays(now.around, terms, late)
         if np.abs(step).max() < SETTLED:
             break
     # Samples at the ends are left out: scale the likelihood to the full number of samples.
@@ -252,16 +233,16 @@ def _align(found: Solution, max_terms: int) -> Solution | None:
     return now if sure and now.fits and now.score < found.score else None
 
 
-def _lacks_terms(late: Solution, max_terms: int) -> str:
+def _lacks_terms(late: Solution) -> str:
     """Why terms are missing rather than a sensor late; empty unless one degree more is as good.
 
     With a channel that is moved, wrong equations may stand in for terms that the library lacks. But
     higher products also stand in for a delay: they count if there are no more terms of them.
     """
     wider = late.problem.widen and late.problem.widen()
-    if wider is None or len(wider.library) > MAX_WIDER or not enough_samples(wider):
+    if wider is None or len(wider.library) > MAX_WIDER or not wider.enough_samples:
         return ""
-    found = search_within(wider, max_terms=max_terms)
+    found = search_within(replace(wider, most_terms=late.problem.most_terms))
     n_more = found.fit.support.sum() - late.fit.support.sum()
     if not found.fits or found.score > late.score or n_more > 0:
         return ""
@@ -291,31 +272,31 @@ def _misfit(found: Solution) -> str:
     return f"{words}. A state is missing for certain: {sign}. {ADVICE}" if sign else words
 
 
-def _full(found: Solution, max_terms: int) -> list[str]:
+def _full(found: Solution) -> list[str]:
     """Equations with all terms allowed, though the library has more."""
     problem = found.problem
-    if max_terms_for(problem, max_terms) < max_terms:
+    if problem.max_terms < problem.most_terms:
         return []  # too few samples: this is reported anyway
     used = problem.coef_SI(found.fit.free) != 0.0
     n_used = np.bincount(problem.equation[used], minlength=len(problem.states))
     n_all = np.bincount(problem.candidates.equation, minlength=len(problem.states))
-    full = (n_used >= max_terms) & (n_all > max_terms)
+    full = (n_used >= problem.max_terms) & (n_all > problem.max_terms)
     return [f"{state}'" for state in compress(problem.states, full)]
 
 
-def _at_limit(found: Solution, max_terms: int) -> str:
+def _at_limit(found: Solution) -> str:
     """Warning if an equation uses all terms allowed: many terms may stand in for a missing one."""
-    full = _full(found, max_terms)
+    full = _full(found)
     if not full:
         return ""
     return (
-        f"{', '.join(full)} with as many terms as may be (max_terms={max_terms}): they may "
-        "stand for one that the library lacks, and intervals are not given; add terms to it, or "
-        "raise max_terms"
+        f"{', '.join(full)} with as many terms as may be (max_terms={found.problem.most_terms}): "
+        "they may stand for one that the library lacks, and intervals are not given; add terms to "
+        "it, or raise max_terms"
     )
 
 
-def on_likeliest_courses(problem: EstimationProblem, *, max_terms: int) -> EstimationProblem:
+def on_likeliest_courses(problem: EstimationProblem) -> EstimationProblem:
     """The problem with every input on the likeliest of the courses that its samples allow.
 
     They are compared before the search, with all terms: a wrong course would ask for wrong ones,
@@ -323,15 +304,12 @@ def on_likeliest_courses(problem: EstimationProblem, *, max_terms: int) -> Estim
     """
     if all(len(options) == 1 for options in problem.allowed_courses):
         return problem
-    part = problem.restricted(first_set(problem, max_terms))
+    part = problem.restricted(first_set(problem))
     start = start_from_smooth(part, None)
 
     @cache
     def unlikely(courses: tuple[str, ...]) -> float:
-        fit = at_level(
-            replace(start, problem=part.on_courses(courses)),
-            replace(start.level, model_error=COURSES_AT),
-        )
+        fit = refit(replace(start, problem=part.on_courses(courses), model_error=COURSES_AT))
         return part.n_squares * log(max(fit.total, np.finfo(np.float64).tiny))
 
     best = problem.courses
@@ -339,3 +317,64 @@ def on_likeliest_courses(problem: EstimationProblem, *, max_terms: int) -> Estim
         first, *others = [(*best[:j], course, *best[j + 1 :]) for course in options]
         best = min([first, *others], key=lambda c: unlikely(c) - BETTER * (c == first))
     return problem.on_courses(best)
+
+
+def unobserved_state(problem: EstimationProblem) -> str:
+    """The sign that a state is unobserved; empty if there is none, inputs drive, or d is above two.
+
+    A state that moves by a law of its own cannot pass a value upwards and later downwards, and the
+    path of two states in their plane cannot cross itself.
+    """
+    d = len(problem.states)
+    if problem.driven or d > 2 or not problem.measured.all():
+        return ""
+    smooth, _, noise = smooth_states(problem, None)
+    paths = [_clear_steps(path) for path in problem.split(smooth / noise)]
+    name = problem.states[0]
+    if d == 1 and sum(_turns(path[:, 0]) for path in paths) >= LEAST_CROSSINGS:
+        return f"{name} passes the same values up and down, which no law of {name} alone does"
+    if d == 2 and sum(_crossings(path) for path in paths) >= LEAST_CROSSINGS:
+        both = " and ".join(problem.states)
+        return f"the path of {both} crosses itself, which no law of {both} alone does"
+    return ""
+
+
+def _clear_steps(path: BySample) -> Float[np.ndarray, "points d"]:
+    """Points of a path that lie clearly apart; in units of the noise."""
+    kept = [0]
+    for k in range(1, len(path)):
+        if np.square(path[k] - path[kept[-1]]).sum() > CLEAR**2:
+            kept.append(k)
+            if len(kept) == MOST_POINTS:
+                break
+    return path[kept]
+
+
+def _turns(x: Float[np.ndarray, " points"]) -> int:
+    """Number of turns from up to down."""
+    up = np.diff(x) > 0.0
+    return int((up[:-1] & ~up[1:]).sum())
+
+
+def _crossings(path: Float[np.ndarray, "points 2"]) -> int:
+    """Number of pairs of steps that cross each other at a clear angle."""
+    if len(path) < 4:
+        return 0
+    points = path / np.maximum(path.std(axis=0), 1e-150)
+    step = np.diff(points, axis=0)
+    length = np.maximum(np.linalg.norm(step, axis=1), 1e-150)
+    along = (step[1:] * step[:-1]).sum(axis=1) > STRAIGHT * length[1:] * length[:-1]
+    # The chord of an arc cuts its corner: only where the path goes straight does it lie on it.
+    straight = np.flatnonzero(along[1:] & along[:-1]) + 1
+    points, step, length = points[straight], step[straight], length[straight]
+    count = 0
+    for k in range(len(step) - 1):
+        # Step k is p + s u, and a later one q + t v, with s and t from 0 to 1.
+        between, later = points[k + 1 :] - points[k], step[k + 1 :]
+        area = step[k, 0] * later[:, 1] - step[k, 1] * later[:, 0]
+        clear = np.abs(area) > LEAST_SINE * length[k] * length[k + 1 :]
+        safe = np.where(clear, area, 1.0)
+        s = (between[:, 0] * later[:, 1] - between[:, 1] * later[:, 0]) / safe
+        t = (between[:, 0] * step[k, 1] - between[:, 1] * step[k, 0]) / safe
+        count += int((clear & (s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0)).sum())
+    return count

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby, product
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.coerce import Task
@@ -34,7 +34,7 @@ from ep2sindy.signals.trace import is_positive
 # where the factor is small, this is little.
 LEAST_FACTOR = 0.03
 
-Columns = Mapping[str, Float[np.ndarray, " samples"]]
+Columns = dict[str, Float[np.ndarray, " samples"]]
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def with_guess(run: Trajectory, library: Library, ways: Sequence[Entrance]) -> T
         one = known | {way.hidden: np.ones(run.n_samples)}
         row = np.arange(len(library)) == library.index(way.term)
         factor = way.coefficient * _evaluate(library, row, one)[:, 0]
-        known, rates = _add_state(run, known, rates, way.hidden, _quotient(rate, factor))
+        _add_state(run, known, rates, way.hidden, _quotient(rate, factor))
     return _insert_states(run, known, units)
 
 
@@ -167,15 +167,15 @@ def with_guess_by(model: SparseModel, run: Trajectory) -> Trajectory:
     lacking = [name for name in model.states if name not in run.state_names]
     units = dict(run.units) | {name: model.units.get(name, "1") for name in lacking}
     while lacking:
-        told = {name: _infer_state(model, name, known, rates) for name in lacking}
-        shown = [(name, values) for name, values in told.items() if values is not None]
-        if not shown:
+        for name in lacking:
+            if (values := _infer_state(model, name, known, rates)) is not None:
+                break
+        else:
             raise ValueError(
                 f"states that a record lacks must show in the equations of those that it has, one "
                 f"at a time: none of {lacking} does in those of {list(rates)}; measure one of them"
             )
-        name, values = shown[0]
-        known, rates = _add_state(run, known, rates, name, values)
+        _add_state(run, known, rates, name, values)
         lacking.remove(name)
     return _insert_states(run, known, units)
 
@@ -198,7 +198,7 @@ def _infer_state(
     return None
 
 
-def _smooth(run: Trajectory) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _smooth(run: Trajectory) -> tuple[Columns, Columns]:
     """Smoothed states and the inputs, by name, and the rates of the states."""
     found = KalmanSmoother().estimate(run.t, run.states)
     known = dict(zip(run.state_names, found.smoothed.T, strict=True))
@@ -208,10 +208,9 @@ def _smooth(run: Trajectory) -> tuple[dict[str, np.ndarray], dict[str, np.ndarra
 
 def _add_state(
     run: Trajectory, known: Columns, rates: Columns, name: str, values: np.ndarray
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The known states and rates, and one state more."""
-    rate = make_interp_spline(run.t, values, k=3).derivative()(run.t)
-    return {**known, name: values}, {**rates, name: rate}
+) -> None:
+    """Add one state to those that are known, and its rate to theirs."""
+    known[name], rates[name] = values, make_interp_spline(run.t, values, k=3).derivative()(run.t)
 
 
 def _quotient(
@@ -234,23 +233,14 @@ def _insert_states(run: Trajectory, known: Columns, units: Mapping[str, str]) ->
     )
 
 
-def _powers_of(library: Library, name: str) -> Int[np.ndarray, " terms"]:
-    """How often each term holds a variable, alone or within a function."""
-    n, own = len(library.variables), [library.variables.index(name)]
-    own += [n + k for k, function in enumerate(library.functions) if function.variable == name]
-    return np.asarray(library.exponents[:, own].sum(axis=1))
-
-
 def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.ndarray, " terms"]:
     """Terms that are this variable times others alone; for no name, terms of the others."""
-    found = np.ones(len(library), dtype=np.bool_)
-    for variable in library.variables:
-        if variable not in (name, *others):
-            found &= _powers_of(library, variable) == 0
-    if name:
-        found &= library.exponents[:, library.variables.index(name)] == 1
-        found &= _powers_of(library, name) == 1
-    return found
+    of = np.array([*library.variables, *(function.variable for function in library.functions)])
+    found = ~library.exponents[:, ~np.isin(of, [name, *others])].any(axis=1)
+    if name:  # itself and not within a function
+        own = library.exponents[:, of == name]
+        found &= (own[:, 0] == 1) & (own.sum(axis=1) == 1)
+    return np.asarray(found)
 
 
 def _evaluate(

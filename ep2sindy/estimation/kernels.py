@@ -2,9 +2,12 @@
 
 A record has n samples of d states; p coefficients are free. The flow maps a state over one step
 between samples; `flow`: (n - 1, d, d + p) holds its derivatives with respect to the state, then to
-the coefficients. Everything is linearised about a path: `misses` (n - 1, d) is the flow minus the
+the coefficients. Everything is linearised about a path: `defects` (n - 1, d) is the flow minus the
 next state of the path, `residuals` (n, d) is the samples minus the path, and the unknowns are
-departures from the path.
+corrections of the path. With F_k the derivatives by the state, G_k those by the coefficients and c
+the change of these, the correction x_k of a state follows
+
+    x_(k+1) = F_k x_k + G_k c + defects_k + process noise,    residuals_k = x_k + noise
 
 A filter keeps one row for each state: its mean, the derivatives of the mean by the p coefficients,
 and its row of the covariance. The observation of a sample subtracts a multiple of one row from all
@@ -43,38 +46,47 @@ def _observe(i, residual, variance, state, cov, row, gain):
     cov: first column of the covariance. `row` becomes the row of state i before the update, with
     minus the innovation in place of its mean.
     """
+    # Innovation e = y_i - x_i with its derivatives by the coefficients, and its variance
+    # s = P_ii + R_i.
     _copy(state[i], row)
     row[0] -= residual
     spread = row[cov + i] + variance
+    # Kalman gain K_j = P_ji / s.
     weight = 1.0 / spread
     for j in range(len(state)):
         gain[j] = weight * state[j, cov + i]
+    # Kalman update of the other states: x_j + K_j e, and P_jl - K_j P_il.
     for j in range(len(state)):
         if j != i:
             _add(row, -gain[j], state[j])
-    # What differences would lose where the state was far less certain than the sample.
+    # Kalman update of state i itself: x_i + K_i e = y_i - (R_i / s) e, and P_il R_i / s. The usual
+    # differences would lose digits where the state was far less certain than the sample.
     left = weight * variance
     own = state[i]
     for c in range(len(own)):
         own[c] = left * row[c]
     own[0] += residual
+    # The covariance is symmetric: column i becomes row i.
     for j in range(len(state)):
         state[j, cov + i] = own[cov + j]
     return spread, weight
 
 
 @compiled(**INNER)
-def _step(flow, miss, process, state, cov, ahead, row):
+def _step(flow, defect, process, state, cov, ahead, row):
     """Write to `ahead` the rows of all states, propagated over one step."""
     d = len(flow)
     for i in range(d):
+        # Prediction of the mean and its derivatives: F x + defect, and F dx/dc + G. The columns of
+        # the covariance hold row i of F P meanwhile.
         new = ahead[i]
-        new[0] = miss[i]
+        new[0] = defect[i]
         _copy(flow[i, d:], new[1:cov])
         for c in range(cov, len(new)):
             new[c] = 0.0
         for j in range(d):
             _add(state[j], flow[i, j], new)
+        # Prediction of the covariance, F P F' + Q: its lower triangle, and the mirror image.
         for m in range(i + 1):
             row[m] = 0.0
             for j in range(d):
@@ -88,13 +100,13 @@ def _step(flow, miss, process, state, cov, ahead, row):
 def _at_start(d, p, free_start):
     """Rows of d states that nothing is known of, and the first column of their covariance."""
     cov = 1 + p
-    state = np.zeros((d, -(-(cov + d) // VECTOR) * VECTOR))
+    state = np.zeros((d, -(-(cov + d) // VECTOR) * VECTOR))  # rounded up
     state[:, cov : cov + d] = free_start * np.eye(d)
     return state, cov
 
 
-def eliminate(flow, misses, residuals, variance, process, free_start):
-    """Eliminate all states: the squares as a quadratic function of the coefficients alone.
+def marginalise(flow, defects, residuals, variance, process, free_start):
+    """Marginalise all states: the squares as a quadratic function of the coefficients alone.
 
     variance: (n, d), of the samples' noise; process: (n - 1, d), of the flow's error; free_start:
     prior variance of the first state. A residual that is not finite counts as a missing sample.
@@ -105,43 +117,45 @@ def eliminate(flow, misses, residuals, variance, process, free_start):
     n, d = residuals.shape
     state, cov = _at_start(d, flow.shape[2] - d, free_start)
     n_rows = max(FEWEST, PIECE // cov)
-    told, room = np.empty((min(n, max(1, n_rows // d)), d, cov)), _room_of(state)
-    gram, log_spread, case = np.zeros((cov, cov)), 0.0, (misses, residuals, variance, process)
-    for first in range(0, n, len(told)):
-        log_spread += _filter(first, flow, *case, state, cov, *room, told, *_nothing(d))
-        rows = told[: n - first].reshape(-1, cov)
+    whitened, room = np.empty((min(n, max(1, n_rows // d)), d, cov)), _room_of(state)
+    gram, log_spread, case = np.zeros((cov, cov)), 0.0, (defects, residuals, variance, process)
+    # Each whitened row is (-e, -de/dc) / sqrt(s) of one sample, so that the sum of their squares, a
+    # quadratic function of c, is the sum over samples of e^2 / s.
+    for first in range(0, n, len(whitened)):
+        log_spread += _filter(first, flow, *case, state, cov, *room, whitened, *_no_history(d))
+        rows = whitened[: n - first].reshape(-1, cov)
         gram += rows.T @ rows
     return gram[1:, 1:], -gram[0, 1:], gram[0, 0], log_spread
 
 
-def filtered(flow, misses, residuals, variance, process, free_start):
-    """Innovations (n, d), and mean (d,) and covariance (d, d) of the last departure from the path.
+def filter_states(flow, defects, residuals, variance, process, free_start):
+    """Innovations (n, d), and mean (d,) and covariance (d, d) of the last state's correction.
 
     An innovation is what a sample brings that the past did not tell, in its standard deviation; NaN
-    where nothing was measured. Arguments as for `departures`.
+    where nothing was measured. Arguments as for `smooth_corrections`.
     """
     n, d = residuals.shape
     state, cov = _at_start(d, 0, free_start)
-    told, case = np.empty((n, d, cov)), (misses, residuals, variance, process)
-    _filter(0, flow, *case, state, cov, *_room_of(state), told, *_nothing(d))
-    found = np.where(np.isfinite(residuals), -told[:, :, 0], np.nan)
+    whitened, case = np.empty((n, d, cov)), (defects, residuals, variance, process)
+    _filter(0, flow, *case, state, cov, *_room_of(state), whitened, *_no_history(d))
+    found = np.where(np.isfinite(residuals), -whitened[:, :, 0], np.nan)
     return found, state[:, 0], state[:, cov : cov + d]
 
 
-def departures(flow, misses, residuals, variance, process, free_start):
-    """Departures (n, d) of all states from the path that minimise the squares.
+def smooth_corrections(flow, defects, residuals, variance, process, free_start):
+    """Corrections (n, d) of all states of the path that minimise the squares, given all samples.
 
-    Arguments as for `eliminate`, but only the first d columns of `flow` are used. The backward pass
-    is the adjoint of the filter, which inverts no matrix (Bierman 1973,
+    Arguments as for `marginalise`, but only the first d columns of `flow` are used. The backward
+    pass is the adjoint of the filter, which inverts no matrix (Bierman 1973,
     doi:10.1016/0005-1098(73)90089-3).
     """
     n, d = residuals.shape
     state, cov = _at_start(d, 0, free_start)
-    told, roots, states = np.empty((n, d, cov + d)), np.empty((n, d)), np.empty((n, *state.shape))
-    case = misses, residuals, variance, process
-    _filter(0, flow, *case, state, cov, *_room_of(state), told, roots, states)
+    whitened, case = np.empty((n, d, cov + d)), (defects, residuals, variance, process)
+    history = np.empty((n, d)), np.empty((n, *state.shape))
+    _filter(0, flow, *case, state, cov, *_room_of(state), whitened, *history)
     found = np.empty((n, d))
-    _look_back(flow, told, roots, states, cov, np.zeros((2, d)), found)
+    _look_back(flow, whitened, *history, cov, np.zeros((2, d)), found)
     return found
 
 
@@ -150,31 +164,32 @@ def _room_of(state):
     return np.empty_like(state), np.empty(state.shape[1]), np.empty(len(state))
 
 
-def _nothing(d):
-    """Arrays that keep no roots and states of `_filter`."""
+def _no_history(d):
+    """Arrays without room for the roots and states of `_filter`."""
     return np.empty((0, d)), np.empty((0, d, 0))
 
 
 @compiled(**LOOPS)
 def _filter(
-    first, flow, misses, residuals, variance, process, state, cov, ahead, row, gain, told, roots,
-    states,
+    first, flow, defects, residuals, variance, process, state, cov, ahead, row, gain, whitened,
+    roots, states,
 ):  # fmt: skip
-    """Filter the samples from `first` on, as many as `told` (samples, d, columns) has room for.
+    """Filter the samples from `first` on, as many as `whitened` (samples, d, columns) has room for.
 
-    state: the rows before the first sample, then before the next one. Written to `told` are the
+    state: the rows before the first sample, then before the next one. Written to `whitened` are the
     first columns of each observed row (see `_observe`), over the standard deviation of the
     innovation; zero where nothing was measured. Kept, if they have room, are the inverses of these
     deviations in `roots` (n, d), and in `states` (n, d, columns) the rows before each sample.
     Returns the sum of the logarithms of the innovations' variances.
     """
     product, log_spread = 1.0, 0.0
-    for k in range(first, min(first + len(told), len(residuals))):
+    for k in range(first, min(first + len(whitened), len(residuals))):
         if len(states):
             for i in range(len(state)):
                 _copy(state[i], states[k, i])
         for i in range(len(state)):
-            out, root = told[k - first, i], 0.0
+            out, root = whitened[k - first, i], 0.0
+            # Innovation of sample (k, i) given all before it, unless nothing was measured.
             if np.isfinite(residuals[k, i]):
                 spread, weight = _observe(i, residuals[k, i], variance[k, i], state, cov, row, gain)
                 root = np.sqrt(weight)
@@ -185,22 +200,29 @@ def _filter(
             else:
                 for c in range(len(row)):
                     row[c] = 0.0
+            # In units of its standard deviation; with its row of the covariance for `_look_back`.
             for c in range(len(out)):
                 out[c] = root * row[c]
             if len(roots):
                 roots[k, i] = root
+        # Prediction of the next state.
         if k < len(flow):
-            _step(flow[k], misses[k], process[k], state, cov, ahead, row)
+            _step(flow[k], defects[k], process[k], state, cov, ahead, row)
             for i in range(len(state)):
                 _copy(ahead[i], state[i])
     return log_spread + np.log(product)
 
 
 @compiled(**LOOPS)
-def _look_back(flow, told, roots, states, cov, adjoints, found):
-    """Write the departures to `found` (n, d), from what the filter kept of every sample."""
+def _look_back(flow, whitened, roots, states, cov, adjoints, found):
+    """Write the corrections to `found` (n, d), from what the filter kept of every sample.
+
+    With P_k and x_k the filter's before sample k, the smoothed correction is x_k - P_k a_k, where
+    the adjoint a_k sums up what this sample and all later ones tell.
+    """
     (n, d), adjoint, carried = found.shape, adjoints[0], adjoints[1]
     for k in range(n - 1, -1, -1):
+        # Adjoint recursion over the step: a = F' a_(k+1); zero after the last sample.
         for j in range(d):
             carried[j] = 0.0
         if k < n - 1:
@@ -208,11 +230,14 @@ def _look_back(flow, told, roots, states, cov, adjoints, found):
                 for j in range(d):
                     carried[j] += flow[k, i, j] * adjoint[i]
         _copy(carried, adjoint)
+        # Adjoint recursion over the samples, last first, with s and P_i: of each at its update:
+        # a_i = a_i - (e + P_i: a) / s.
         for i in range(d - 1, -1, -1):
-            value = -told[k, i, 0]
+            value = -whitened[k, i, 0]
             for j in range(d):
-                value += told[k, i, cov + j] * adjoint[j]
+                value += whitened[k, i, cov + j] * adjoint[j]
             adjoint[i] -= roots[k, i] * value
+        # Smoothed correction: x_k - P_k a_k.
         for i in range(d):
             value = states[k, i, 0]
             for j in range(d):

@@ -31,9 +31,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.estimation.kernels import departures, eliminate
-from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
-from ep2sindy.model.flow import Flow
+from ep2sindy.estimation.kernels import marginalise, smooth_corrections
+from ep2sindy.estimation.problem import (
+    ByCoefficient,
+    BySample,
+    ByState,
+    EstimationProblem,
+    ScaledRecord,
+    Support,
+)
+from ep2sindy.model.flow import Flow, flow
+from ep2sindy.regression.gram_kernels import invert_gram
 
 FREE_START = 100.0  # prior variance of the first state: ten times its RMS, squared
 HELD_START = 1e-24  # the same of one that starts at zero
@@ -47,63 +55,67 @@ RIDGE = 1e-12  # added to a Hessian of unit diagonal
 # Samples that resolve the motion never need more substeps. Runaway coefficients may ask for more,
 # and each substep costs as much as the first.
 MAX_SUBSTEPS, MIN_ALLOWED, MAX_IN_ALL = 32, 4, 20_000
+SUBSTEP_ERROR = 0.1  # RMS error of the substeps, as a share of the flow's
 FAR_OUT = 1e3  # distance beyond a limit, in noise, from which the limit acts as a value
 TELLS = 1e-3  # weight, relative to a value's, below which limits carry no information
 LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
-    """How closely states must follow the samples and the flow.
-
-    noise: (samples, d), standard deviations of the samples of all records, scaled. model_error: of
-    the flow, as a share of the noise. process_noise: (d,), the flow's error itself, if it is known.
-    """
-
-    noise: Float[np.ndarray, "samples d"]
-    model_error: float
-    n_substeps: int = 1
-    process_noise: Float[np.ndarray, " d"] | None = None
-
-    def with_errors(
-        self, noise: Float[np.ndarray, " d"], process_noise: Float[np.ndarray, " d"]
-    ) -> Level:
-        """The same samples with other errors, alike at all of them."""
-        return Level(np.tile(noise, (len(self.noise), 1)), 1.0, process_noise=process_noise)
-
-
-@dataclass(frozen=True, eq=False)
 class TrajectoryFit:
-    """States and coefficients of a problem, fitted at a level of errors.
+    """States and coefficients of a problem, fitted under some noise and error of the flow.
 
-    path: states at the samples of all records, one after the other, scaled. free: zero outside the
-    support. at_zero: states that start at zero, and would start below it; None for none.
+    noise: standard deviations of the samples of all records, scaled. model_error: of the flow, as a
+    share of the noise. path: states at the samples of all records, one after the other, scaled.
+    free: zero outside the support. n_substeps: Runge-Kutta steps between two samples.
+    process_noise: the flow's error itself, if it is known. at_zero: states that start at zero, and
+    would start below it; None for none.
     """
 
     problem: EstimationProblem
-    level: Level
-    path: Float[np.ndarray, "samples d"]
-    free: Float[np.ndarray, " free"]
-    support: Bool[np.ndarray, " free"]
+    noise: BySample
+    model_error: float
+    path: BySample
+    free: ByCoefficient
+    support: Support
+    n_substeps: int = 1
+    process_noise: ByState | None = None
     at_zero: Bool[np.ndarray, "records d"] | None = None
 
+    def with_errors(self, noise: ByState, process_noise: ByState) -> TrajectoryFit:
+        """The same states under other errors, alike at all samples."""
+        noise = np.tile(noise, (len(self.path), 1))
+        return replace(self, noise=noise, n_substeps=1, process_noise=process_noise)
+
     @property
-    def paths(self) -> list[Float[np.ndarray, "samples d"]]:
+    def paths(self) -> list[BySample]:
         """The path of each record."""
         return self.problem.split(self.path)
 
     @cached_property
-    def squares(self) -> Float[np.ndarray, " d"]:
+    def squares(self) -> ByState:
         """The objective (see the module), by state; infinite if the flow is not finite."""
         self.problem.monitor.look()
-        record, level = self.problem.all_records, self.level
         with np.errstate(over="ignore", invalid="ignore"):
-            defects = self.problem.ends(record, self.path[:-1], self.free, level.n_substeps)
-            defects -= self.path[1:]
-            defects[record.breaks] = 0.0
-            total = observe(record, self.path, np.square(level.noise)).squares.sum(axis=0)
-            total = total + (np.square(defects) / self.process).sum(axis=0)
+            record, variance = self.problem.all_records, np.square(self.noise)
+            total = observe(record, self.path, variance).squares.sum(axis=0)
+            total = total + (np.square(self.defects) / self.process).sum(axis=0)
         return np.where(np.isfinite(total), total, np.inf)
+
+    @cached_property
+    @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
+    def defects(self) -> Float[np.ndarray, "steps d"]:
+        """What the flow from each state misses of the next one; zero between records."""
+        ends = self.problem.ends(self.path[:-1], self.free, self.n_substeps)
+        defects = ends - self.path[1:]
+        defects[self.problem.all_records.breaks] = 0.0
+        return defects
+
+    @property
+    @np.errstate(over="ignore", invalid="ignore")
+    def squared_defects(self) -> ByState:
+        """Sums of the squares of the defects, by state."""
+        return np.square(self.defects).sum(axis=0)
 
     @property
     def total(self) -> float:
@@ -117,29 +129,43 @@ class TrajectoryFit:
         Those between records are of states of which nothing is known, so that a filter whose slopes
         and defects are zero there begins each record anew.
         """
-        level = self.level
-        error = level.process_noise
-        error = level.model_error * level.noise[:-1] if error is None else error
-        found = np.square(np.broadcast_to(error, level.noise[:-1].shape))
+        noise, error = self.noise[:-1], self.process_noise
+        error = self.model_error * noise if error is None else error
+        found = np.square(np.broadcast_to(error, noise.shape))
         found[self.problem.all_records.breaks] = FREE_START
         return found
 
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """The squares as a quadratic function of all free coefficients, the states eliminated.
+    """The squares as a quadratic function of some unknowns z, the states marginalised.
 
     squares(z) = offset - 2 linear' z + z' quadratic z, exact where the fit is linear.
+    z: all free coefficients, and what a flow was differentiated by beside them.
     """
 
-    quadratic: Float[np.ndarray, "free free"]
-    linear: Float[np.ndarray, " free"]
+    quadratic: Float[np.ndarray, "z z"]
+    linear: Float[np.ndarray, " z"]
     offset: float
 
     @property
     def finite(self) -> bool:
         """False if terms outside the present support overflow between two samples."""
         return bool(np.isfinite(self.quadratic).all() and np.isfinite(self.linear).all())
+
+    def select(self, kept: Bool[np.ndarray, " z"]) -> Gram:
+        """The same with the other unknowns at zero."""
+        return Gram(self.quadratic[np.ix_(kept, kept)], self.linear[kept], self.offset)
+
+    def minimise(self, over: Bool[np.ndarray, " z"]) -> Gram:
+        """The least squares over some of the unknowns, as a function of the rest."""
+        rest, inverse = ~over, invert_gram(self.quadratic[np.ix_(over, over)])
+        share = self.quadratic[np.ix_(rest, over)] @ inverse
+        return Gram(
+            self.quadratic[np.ix_(rest, rest)] - share @ self.quadratic[np.ix_(over, rest)],
+            self.linear[rest] - share @ self.linear[over],
+            self.offset - float(self.linear[over] @ inverse @ self.linear[over]),
+        )
 
 
 def fit_paths(fit: TrajectoryFit) -> TrajectoryFit:
@@ -191,10 +217,10 @@ def _descend(fit: TrajectoryFit) -> TrajectoryFit:
         return fit  # no gradient to follow
     for _ in range(MAX_STEPS):
         fit.problem.monitor.step()
-        change, move = _step(fit)
-        if not np.isfinite(change).all():
+        step = _step(fit)
+        if step is None:
             return fit  # derivatives overflow before the flow itself does
-        share = 1.0
+        (change, move), share = step, 1.0
         while share > SHORTEST:
             tried = replace(fit, path=fit.path + share * move, free=fit.free + share * change)
             if tried.total < fit.total:
@@ -209,36 +235,25 @@ def _descend(fit: TrajectoryFit) -> TrajectoryFit:
     return fit
 
 
-def _step(
-    fit: TrajectoryFit,
-) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "samples d"]]:
-    """One Gauss-Newton step: changes of the free coefficients and of the path.
+def _step(fit: TrajectoryFit) -> tuple[ByCoefficient, BySample] | None:
+    """One Gauss-Newton step: changes of the free coefficients and of the path; None for no number.
 
     The states are marginalised, so that the normal equations of the coefficients alone remain; the
     change of the states follows from theirs by the smoother.
     """
-    change = np.full_like(fit.free, np.nan)
     # Reduced normal equations, H c = g: the Schur complement of the states' block.
     hessian, gradient, _, about = hessian_on(fit, fit.support)
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
-        return change, fit.path
+        return None
     # In units of H's diagonal, with a ridge for directions that the samples do not tell.
     size = unit_sizes(hessian)
     scaled = hessian / np.outer(size, size) + RIDGE * np.eye(len(size))
     step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
-    change[:] = 0.0
+    change = np.zeros_like(fit.free)
     change[fit.support] = step
     # Back-substitution into the states' block, which is block tridiagonal.
-    return change, _move(about, step)
-
-
-def _move(
-    about: Linearised, change: Float[np.ndarray, " support"]
-) -> Float[np.ndarray, "samples d"]:
-    """Change of the path, for a change of the coefficients."""
-    d = about.defects.shape[1]
-    defects = about.defects + about.slopes[:, :, d:] @ change
-    return departures(*about.of_states._replace(defects=defects))
+    defects = about.defects + about.slopes[:, :, fit.path.shape[1] :] @ step
+    return change, smooth_corrections(*about.of_states._replace(defects=defects))
 
 
 def divergence_rate(fit: TrajectoryFit) -> float:
@@ -262,47 +277,42 @@ def innovations(fit: TrajectoryFit) -> tuple[Linearised, float, float]:
     sum of the logarithms of their variances.
     """
     about = linearise(fit)
-    _, _, least, logs = eliminate(*about)
+    _, _, least, logs = marginalise(*about)
     return about, least, logs
 
 
 @np.errstate(over="ignore", invalid="ignore")  # `Gram.finite` says whether the result counts
-def gram(fit: TrajectoryFit) -> Gram:
-    """Linearise about a fit: all free coefficients of all equations, the states eliminated."""
-    quadratic, gradient, least, _ = hessian_on(fit, np.ones_like(fit.support))
-    linear = quadratic @ fit.free + gradient
-    offset = least + fit.free @ quadratic @ fit.free + 2.0 * fit.free @ gradient
-    return Gram(quadratic, linear, float(offset))
+def gram(fit: TrajectoryFit, along: Flow | None = None) -> Gram:
+    """Linearise about a fit: all free coefficients of all equations, the states marginalised.
+
+    along: the flow on its path, if it is differentiated by more than the coefficients.
+    """
+    along = along or flow_by(fit, np.ones_like(fit.support))
+    hessian, gradient, least, _ = marginalise(*linearise(fit, along))
+    free, n = fit.free, len(fit.free)
+    offset = least + free @ hessian[:n, :n] @ free + 2.0 * free @ gradient[:n]
+    return Gram(hessian, hessian[:, :n] @ free + gradient, float(offset))
 
 
-def covariance(fit: TrajectoryFit) -> Float[np.ndarray, "support support"] | None:
-    """Covariance of the support's free coefficients, scaled; None if the fit is not finite."""
-    hessian = hessian_on(fit, fit.support)[0]
-    if not np.isfinite(hessian).all():
-        return None
-    size = unit_sizes(hessian)
-    return np.linalg.pinv(hessian / np.outer(size, size), hermitian=True) / np.outer(size, size)
-
-
-def enough_substeps(fit: TrajectoryFit, *, share: float = 0.1) -> int:
-    """Number of Runge-Kutta steps between samples for an error below a share of the flow's."""
-    problem, n = fit.problem, fit.level.n_substeps
+def enough_substeps(fit: TrajectoryFit) -> int:
+    """Number of Runge-Kutta steps between samples for an error below a tenth of the flow's."""
+    problem, n = fit.problem, fit.n_substeps
     most = min(MAX_SUBSTEPS, max(MIN_ALLOWED, MAX_IN_ALL // problem.n_samples))
-    record, starts = problem.all_records, fit.path[:-1]
+    starts = fit.path[:-1]
     while 2 * n <= most:
         problem.monitor.look()
         with np.errstate(over="ignore", invalid="ignore"):
-            change = problem.ends(record, starts, fit.free, n)
-            change -= problem.ends(record, starts, fit.free, 2 * n)
-            errors = np.delete(np.square(change) / fit.process, record.breaks, axis=0)
-        if (errors.mean(axis=0) <= share**2).all():
+            change = problem.ends(starts, fit.free, n) - problem.ends(starts, fit.free, 2 * n)
+            errors = np.square(change) / fit.process
+            errors = np.delete(errors, problem.all_records.breaks, axis=0)
+        if (errors.mean(axis=0) <= SUBSTEP_ERROR**2).all():
             break
         n *= 2
     return n
 
 
 class Linearised(NamedTuple):
-    """The objective about a fit, as the kernels take it: `eliminate`, `filtered`, `departures`.
+    """The objective about a fit, as the three functions of `kernels` take it.
 
     slopes: derivatives of the flow by the state, then by the parameters; zero between records, as
     are the defects, what the flow from each sample misses of the next state of the path. residuals,
@@ -312,10 +322,10 @@ class Linearised(NamedTuple):
 
     slopes: Float[np.ndarray, "steps d columns"]
     defects: Float[np.ndarray, "steps d"]
-    residuals: Float[np.ndarray, "samples d"]
-    variance: Float[np.ndarray, "samples d"]
+    residuals: BySample
+    variance: BySample
     process: Float[np.ndarray, "steps d"]
-    start: Float[np.ndarray, " d"]
+    start: ByState
 
     @property
     def of_states(self) -> Linearised:
@@ -325,40 +335,53 @@ class Linearised(NamedTuple):
 
 
 @np.errstate(over="ignore", invalid="ignore")  # callers look whether the result is finite
-def linearise(fit: TrajectoryFit, flow: Flow | None = None) -> Linearised:
-    """The objective about a fit. flow: along its path; None for one with slopes by the state."""
+def linearise(fit: TrajectoryFit, along: Flow | None = None) -> Linearised:
+    """The objective about a fit. along: the flow on its path; None: with slopes by the state."""
     problem, record = fit.problem, fit.problem.all_records
     problem.monitor.look()
-    flow = flow or flow_by(fit, np.zeros_like(fit.support))
+    along = along or flow_by(fit, np.zeros_like(fit.support))
     # Rows of the steps: what the flow from each state misses of the next one.
-    defects = flow.ends - fit.path[1:]
-    defects[record.breaks] = flow.slopes[record.breaks] = 0.0
+    defects = along.ends - fit.path[1:]
+    defects[record.breaks] = along.slopes[record.breaks] = 0.0
     # Rows of the samples: residuals, and the variances of their noise.
-    residuals, variance, _ = observe(record, fit.path, np.square(fit.level.noise))
+    residuals, variance, _ = observe(record, fit.path, np.square(fit.noise))
     # Weights of the steps, and of the first states, of which nothing is known unless held at zero.
     process, start = fit.process, np.full(len(problem.states), FREE_START)
     if fit.at_zero is not None:
         first, *others = np.where(fit.at_zero, HELD_START, FREE_START)
         process[record.breaks], start = np.reshape(others, (-1, len(start))), first
-    return Linearised(flow.slopes, defects, residuals, variance, process, start)
+    return Linearised(along.slopes, defects, residuals, variance, process, start)
 
 
-def flow_by(fit: TrajectoryFit, support: Bool[np.ndarray, " free"], *, n_more: int = 0) -> Flow:
-    """The flow along the path of a fit, with derivatives by the coefficients of a support."""
-    problem, n = fit.problem, fit.level.n_substeps
-    return problem.flow(problem.all_records, fit.path[:-1], fit.free, support, n, n_more=n_more)
+@np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
+def flow_by(fit: TrajectoryFit, support: Support, *, n_more: int = 0) -> Flow:
+    """The flow along the path of a fit, with derivatives by the coefficients of a support.
+
+    n_more: columns of zeros behind them, for derivatives by something else.
+    """
+    problem = fit.problem
+    own, steps = problem.field(fit.free), problem.all_records.divided(fit.n_substeps)
+    involved = np.flatnonzero(support if problem.C is None else problem.C[:, support].any(axis=1))
+    by = problem.equation[involved], problem.column[involved]
+    found = flow(own, fit.path[:-1], steps, by, n_more=n_more)
+    if problem.C is None:
+        return found
+    d, p = len(problem.states), len(problem.states) + len(involved)
+    by_free = found.slopes[:, :, d:p] @ problem.C[np.ix_(involved, support)]
+    slopes = [found.slopes[:, :, :d], by_free, found.slopes[:, :, p:]]
+    return replace(found, slopes=np.concatenate(slopes, axis=2))
 
 
 def hessian_on(
-    fit: TrajectoryFit, support: Bool[np.ndarray, " free"]
+    fit: TrajectoryFit, support: Support
 ) -> tuple[np.ndarray, np.ndarray, float, Linearised]:
-    """Derivatives of the squares by the coefficients of a support, the states eliminated.
+    """Derivatives of the squares by the coefficients of a support, the states marginalised.
 
     Returns half the second derivatives, minus half the first, the least squares with these
     coefficients unchanged, and the linearisation.
     """
     about = linearise(fit, flow_by(fit, support))
-    return *eliminate(*about)[:3], about
+    return *marginalise(*about)[:3], about
 
 
 def within_bounds(
@@ -391,26 +414,19 @@ class LinearisedObservation(NamedTuple):
     squares: contributions to the objective, zero for a sample that the path meets.
     """
 
-    residuals: Float[np.ndarray, "samples d"]
-    variance: Float[np.ndarray, "samples d"]
-    squares: Float[np.ndarray, "samples d"]
+    residuals: BySample
+    variance: BySample
+    squares: BySample
 
 
-def observe(
-    record: ScaledRecord,
-    path: Float[np.ndarray, "samples d"],
-    variance: Float[np.ndarray, "samples d"],
-) -> LinearisedObservation:
+def observe(record: ScaledRecord, path: BySample, variance: BySample) -> LinearisedObservation:
     """Compare the samples of a record with a path, given the variance of the noise."""
-    residuals = record.samples - path
-    squares = np.square(residuals) / variance
-    if record.missing is not None:
-        residuals = np.where(record.missing, np.nan, residuals)
-        squares = np.where(record.missing, 0.0, squares)
-    if record.limits is None:
+    residuals = np.where(record.missing, np.nan, record.samples - path)
+    squares = np.where(record.missing, 0.0, np.square(record.samples - path) / variance)
+    at = record.limits.at & ~record.missing
+    if not at.any():
         return LinearisedObservation(residuals, variance, squares)
-    residuals, variance = residuals.copy(), variance.copy()
-    at = record.limits.at & record.at_hand
+    variance = variance.copy()
     noise = np.sqrt(variance[at])
     lower = (record.limits.lower - path)[at] / noise
     upper = (record.limits.upper - path)[at] / noise

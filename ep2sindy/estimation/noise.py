@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
+from itertools import chain, combinations_with_replacement, islice
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.likelihood import TrajectoryFit, fit_paths, innovations, observe
-from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.problem import BySample, ByState, EstimationProblem, StateMask
 from ep2sindy.runtime.screen import joined
 
 FLOOR = 1e-3  # least noise, as a share of the RMS: no model and no integration is exact
@@ -59,34 +59,34 @@ class Noise:
     from the median. deviance: -2 log likelihood of the residuals.
     """
 
-    std: Float[np.ndarray, " d"]
-    shape: Float[np.ndarray, "samples d"]
-    memory: Float[np.ndarray, " d"]
-    unexplained: Float[np.ndarray, " d"]
-    patterned: Bool[np.ndarray, " d"]
-    growth: Float[np.ndarray, " d"]
-    kurtosis: Float[np.ndarray, " d"]
+    std: ByState
+    shape: BySample
+    memory: ByState
+    unexplained: ByState
+    patterned: StateMask
+    growth: ByState
+    kurtosis: ByState
     outliers: Int[np.ndarray, " d"]
     deviance: float
 
     @property
-    def is_error(self) -> Bool[np.ndarray, " d"]:
+    def is_error(self) -> StateMask:
         """Mask of the states whose residuals are the model's error rather than noise."""
         return (self.unexplained > 0.0) | self.patterned
 
     @property
-    def white(self) -> Float[np.ndarray, "samples d"]:
+    def white(self) -> BySample:
         """Standard deviations at all samples."""
         least = np.minimum(self.std, FLOOR)  # a hidden state may be smaller
         return np.maximum(self.std * self.shape, least)
 
     @property
-    def effective(self) -> Float[np.ndarray, "samples d"]:
+    def effective(self) -> BySample:
         """Standard deviations of white noise that tells equally little about slow signals."""
         return self.white / np.sqrt(self.independent)
 
     @property
-    def independent(self) -> Float[np.ndarray, " d"]:
+    def independent(self) -> ByState:
         """Effective share of independent samples."""
         return (1.0 - self.memory) / (1.0 + self.memory)
 
@@ -95,7 +95,7 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     """Size, shape and memory of the residuals of a fit; the memory is that of an AR(1) process."""
     problem, record = fit.problem, fit.problem.all_records
     hidden, limited = ~problem.measured, problem.limited
-    left = np.where(record.at_hand, record.samples - fit.path, 0.0)
+    left = np.where(record.missing, 0.0, record.samples - fit.path)
     n = np.where(hidden, problem.n_samples, problem.n_measured)
     per_state = fit.support.sum() / len(problem.states) + len(problem.records)
     freedom = np.sqrt(n / np.maximum(n - per_state, 1.0))
@@ -116,7 +116,11 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
     new = [np.concatenate([e[:1], e[1:] - memory * e[:-1]]) for e in unit]
     patterned = (_hold_line(problem, new) | _follow_states(fit, new)) & (std > FLOOR)
-    believed = shows & _last_as_noise(fit, unit, std, memory) & ~patterned
+    samples, off = (problem.split(each) for each in (record.values, record.values - fit.path))
+    # Slow residuals of a signal's size tell that the model ignores the signal.
+    ignored = (memory > SLOW) & (std > LARGE * record.samples.std(axis=0))
+    lasts = _lasts_as_noise(unit, samples, off, std, memory, problem.n_samples)
+    believed = shows & lasts & ~ignored & ~patterned
     std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std[~hidden]).mean()
@@ -137,27 +141,7 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     )
 
 
-def _last_as_noise(
-    fit: TrajectoryFit,
-    unit: Sequence[Float[np.ndarray, "samples d"]],
-    std: Float[np.ndarray, " d"],
-    memory: Float[np.ndarray, " d"],
-) -> Bool[np.ndarray, " d"]:
-    """True where residuals are correlated as noise of this size and memory would be."""
-    problem, record = fit.problem, fit.problem.all_records
-    samples, off = (problem.split(each) for each in (record.values, record.values - fit.path))
-    # Slow residuals of a signal's size tell that the model ignores the signal.
-    ignored = (memory > SLOW) & (std > LARGE * record.samples.std(axis=0))
-    n = float(problem.n_samples)
-    shown = _shown_by_samples(samples, off, std, memory, n)
-    return _forgets(unit, memory, n) & shown & ~ignored
-
-
-def are_noise(
-    samples: Sequence[Float[np.ndarray, "samples d"]],
-    left: Sequence[Float[np.ndarray, "samples d"]],
-    n: float,
-) -> Bool[np.ndarray, " d"]:
+def are_noise(samples: Sequence[BySample], left: Sequence[BySample], n: float) -> StateMask:
     """True for states of which a model leaves no more than noise, so that intervals tell something.
 
     What it leaves is less than any model's error, or white, or lasts as noise does that the samples
@@ -165,33 +149,25 @@ def are_noise(
     of these samples are independent.
     """
     std, memory = np.sqrt(np.mean(np.square(np.concatenate(left)), axis=0)), _memory(left)
-    believed = _forgets(left, memory, n) & _shown_by_samples(samples, left, std, memory, n)
-    return believed | (memory <= SIGNIFICANT / np.sqrt(n)) | (std <= FLOOR)
+    lasts = _lasts_as_noise(left, samples, left, std, memory, n)
+    return lasts | (memory <= SIGNIFICANT / np.sqrt(n)) | (std <= FLOOR)
 
 
-def _likeliest_std(
-    fit: TrajectoryFit, std: Float[np.ndarray, " d"]
-) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+def _likeliest_std(fit: TrajectoryFit, std: ByState) -> tuple[ByState, ByState]:
     """For sensors with limits: the likeliest noise, and -2 log of the likelihood under it.
 
     The second value replaces that of `noise_beside` for states with limits.
     """
-    best, found = np.full(len(std), np.inf), std
     record, path = fit.problem.all_records, fit.path
     n_values = np.isfinite(record.values).sum(axis=0)
-    for share in NOISE_SHARES:
-        tried = np.maximum(share * std, FLOOR)
-        deviance = n_values * (np.log(np.square(tried)) - 1.0)
-        variance = np.broadcast_to(np.square(tried), path.shape)
-        deviance = deviance + observe(record, path, variance).squares.sum(axis=0)
-        found = np.where(deviance < best, tried, found)
-        best = np.minimum(deviance, best)
-    return found, best
+    tried = np.maximum(NOISE_SHARES[:, None] * std, FLOOR)
+    variances = (np.broadcast_to(np.square(each), path.shape) for each in tried)
+    squares = [observe(record, path, variance).squares.sum(axis=0) for variance in variances]
+    deviance = n_values * (np.log(np.square(tried)) - 1.0) + np.array(squares)
+    return tried[deviance.argmin(axis=0), np.arange(len(std))], deviance.min(axis=0)
 
 
-def _expected_residuals(
-    fit: TrajectoryFit, std: Float[np.ndarray, " d"]
-) -> Float[np.ndarray, "samples d"]:
+def _expected_residuals(fit: TrajectoryFit, std: ByState) -> BySample:
     """Residuals of values; for limits, the expected noise."""
     variance = np.broadcast_to(np.square(std), fit.path.shape)
     seen = observe(fit.problem.all_records, fit.path, variance)
@@ -199,13 +175,13 @@ def _expected_residuals(
     return np.where(np.isfinite(pull), pull, 0.0)
 
 
-def _memory(left: Sequence[Float[np.ndarray, "samples d"]]) -> Float[np.ndarray, " d"]:
+def _memory(left: Sequence[BySample]) -> ByState:
     """Correlation of residuals from one sample to the next."""
     return np.clip(autocorrelations(left, [1])[0], 0.0, MAX_LASTING)
 
 
 def autocorrelations(
-    pieces: Sequence[Float[np.ndarray, "samples d"]], lags: Sequence[int]
+    pieces: Sequence[BySample], lags: Sequence[int]
 ) -> Float[np.ndarray, "lags d"]:
     """Correlations of pieces of a record with themselves some samples later."""
     squares = sum(np.square(e).sum(axis=0) for e in pieces)
@@ -213,36 +189,32 @@ def autocorrelations(
     return np.array(products) / np.maximum(squares, TINY)
 
 
-def _shape(
-    problem: EstimationProblem,
-    path: Float[np.ndarray, "samples d"],
-    left: Float[np.ndarray, "samples d"],
-) -> tuple[Float[np.ndarray, "samples d"], Float[np.ndarray, " d"]]:
+def _shape(problem: EstimationProblem, path: BySample, left: BySample) -> tuple[BySample, ByState]:
     """Growth of the noise with the state: variance 1 - w + w x^2 / mean of x^2, w by likelihood.
 
     Returns the root of this variance, and w.
     """
     x2, e2 = np.square(path), np.square(left)
     relative = x2 / np.maximum(x2.mean(axis=0), TINY)
-    variance, growth = np.ones_like(x2), np.zeros(x2.shape[1])
     # Squares of correlated noise are correlated too: fewer of them are independent.
     square = np.square(_memory(problem.split(left)))
     shows = GROWTH_SHOWS * (1.0 + square) / (1.0 - square)
-    best = len(x2) * np.log(np.maximum(e2.mean(axis=0), TINY)) - shows
-    for share in SHARES:
-        tried = 1.0 - share + share * relative
-        ratio = (e2 / tried).mean(axis=0)
-        deviance = np.log(tried).sum(axis=0) + len(x2) * np.log(np.maximum(ratio, TINY))
-        better = deviance < best
-        best = np.where(better, deviance, best)
-        variance = np.where(better, tried, variance)
-        growth = np.where(better, share, growth)
-    return np.sqrt(variance), growth
+    shares = np.array([0.0, *SHARES])
+    deviance = np.array([_growth_deviance(1.0 - w + w * relative, e2) for w in shares])
+    deviance[0] -= shows
+    growth = shares[deviance.argmin(axis=0)]
+    return np.sqrt(1.0 - growth + growth * relative), growth
+
+
+def _growth_deviance(variance: BySample, e2: BySample) -> ByState:
+    """-2 log likelihood of noise with these variances, scaled to its best size."""
+    ratio = (e2 / variance).mean(axis=0)
+    return np.log(variance).sum(axis=0) + len(e2) * np.log(np.maximum(ratio, TINY))
 
 
 def _tails(
-    problem: EstimationProblem, new: Sequence[Float[np.ndarray, "samples d"]]
-) -> tuple[Float[np.ndarray, " d"], Int[np.ndarray, " d"]]:
+    problem: EstimationProblem, new: Sequence[BySample]
+) -> tuple[ByState, Int[np.ndarray, " d"]]:
     """Kurtosis of the AR(1) innovations of the residuals of values, and the number of outliers."""
     d = len(problem.states)
     kurtosis, outliers = np.full(d, np.nan), np.zeros(d, dtype=np.int64)
@@ -264,11 +236,11 @@ def flow_error(fit: TrajectoryFit, noise: Noise) -> float:
     weighed with white noise.
     Source of the likelihood by innovations: Schweppe 1965, doi:10.1109/TIT.1965.1053737.
     """
-    fit = replace(fit, level=replace(fit.level, noise=noise.white))
+    fit = replace(fit, noise=noise.white)
     by_memory = float((fit.problem.n_measured * np.log1p(-np.square(noise.memory))).sum())
     best, found = _deviance(fit) + by_memory - ERROR_SHOWS, 0.0
     for model_error in MODEL_ERRORS:
-        fit = fit_paths(replace(fit, level=replace(fit.level, model_error=model_error)))
+        fit = fit_paths(replace(fit, model_error=model_error))
         deviance = _deviance(fit)
         if deviance < best:
             best, found = deviance, model_error
@@ -283,25 +255,13 @@ def _deviance(fit: TrajectoryFit) -> float:
     """
     (about, least, spread), problem = innovations(fit), fit.problem
     if problem.limited.any():
-        assert problem.all_records.limits is not None
         known = problem.all_records.limits.at & np.isfinite(about.residuals)
         return spread - float(np.log(about.variance[known]).sum() - fit.squares.sum())
     n = problem.n_squares
     return spread + n * np.log(max(least, TINY) / n)
 
 
-def _forgets(
-    left: Sequence[Float[np.ndarray, "samples d"]], memory: Float[np.ndarray, " d"], n: float
-) -> Bool[np.ndarray, " d"]:
-    """True if the residuals' autocorrelation falls as fast as that of AR(1) noise of this memory.
-
-    The error of a model on a signal with white noise stays correlated over longer lags.
-    """
-    excess = autocorrelations(left, LAGS) - memory ** np.array(LAGS)[:, None]
-    return np.all(excess < LONGER / np.sqrt(n), axis=0)
-
-
-def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray]) -> Bool[np.ndarray, " d"]:
+def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray]) -> StateMask:
     """True if whitened residuals hold a cleaner line than noise: the model ignores an oscillation.
 
     Of white residuals the m ordinates of a periodogram are alike: the largest has more than a share
@@ -320,9 +280,7 @@ def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray]) -> Bool[np
     return held
 
 
-def _follow_states(
-    fit: TrajectoryFit, new: Sequence[Float[np.ndarray, "samples d"]]
-) -> Bool[np.ndarray, " d"]:
+def _follow_states(fit: TrajectoryFit, new: Sequence[BySample]) -> StateMask:
     """True if products of the states explain more of the residuals than they would of noise.
 
     What a library lacks is a function of the states, also where it lasts as noise does.
@@ -332,9 +290,7 @@ def _follow_states(
     return excess_explained(powers, np.concatenate(new)) > FOLLOWS
 
 
-def excess_explained(
-    columns: Float[np.ndarray, "samples columns"], residuals: Float[np.ndarray, "samples d"]
-) -> Float[np.ndarray, " d"]:
+def excess_explained(columns: Float[np.ndarray, "samples columns"], residuals: BySample) -> ByState:
     """How much more columns explain of residuals than of random ones, in standard errors.
 
     The squares that random residuals share with the columns are expected from the squares of each
@@ -346,25 +302,38 @@ def excess_explained(
     return (shared / expected - 1.0) * np.sqrt(basis.shape[1] / 2.0)
 
 
-def powers_of(states: Float[np.ndarray, "samples d"], degree: int) -> np.ndarray:
+def powers_of(states: BySample, degree: int) -> np.ndarray:
     """Products of standardised states up to a degree, lowest first, at most MAX_POWERS columns."""
     scaled = (states - states.mean(axis=0)) / zero_to_one(states.std(axis=0))
-    most = min(MAX_POWERS, len(states) // 5)
-    columns = [np.ones(len(states))]
-    for k in range(1, degree + 1):
-        for chosen in combinations_with_replacement(range(scaled.shape[1]), k):
-            if len(columns) < most:
-                columns.append(scaled[:, list(chosen)].prod(axis=1))
-    return np.stack(columns, axis=1)
+    most = max(1, min(MAX_POWERS, len(states) // 5))
+    factors = chain.from_iterable(
+        combinations_with_replacement(range(scaled.shape[1]), k) for k in range(degree + 1)
+    )
+    return np.stack([scaled[:, list(each)].prod(axis=1) for each in islice(factors, most)], axis=1)
+
+
+def _lasts_as_noise(
+    unit: Sequence[BySample],
+    samples: Sequence[BySample],
+    left: Sequence[BySample],
+    std: ByState,
+    memory: ByState,
+    n: float,
+) -> StateMask:
+    """True where residuals are correlated as AR(1) noise of this size and memory would be.
+
+    Their autocorrelation falls as fast as that of such noise, which the samples show: the error of
+    a model on a signal with white noise stays correlated over longer lags. unit: the residuals,
+    over the shape of the noise.
+    """
+    excess = autocorrelations(unit, LAGS) - memory ** np.array(LAGS)[:, None]
+    forgets = np.all(excess < LONGER / np.sqrt(n), axis=0)
+    return forgets & _shown_by_samples(samples, left, std, memory, n)
 
 
 def _shown_by_samples(
-    samples: Sequence[Float[np.ndarray, "samples d"]],
-    left: Sequence[Float[np.ndarray, "samples d"]],
-    std: Float[np.ndarray, " d"],
-    memory: Float[np.ndarray, " d"],
-    n: float,
-) -> Bool[np.ndarray, " d"]:
+    samples: Sequence[BySample], left: Sequence[BySample], std: ByState, memory: ByState, n: float
+) -> StateMask:
     """True if noise of this size and memory would leave differences as large as the samples'.
 
     The error of a model on a signal is smooth: it would make the differences smaller than they are.
@@ -380,9 +349,7 @@ def _shown_by_samples(
     return far < ALIKE / np.sqrt(n)
 
 
-def _squared_differences(
-    values: Sequence[Float[np.ndarray, "samples d"]],
-) -> Float[np.ndarray, " d"]:
+def _squared_differences(values: Sequence[BySample]) -> ByState:
     """Mean squares of the third differences, NaN left out; zero where there are none."""
     differences = np.concatenate([np.diff(each, ORDER, axis=0) for each in values])
     count = np.maximum(np.isfinite(differences).sum(axis=0), 1)
@@ -391,7 +358,7 @@ def _squared_differences(
 
 def remark(problem: EstimationProblem, noise: Noise) -> tuple[str, ...]:
     """Remarks on sensor limits, on noise that is not white and normal, and on collinear states."""
-    limits = [w for r in problem.records if r.limits is not None for w in r.limits.words]
+    limits = [words for record in problem.records for words in record.limits.words]
     return (
         *(f"{words}: read as limits, not as values" for words in dict.fromkeys(limits)),
         *(

@@ -18,13 +18,17 @@ from dataclasses import dataclass, replace
 from math import inf, log
 
 import numpy as np
-from jaxtyping import Bool, Float
 
-from ep2sindy.estimation.kernels import eliminate
-from ep2sindy.estimation.likelihood import Gram, TrajectoryFit, flow_by, linearise
+from ep2sindy.estimation.likelihood import Gram, TrajectoryFit, flow_by, gram
 from ep2sindy.estimation.noise import Noise
-from ep2sindy.estimation.problem import EstimationProblem
-from ep2sindy.estimation.supports import PenalisedFit, best_support, penalise
+from ep2sindy.estimation.problem import (
+    ByCoefficient,
+    ByState,
+    EstimationProblem,
+    StateMask,
+    Support,
+)
+from ep2sindy.estimation.supports import best_support, penalise
 from ep2sindy.regression.gram_kernels import invert_gram
 
 IGNORED = 0.5  # residual, as a share of a state's spread, if the model ignores the state
@@ -45,8 +49,8 @@ class Observation:
     """
 
     noise: Noise
-    delays: Float[np.ndarray, " d"]
-    process: Float[np.ndarray, " d"]
+    delays: ByState
+    process: ByState
     price: float = 0.0
 
 
@@ -58,12 +62,12 @@ class LackOfFit:
     all states together.
     """
 
-    statistic: Float[np.ndarray, " d"] | Bool[np.ndarray, " d"]
+    statistic: ByState | StateMask
     bound: float
     words: str = ""
 
     @property
-    def passes(self) -> Bool[np.ndarray, " d"]:
+    def passes(self) -> StateMask:
         return np.asarray(self.statistic <= self.bound)  # NaN does not
 
 
@@ -81,11 +85,11 @@ class Solution:
 
     fit: TrajectoryFit
     observation: Observation
-    prices: Float[np.ndarray, " free"]
+    prices: ByCoefficient
     deviance: float
     tests: tuple[LackOfFit, ...]
     flow_error: float = 0.0
-    around: DelayedGram | None = None
+    around: Gram | None = None
 
     @property
     def problem(self) -> EstimationProblem:
@@ -103,7 +107,7 @@ class Solution:
         return self.deviance + float(self.prices[self.fit.support].sum()) + self.observation.price
 
     @property
-    def explained(self) -> Bool[np.ndarray, " d"]:
+    def explained(self) -> StateMask:
         """Mask of the states that the fit explains; an exact trajectory explains all or none."""
         found = np.all([test.passes for test in self.tests], axis=0) & np.isfinite(self.score)
         return found if self.observation.process.any() else np.full(len(found), found.all())
@@ -138,83 +142,56 @@ class Solution:
         return list(dict.fromkeys(words))
 
 
-@dataclass(frozen=True, eq=False)
-class DelayedGram:
-    """The squares as a quadratic function of the free coefficients z and some states' delays tau.
-
-        S(z, tau) = at_rest(z) + 2 tau' of_both' z + tau' of_delays tau - 2 linear' tau
-
-    Linearised about a fit without delays. at_rest: the part without delays. of_both: (free,
-    delays), of_delays: (delays, delays), both quadratic; linear: (delays,).
-    """
-
-    at_rest: Gram
-    of_both: Float[np.ndarray, "free delays"]
-    of_delays: Float[np.ndarray, "delays delays"]
-    linear: Float[np.ndarray, " delays"]
-
-    def of(self, late: Bool[np.ndarray, " delays"]) -> DelayedGram:
-        """Keep the delays of some states only."""
-        own = self.of_delays[np.ix_(late, late)]
-        return DelayedGram(self.at_rest, self.of_both[:, late], own, self.linear[late])
-
-    @property
-    def freed(self) -> Gram:
-        """The squares as a function of the coefficients, minimised over the delays."""
-        inverse = invert_gram(self.of_delays)
-        share = self.of_both @ inverse
-        return Gram(
-            self.at_rest.quadratic - share @ self.of_both.T,
-            self.at_rest.linear - share @ self.linear,
-            self.at_rest.offset - float(self.linear @ inverse @ self.linear),
-        )
-
-    def delays(
-        self, support: Bool[np.ndarray, " free"]
-    ) -> tuple[Float[np.ndarray, " delays"], Float[np.ndarray, " delays"]]:
-        """Best delays jointly with the coefficients on a support, and their standard errors."""
-        quadratic = self.at_rest.quadratic[np.ix_(support, support)]
-        share = self.of_both[support].T @ invert_gram(quadratic)
-        inverse = invert_gram(self.of_delays - share @ self.of_both[support])
-        best = inverse @ (self.linear - share @ self.at_rest.linear[support])
-        return best, np.sqrt(np.maximum(np.diag(inverse), 0.0))
-
-
-def delayed_gram(fit: TrajectoryFit) -> DelayedGram:
-    """Linearise about a fit, with a delay of every state.
+def delayed_gram(fit: TrajectoryFit) -> Gram:
+    """Linearise about a fit: the free coefficients, then a delay tau of every state.
 
     Without inputs, a common delay of all states leaves no trace in the data. To first order, a
     state that is read tau early lies tau times its rate further on. At the start of a step this
     displacement goes through the flow; at the end of the step it is what the samples show.
     """
-    problem, d, n = fit.problem, fit.path.shape[1], len(fit.support)
+    problem, d = fit.problem, fit.path.shape[1]
     flow = flow_by(fit, np.ones_like(fit.support), n_more=d)
-    rates = problem.rates(problem.all_records, fit.path, fit.free)
+    values = np.concatenate([fit.path, problem.all_records.inputs], axis=1)
+    rates = problem.field(fit.free).rates(values)
     flow.slopes[:, :, -d:] = flow.slopes[:, :, :d] * rates[:-1, None, :]
     flow.slopes[:, np.arange(d), np.arange(-d, 0)] -= rates[1:]
-    quadratic, gradient, least, _ = eliminate(*linearise(fit, flow))
-    linear = quadratic[:, :n] @ fit.free + gradient
-    own = quadratic[:n, :n]
-    offset = least + fit.free @ own @ fit.free + 2.0 * fit.free @ gradient[:n]
-    at_rest = Gram(own, linear[:n], float(offset))
-    return DelayedGram(at_rest, quadratic[:n, n:], quadratic[n:, n:], linear[n:])
+    return gram(fit, flow)
+
+
+def without_delays(around: Gram, n: int) -> Gram:
+    """The squares as a function of the n coefficients alone, no state delayed."""
+    return around.select(np.arange(len(around.linear)) < n)
+
+
+def free_delays(around: Gram, late: StateMask) -> Gram:
+    """The squares as a function of the coefficients, minimised over some states' delays."""
+    n = len(around.linear) - len(late)
+    own = around.select(np.append(np.ones(n, dtype=np.bool_), late))
+    return own.minimise(np.arange(len(own.linear)) >= n)
+
+
+def best_delays(around: Gram, support: Support, late: StateMask) -> tuple[ByState, ByState]:
+    """Best delays of some states jointly with the terms of a support, and their standard errors."""
+    own = around.select(np.append(support, late))
+    own = own.minimise(np.arange(len(own.linear)) < support.sum())
+    inverse = invert_gram(own.quadratic)
+    delays, errors = np.zeros((2, len(late)))
+    delays[late] = inverse @ own.linear
+    errors[late] = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    return delays, errors
 
 
 def suspect_delays(
-    problem: EstimationProblem,
-    around: DelayedGram,
-    support: Bool[np.ndarray, " free"],
-    prices: Float[np.ndarray, " free"],
-    *,
-    max_terms: int,
-) -> Float[np.ndarray, " d"] | None:
+    problem: EstimationProblem, around: Gram, support: Support, prices: ByCoefficient
+) -> ByState | None:
     """Delays by state, in mean steps, that make fewer or likelier terms suffice; None if none."""
     late = problem.measured.copy()
     late[np.argmax(late)] = problem.driven  # without inputs the first state sets the clock
-    if not (late.any() and around.of(late).freed.finite):
+    if not (late.any() and free_delays(around, late).finite):
         return None
-    best = fit_delays(problem, around, late, support, prices, max_terms=max_terms)[0]
-    gain = penalise(around.at_rest, support, prices).score - best.score
+    best = best_support(problem, free_delays(around, late), prices, support)
+    here = penalise(without_delays(around, len(support)), support, prices)
+    gain = here.score - best.score
     if gain < delay_price(problem) + PAYS:
         return None
     delays = _significant_delays(problem, around, best.support, late)
@@ -227,42 +204,20 @@ def delay_price(problem: EstimationProblem) -> float:
     return log(problem.n_samples) + 2.0 * log(problem.measured.sum())
 
 
-def fit_delays(
-    problem: EstimationProblem,
-    around: DelayedGram,
-    late: Bool[np.ndarray, " d"],
-    support: Bool[np.ndarray, " free"],
-    prices: Float[np.ndarray, " free"],
-    *,
-    max_terms: int,
-) -> tuple[PenalisedFit, Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-    """The best terms if some states are delayed, the delays, in mean steps, and their errors."""
-    own = around.of(late)
-    best = best_support(problem, own.freed, prices, support, max_terms=max_terms)
-    delays, errors = np.zeros((2, len(late)))
-    delays[late], errors[late] = own.delays(best.support)
-    return best, delays, errors
-
-
 def _significant_delays(
-    problem: EstimationProblem,
-    around: DelayedGram,
-    support: Bool[np.ndarray, " free"],
-    late: Bool[np.ndarray, " d"],
-) -> Float[np.ndarray, " d"]:
+    problem: EstimationProblem, around: Gram, support: Support, late: StateMask
+) -> ByState:
     """Delays that each pay for themselves: of as few states as possible, late rather than early."""
-    delays = np.zeros(len(late))
-    delays[late] = around.of(late).delays(support)[0]
     if not problem.driven:
+        delays, _ = best_delays(around, support, late)
         measured = np.flatnonzero(problem.measured)
         order = measured[np.argsort(delays[measured], kind="stable")]
         late = problem.measured & (np.arange(len(late)) != order[(len(order) - 1) // 2])
     while late.any():
-        delays[:] = 0.0
-        delays[late], errors = around.of(late).delays(support)
-        shown = np.where(late, 0.0, np.inf)  # zero if rounding leaves no error to compare with
-        tells = errors > 0.0
-        shown[np.flatnonzero(late)[tells]] = np.square(delays[late][tells] / errors[tells])
+        delays, errors = best_delays(around, support, late)
+        # Zero if rounding leaves no error to compare with.
+        shown = np.square(delays / np.where(errors > 0.0, errors, np.inf))
+        shown[~late] = np.inf
         if shown.min() > SURE**2:
             return delays
         late = late & (np.arange(len(late)) != int(np.argmin(shown)))
@@ -270,7 +225,7 @@ def _significant_delays(
 
 
 def shift_channels(
-    problem: EstimationProblem, paths: Sequence[np.ndarray], delays: Float[np.ndarray, " d"]
+    problem: EstimationProblem, paths: Sequence[np.ndarray], delays: ByState
 ) -> EstimationProblem:
     """The problem with every channel brought forward by its delay, in mean steps.
 
@@ -292,7 +247,7 @@ def shift_channels(
     return replace(problem, records=tuple(records))
 
 
-def delay_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
+def delay_words(problem: EstimationProblem, delays: ByState) -> str:
     """Delays in words, `z comes 0.00333 s late (0.99 samples)`, for every delayed state."""
     parts = [
         f"{state} comes {abs(delay) * problem.step_s:.3g} s {'late' if delay > 0.0 else 'early'} "
@@ -303,7 +258,7 @@ def delay_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> 
     return " and ".join(parts)
 
 
-def delay_misfit(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
+def delay_misfit(problem: EstimationProblem, delays: ByState) -> str:
     """Explanation why samples with a late channel are a misfit, and what to do about it."""
     return (
         f"{delay_words(problem, delays)}: brought together, the samples are better explained "

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
+from operator import attrgetter
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,11 +20,21 @@ from ep2sindy.estimation.cost import SearchMonitor
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Process, Relation
 from ep2sindy.library.roles import Roles
-from ep2sindy.model.flow import Flow, Steps, ends, flow
+from ep2sindy.model.flow import Steps, ends
 from ep2sindy.model.inputs import Curve, check_courses, curve_through, plausible_courses
 from ep2sindy.model.vector_field import VectorField
 
+# Arrays by their axes: d states, and the free coefficients of a problem.
+ByState = Float[np.ndarray, " d"]
+StateMask = Bool[np.ndarray, " d"]
+BySample = Float[np.ndarray, "samples d"]
+ByCoefficient = Float[np.ndarray, " free"]
+Support = Bool[np.ndarray, " free"]
+
 MIN_SAMPLES = 5  # of a record: a smoother accepts no fewer
+FIRST_MAX_TERMS = 7  # of one equation
+SAMPLES_PER_TERM = 5  # of the library: fewer samples do not tell which terms are present
+SAMPLES_PER_COEFFICIENT = 10  # of an equation, if samples are few: more terms would fit noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,41 +42,38 @@ class ScaledRecord:
     """A trajectory, or a stretch of it between gaps, in scaled variables.
 
     times: (samples,), and steps: (samples - 1,), in units of the mean step. samples: (samples, d).
-    inputs: at the samples, and their courses between them, see `model.inputs`. limits: of samples
-    that are clipped or rounded. missing: (samples, d), true where nothing was measured, as for all
-    of a hidden state; the samples there are nothing but a start. None if all were measured. run:
-    number of the run that it is a stretch of. parts: the records of which this one is made, one
-    after the other; none for most.
+    inputs: at the samples, and their courses between them, see `model.inputs`. limits: between
+    which the true values lie; both are the sample itself unless it was clipped or rounded. missing:
+    (samples, d), true where nothing was measured, as for all of a hidden state; the samples there
+    are nothing but a start. run: number of the run that it is a stretch of. parts: the records of
+    which this one is made, one after the other; none for most.
     """
 
     times: Float[np.ndarray, " samples"]
-    samples: Float[np.ndarray, "samples d"]
+    samples: BySample
     inputs: Float[np.ndarray, "samples n_inputs"]
     courses: tuple[str, ...]
-    limits: Bounds | None = None
-    missing: Bool[np.ndarray, "samples d"] | None = None
+    limits: Bounds
+    missing: Bool[np.ndarray, "samples d"]
     run: int = 0
     parts: tuple[ScaledRecord, ...] = ()
 
     @staticmethod
     def join(records: Sequence[ScaledRecord]) -> ScaledRecord:
         """All records as one, so that each pass over the samples is a single call."""
-        if len(records) == 1:
-            return records[0]
-        limits, at_hand = None, np.concatenate([record.at_hand for record in records])
-        if any(record.limits is not None for record in records):
-            exact = [
-                record.limits or Bounds(record.samples, record.samples, ()) for record in records
-            ]
-            lower, upper = ([getattr(each, end) for each in exact] for end in ("lower", "upper"))
-            limits = Bounds(np.concatenate(lower), np.concatenate(upper), ())
-        times, samples, inputs = (
-            np.concatenate([getattr(record, name) for record in records])
-            for name in ("times", "samples", "inputs")
+
+        def of_all(name: str) -> np.ndarray:
+            return np.concatenate([attrgetter(name)(record) for record in records])
+
+        return ScaledRecord(
+            times=of_all("times"),
+            samples=of_all("samples"),
+            inputs=of_all("inputs"),
+            courses=records[0].courses,
+            limits=Bounds(of_all("limits.lower"), of_all("limits.upper"), ()),
+            missing=of_all("missing"),
+            parts=tuple(records),
         )
-        missing = None if at_hand.all() else ~at_hand
-        courses = records[0].courses
-        return ScaledRecord(times, samples, inputs, courses, limits, missing, parts=tuple(records))
 
     @cached_property
     def breaks(self) -> Int[np.ndarray, " breaks"]:
@@ -73,17 +81,9 @@ class ScaledRecord:
         return np.cumsum([len(part.times) for part in self.parts], dtype=np.int64)[:-1] - 1
 
     @property
-    def values(self) -> Float[np.ndarray, "samples d"]:
+    def values(self) -> BySample:
         """The samples, with NaN in place of limits and of missing samples."""
-        values = self.samples
-        if self.limits is not None:
-            values = np.where(self.limits.at, np.nan, values)
-        return values if self.missing is None else np.where(self.missing, np.nan, values)
-
-    @property
-    def at_hand(self) -> Bool[np.ndarray, "samples d"]:
-        """Mask of the samples that were measured."""
-        return np.ones(self.samples.shape, bool) if self.missing is None else ~self.missing
+        return np.where(self.limits.at | self.missing, np.nan, self.samples)
 
     def stretches(self) -> list[ScaledRecord]:
         """The stretches between gaps, which no step of the flow may cross; or all, if it has none.
@@ -109,30 +109,27 @@ class ScaledRecord:
         self, kept: Bool[np.ndarray, " samples"], samples: Float[np.ndarray, "kept d"]
     ) -> ScaledRecord:
         """Keep some of the samples, and replace their values; limits shift with them."""
-        limits, missing, by = self.limits, self.missing, samples - self.samples[kept]
-        if limits is not None:
-            limits = replace(limits, lower=limits.lower[kept] + by, upper=limits.upper[kept] + by)
+        by, limits = samples - self.samples[kept], self.limits
         return replace(
             self,
             times=self.times[kept],
             samples=samples,
             inputs=self.inputs[kept],
-            limits=limits,
-            missing=None if missing is None else missing[kept],
+            limits=replace(limits, lower=limits.lower[kept] + by, upper=limits.upper[kept] + by),
+            missing=self.missing[kept],
         )
 
     @cached_property
     def steps(self) -> Float[np.ndarray, " steps"]:
-        if self.parts:  # those between parts have no length
-            return np.concatenate([np.append(part.steps, 0.0) for part in self.parts])[:-1]
-        return np.diff(self.times)
+        """Lengths of the steps; those between parts have none."""
+        steps = np.diff(self.times)
+        steps[self.breaks] = 0.0
+        return steps
 
     def inputs_at(self, share: float) -> Float[np.ndarray, "steps n_inputs"]:
         """Inputs at a given share of every step."""
-        if self.parts:
-            rows = [(part.inputs_at(share), part.inputs[-1:]) for part in self.parts]
-            return np.concatenate([each for pair in rows for each in pair])[:-1]
-        return self.curve.at(share)
+        rows = [(part.curve.at(share), part.inputs[-1:]) for part in self.parts]
+        return np.concatenate([each for pair in rows for each in pair])[:-1]
 
     def divided(self, n_substeps: int) -> Steps:
         """The steps, each divided into equal substeps."""
@@ -168,10 +165,11 @@ class EstimationProblem:
     required: (free,), coefficients that are never left out. to_SI: (coefficients,), factors from
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
     measured: (d,), False for hidden states. monitor: told of every step of a fit. whole: the
-    problem with all terms, if this one has only those of a working set; places: (terms,), their
-    positions in its library. allowed_courses: of each input, the most plausible first. widen: makes
-    the problem with all products of one degree more. processes: one for each free coefficient under
-    roles; else none. nonnegative: (d,), states that never start below zero.
+    problem with all terms, if this one has only those of a working set; places: (coefficients,),
+    their positions in it. most_terms: asked for of one equation. allowed_courses: of each input,
+    the most plausible first. widen: makes the problem with all products of one degree more.
+    processes: one for each free coefficient under roles; else none. nonnegative: (d,), states that
+    never start below zero.
     """
 
     library: Library
@@ -182,22 +180,23 @@ class EstimationProblem:
     column: Int[np.ndarray, " coefficients"]
     C: Float[np.ndarray, "coefficients free"] | None
     fixed_SI: Float[np.ndarray, " coefficients"]
-    required: Bool[np.ndarray, " free"]
+    required: Support
     to_SI: Float[np.ndarray, " coefficients"]
-    scale: Float[np.ndarray, " d"]
+    scale: ByState
     input_scale: Float[np.ndarray, " n_inputs"]
     step_s: float
-    measured: Bool[np.ndarray, " d"]
-    places: Int[np.ndarray, " terms"]
-    nonnegative: Bool[np.ndarray, " d"]
+    measured: StateMask
+    places: Int[np.ndarray, " coefficients"]
+    nonnegative: StateMask
     processes: tuple[Process, ...] = ()
     inputs: tuple[str, ...] = ()
+    most_terms: int = FIRST_MAX_TERMS
     allowed_courses: tuple[tuple[str, ...], ...] = ()
     monitor: SearchMonitor = field(default_factory=SearchMonitor)
     whole: EstimationProblem | None = None
     widen: Callable[[], EstimationProblem] | None = None
 
-    def restricted(self, kept: Bool[np.ndarray, " free"]) -> EstimationProblem:
+    def restricted(self, kept: Support) -> EstimationProblem:
         """The same records with some of the coefficients; the others are zero."""
         if kept.all():
             return self
@@ -215,7 +214,7 @@ class EstimationProblem:
             fixed_SI=self.fixed_SI[rows],
             required=self.required[kept],
             to_SI=self.to_SI[rows],
-            places=self.places[columns],
+            places=self.places[rows],
             processes=tuple(compress(self.processes, kept)),
             whole=self.candidates,
         )
@@ -226,27 +225,35 @@ class EstimationProblem:
         return self.whole or self
 
     @property
-    def taken(self) -> Bool[np.ndarray, " free"]:
+    def taken(self) -> Bool[np.ndarray, " coefficients"]:
         """Mask of the candidates' coefficients that this problem has."""
-        if self.whole is None:
-            return np.ones(self.n_free, dtype=np.bool_)
-        n = len(self.whole.library)
-        own = self.equation * n + self.places[self.column]
-        return np.isin(self.whole.equation * n + self.whole.column, own)
+        return np.isin(np.arange(len(self.candidates.column)), self.places)
+
+    @property
+    def enough_samples(self) -> bool:
+        """True if there are enough samples to tell which terms of the library are present."""
+        return self.n_samples >= SAMPLES_PER_TERM * len(self.candidates.library)
+
+    @property
+    def max_terms(self) -> int:
+        """Most terms allowed in one equation; fewer than asked for if the samples are few."""
+        if self.enough_samples:
+            return self.most_terms
+        return max(1, min(self.most_terms, self.n_samples // SAMPLES_PER_COEFFICIENT))
 
     def record(self, run: Trajectory, number: int = 0) -> ScaledRecord:
         """A run with the same states and inputs, in the scale of this problem."""
-        missing = np.tile(~self.measured, (run.n_samples, 1))
+        states, missing = run.columns(self.states), np.tile(~self.measured, (run.n_samples, 1))
         if run.missing is not None:
-            order = [run.state_names.index(state) for state in self.states]
-            missing |= run.missing[:, order]
+            missing |= run.missing[:, [run.state_names.index(state) for state in self.states]]
+        limits = bounds_of(states, self.states) or Bounds(states, states, ())
         return ScaledRecord(
             times=(run.t - run.t[0]) / self.step_s,
-            samples=run.columns(self.states) / self.scale,
+            samples=states / self.scale,
             inputs=run.columns(self.inputs) / self.input_scale,
             courses=self.courses,
-            limits=_limits(run, self.scale),
-            missing=missing if missing.any() else None,
+            limits=Bounds(limits.lower / self.scale, limits.upper / self.scale, limits.words),
+            missing=missing,
             run=number,
         )
 
@@ -279,10 +286,9 @@ class EstimationProblem:
         return sum(len(record.samples) for record in self.records)
 
     @cached_property
-    def limited(self) -> Bool[np.ndarray, " d"]:
+    def limited(self) -> StateMask:
         """Mask of the measured states that have limits among their samples."""
-        limits = self.all_records.limits
-        return self.measured & (False if limits is None else limits.at.any(axis=0))
+        return self.measured & self.all_records.limits.at.any(axis=0)
 
     @property
     def n_squares(self) -> int:
@@ -292,19 +298,14 @@ class EstimationProblem:
     @cached_property
     def n_measured(self) -> Int[np.ndarray, " d"]:
         """Number of measured samples of each state."""
-        return self.all_records.at_hand.sum(axis=0)
-
-    @cached_property
-    def partial(self) -> bool:
-        """True if measured states lack samples."""
-        return bool((self.n_measured[self.measured] < self.n_samples).any())
+        return (~self.all_records.missing).sum(axis=0)
 
     @property
     def n_free(self) -> int:
         return len(self.column) if self.C is None else self.C.shape[1]
 
     @cached_property
-    def positive(self) -> Bool[np.ndarray, " free"]:
+    def positive(self) -> Support:
         """Mask of the free coefficients that must be positive."""
         found = np.zeros(self.n_free, dtype=np.bool_)
         found[: len(self.processes)] = [process.one_sign for process in self.processes]
@@ -323,73 +324,29 @@ class EstimationProblem:
             return degrees
         return np.where(self.C != 0.0, degrees[:, None], degrees.max()).min(axis=0)
 
-    @cached_property
-    def fixed(self) -> Float[np.ndarray, " coefficients"]:
-        """The fixed parts of all coefficients, scaled."""
-        return self.fixed_SI / self.to_SI
-
-    def coef(self, free: Float[np.ndarray, " free"]) -> Float[np.ndarray, "terms d"]:
+    def coef(self, free: ByCoefficient) -> Float[np.ndarray, "terms d"]:
         """Scaled coefficients as a matrix."""
         coef = np.zeros((len(self.library), len(self.states)))
-        coef[self.column, self.equation] = self.all_coefficients(free)
+        scaled = free if self.C is None else self.C @ free + self.fixed_SI / self.to_SI
+        coef[self.column, self.equation] = scaled
         return coef
 
-    def all_coefficients(self, free: Float[np.ndarray, " free"]) -> np.ndarray:
-        """(coefficients,), scaled, from the free ones."""
-        return free if self.C is None else self.C @ free + self.fixed
-
-    def coef_SI(self, free: Float[np.ndarray, " free"]) -> Float[np.ndarray, " coefficients"]:
+    def coef_SI(self, free: ByCoefficient) -> Float[np.ndarray, " coefficients"]:
         """All coefficients that may differ from zero, in SI."""
         return (free if self.C is None else self.C @ free) * self.to_SI + self.fixed_SI
 
     @property
     def driven(self) -> bool:
         """True if inputs drive the states."""
-        return any(record.inputs.shape[1] for record in self.records)
-
-    def rates(
-        self, record: ScaledRecord, states: Float[np.ndarray, "samples d"], free: np.ndarray
-    ) -> Float[np.ndarray, "samples d"]:
-        """Derivatives of the states at the samples, per mean step."""
-        return self.field(free).rates(np.concatenate([states, record.inputs], axis=1))
+        return bool(self.inputs)
 
     def ends(
-        self,
-        record: ScaledRecord,
-        states: Float[np.ndarray, "steps d"],
-        free: Float[np.ndarray, " free"],
-        n_substeps: int,
+        self, states: Float[np.ndarray, "steps d"], free: np.ndarray, n_substeps: int
     ) -> Float[np.ndarray, "steps d"]:
         """States at the end of each step, by `n_substeps` classical Runge-Kutta steps."""
-        return ends(self.field(free), states, record.divided(n_substeps))
+        return ends(self.field(free), states, self.all_records.divided(n_substeps))
 
-    @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
-    def flow(
-        self,
-        record: ScaledRecord,
-        states: Float[np.ndarray, "steps d"],
-        free: Float[np.ndarray, " free"],
-        support: Bool[np.ndarray, " free"],
-        n_substeps: int,
-        *,
-        n_more: int = 0,
-    ) -> Flow:
-        """`ends` with its derivatives by the states and by the free coefficients of a support.
-
-        n_more: columns of zeros behind them, for derivatives by something else.
-        """
-        involved = np.flatnonzero(support if self.C is None else self.C[:, support].any(axis=1))
-        by = self.equation[involved], self.column[involved]
-        steps = record.divided(n_substeps)
-        found = flow(self.field(free), states, steps, by, n_more=n_more)
-        if self.C is None:
-            return found
-        d, p = len(self.states), len(self.states) + len(involved)
-        by_free = found.slopes[:, :, d:p] @ self.C[np.ix_(involved, support)]
-        slopes = [found.slopes[:, :, :d], by_free, found.slopes[:, :, p:]]
-        return replace(found, slopes=np.concatenate(slopes, axis=2))
-
-    def field(self, free: Float[np.ndarray, " free"]) -> VectorField:
+    def field(self, free: ByCoefficient) -> VectorField:
         """The scaled right-hand side with these coefficients."""
         return VectorField(self.library, self.coef(free))
 
@@ -409,14 +366,16 @@ def scale_problem(
     """
     states = runs[0].state_names
     inputs = [name for name in runs[0].input_names if name in library.variables]
-    allowed = _allowed_courses(runs, inputs, courses or {})
+    told = {name: (course,) for name, course in check_courses(courses or {}, inputs).items()}
+    allowed = {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | told
     names, known = [*states, *inputs], terms or {}
     over = (roles.with_known_terms(library, states) if roles else library).over(names)
-    size = _rms(runs, names)
+    samples = np.concatenate([run.columns(names) for run in runs])
+    size = zero_to_one(np.sqrt(np.square(samples).mean(axis=0)))
     step_s = mean_step(*(run.t for run in runs))
     scaled, numbers = over.scaled(size)
     processes = roles.processes(library, states) if roles else []
-    equation, column, held = coefficients_of(
+    equation, column, ties = coefficients_of(
         over, states, known, exclude or {}, relations, processes, roles
     )
     to_SI = size[equation] / (numbers[column] * step_s)
@@ -428,15 +387,15 @@ def scale_problem(
         records=(),
         equation=equation,
         column=column,
-        C=held.C * to_SI[held.leads] / to_SI[:, None] if held else None,
-        fixed_SI=held.fixed if held else np.zeros(len(column)),
-        required=(held.C[fixed] != 0.0).any(axis=0) if held else fixed,
+        C=ties and ties.C * to_SI[ties.leads] / to_SI[:, None],
+        fixed_SI=ties.fixed if ties else np.zeros(len(column)),
+        required=(ties.C[fixed] != 0.0).any(axis=0) if ties else fixed,
         to_SI=to_SI,
         scale=size[: len(states)],
         input_scale=size[len(states) :],
         step_s=step_s,
         measured=np.isin(states, measured or states),
-        places=np.arange(len(over)),
+        places=np.arange(len(column)),
         nonnegative=np.isin(states, roles.positive if roles else []),
         processes=tuple(processes),
         inputs=tuple(inputs),
@@ -446,51 +405,26 @@ def scale_problem(
     return problem.of(runs)
 
 
-def _rms(runs: Sequence[Trajectory], names: Sequence[str]) -> Float[np.ndarray, " names"]:
-    values = np.concatenate([run.columns(names) for run in runs])
-    return zero_to_one(np.sqrt(np.square(values).mean(axis=0)))
-
-
-def _allowed_courses(
-    runs: Sequence[Trajectory], inputs: Sequence[str], courses: Mapping[str, str]
-) -> dict[str, tuple[str, ...]]:
-    """Courses of every input: the one that was told, or those that its samples allow."""
-    told = {name: (course,) for name, course in check_courses(courses, inputs).items()}
-    return {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | told
-
-
 def by_run(
     problem: EstimationProblem, paths: Sequence[np.ndarray], runs: Sequence[Trajectory]
-) -> Iterator[tuple[Trajectory, Float[np.ndarray, "samples d"]]]:
-    """Each run as it was fitted, and its path in SI: the stretches of a run with gaps together."""
+) -> Iterator[tuple[Trajectory, BySample]]:
+    """Each run as it was fitted, and its path in SI: the stretches of a run with gaps together.
+
+    Its samples are those that were fitted, the estimated path of hidden states among them.
+    """
     pairs = list(zip(problem.records, paths, strict=True))
     for number, run in enumerate(runs):
         own = [(record, path) for record, path in pairs if record.run == number]
-        times, samples, path = (
-            np.concatenate(parts)
-            for parts in zip(
-                *((record.times, record.samples, path) for record, path in own), strict=True
+        path = np.concatenate([path for _, path in own])
+        times = np.concatenate([record.times for record, _ in own])
+        kept = np.isin((run.t - run.t[0]) / problem.step_s, times)
+        if not (kept.all() and problem.measured.all()):
+            samples = np.concatenate([record.samples for record, _ in own])
+            run = replace(
+                run,
+                t=run.t[kept],
+                states=np.where(problem.measured, samples, path) * problem.scale,
+                inputs=run.inputs[kept],
+                missing=None if run.missing is None else run.missing[kept],
             )
-        )
-        yield _as_fitted(problem, times, samples, path, run), path * problem.scale
-
-
-def _as_fitted(
-    problem: EstimationProblem,
-    times: np.ndarray,
-    samples: np.ndarray,
-    path: np.ndarray,
-    run: Trajectory,
-) -> Trajectory:
-    """The samples of a run that were fitted, the estimated path of hidden states among them."""
-    if len(times) == run.n_samples and problem.measured.all():
-        return run
-    states = np.where(problem.measured, samples, path) * problem.scale
-    kept = np.isin((run.t - run.t[0]) / problem.step_s, times)
-    missing = None if run.missing is None else run.missing[kept]
-    return replace(run, t=run.t[kept], states=states, inputs=run.inputs[kept], missing=missing)
-
-
-def _limits(run: Trajectory, size: np.ndarray) -> Bounds | None:
-    found = bounds_of(run.states, run.state_names)
-    return found and replace(found, lower=found.lower / size, upper=found.upper / size)
+        yield run, path * problem.scale

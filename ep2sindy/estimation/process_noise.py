@@ -12,13 +12,12 @@ The likelihood is that of the innovations (Schweppe 1965, doi:10.1109/TIT.1965.1
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.estimation.kernels import eliminate, filtered
+from ep2sindy.estimation.kernels import filter_states, marginalise
 from ep2sindy.estimation.likelihood import TrajectoryFit, linearise
 from ep2sindy.estimation.noise import (
     MORE_DEGREES,
@@ -28,12 +27,11 @@ from ep2sindy.estimation.noise import (
     powers_of,
 )
 from ep2sindy.estimation.observation import LackOfFit, Observation, Solution
-from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.problem import BySample, ByState, EstimationProblem
 from ep2sindy.estimation.solver import (
     EXACT,
-    at_level,
     exchange_terms,
-    squares_of_steps,
+    refit,
     start_from_smooth,
 )
 from ep2sindy.estimation.supports import term_prices
@@ -52,22 +50,14 @@ MAX_DEFECT = 3.0
 SETTLING = 5  # samples from whose start on innovations count
 
 
-class Errors(NamedTuple):
-    """Standard deviations of noise and process noise, by state; deviance: -2 log likelihood."""
+def likely_errors(fit: TrajectoryFit) -> tuple[ByState, ByState, float]:
+    """The likeliest noise and process noise about the path of a fit, and -2 log likelihood.
 
-    noise: Float[np.ndarray, " d"]
-    process: Float[np.ndarray, " d"]
-    deviance: float
-
-
-def likely_errors(fit: TrajectoryFit) -> Errors:
-    """The likeliest noise and process noise about the path of a fit.
-
-    The search for them starts from those of the fit's level.
+    Both are standard deviations. The search for them starts from those of the fit.
     """
     from scipy.optimize import minimize  # imported only to estimate errors
 
-    measured, level, about = fit.problem.measured, fit.level, linearise(fit)
+    measured, about = fit.problem.measured, linearise(fit)
     n, d = int(measured.sum()), len(measured)
     low = np.log(np.repeat([LEAST_NOISE, LEAST_PROCESS], [n, d]))
 
@@ -78,52 +68,38 @@ def likely_errors(fit: TrajectoryFit) -> Errors:
         return own, held[n:]
 
     def unlikely(logs: np.ndarray) -> float:
-        tried = replace(fit, level=level.with_errors(*sizes(logs)))
+        tried = fit.with_errors(*sizes(logs))
         bounded = np.clip(logs, low, np.log(MOST))
-        variance = np.square(tried.level.noise)
+        variance = np.square(tried.noise)
         case = about._replace(variance=variance, process=tried.process)
-        return float(np.square(logs - bounded).sum() + sum(eliminate(*case)[2:]))
+        return float(np.square(logs - bounded).sum() + sum(marginalise(*case)[2:]))
 
-    assert level.process_noise is not None
-    start = np.log(np.append(level.noise[0, measured], level.process_noise))
-    found = minimize(
-        unlikely,
-        start,
-        method="Nelder-Mead",
-        options={
-            "initial_simplex": np.vstack([start, start + 1.5 * np.eye(len(start))]),
-            "maxfev": MAX_TRIALS * len(start),
-            "fatol": 0.1,
-            "xatol": 0.05,
-        },
-    )
-    return Errors(*sizes(found.x), float(found.fun))
+    assert fit.process_noise is not None
+    start = np.log(np.append(fit.noise[0, measured], fit.process_noise))
+    simplex = np.vstack([start, start + 1.5 * np.eye(len(start))])
+    budget = {"maxfev": MAX_TRIALS * len(start), "fatol": 0.1, "xatol": 0.05}
+    options = {"initial_simplex": simplex, **budget}
+    found = minimize(unlikely, start, method="Nelder-Mead", options=options)
+    return *sizes(found.x), float(found.fun)
 
 
-def solve_with_process_noise(problem: EstimationProblem, *, max_terms: int) -> Solution:
+def solve_with_process_noise(problem: EstimationProblem) -> Solution:
     """Errors and sparse coefficients in turn, from smoothed states with all coefficients free."""
     fit = start_from_smooth(problem, None)
-    std, prices = fit.level.noise[0], term_prices(problem, float(problem.n_samples))
-    level = fit.level.with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
+    std, prices = fit.noise[0], term_prices(problem, float(problem.n_samples))
+    fit = fit.with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
     for share in SHARES:
-        fit = exchange_terms(at_level(fit, level), share * prices, max_terms)
-        errors = likely_errors(fit)
-        level = level.with_errors(errors.noise, errors.process)
-    fit = at_level(fit, level)
+        fit = exchange_terms(refit(fit), share * prices)
+        std, process, deviance = likely_errors(fit)
+        fit = fit.with_errors(std, process)
+    fit = refit(fit)
     noise, none = noise_beside(fit), np.zeros(len(problem.states))
-    explained = replace(
-        noise,
-        std=errors.noise,
-        memory=none,
-        unexplained=none,
-        patterned=none > 0.0,
-        deviance=errors.deviance,
-    )
+    explained = replace(noise, std=std, memory=none, unexplained=none, patterned=none > 0.0)
     return Solution(
         fit=fit,
-        observation=Observation(explained, none, errors.process),
+        observation=Observation(explained, none, process),
         prices=prices,
-        deviance=errors.deviance,
+        deviance=deviance,
         tests=(_test_defects(fit), *_test_innovations(fit)),
     )
 
@@ -133,8 +109,8 @@ def _test_defects(fit: TrajectoryFit) -> LackOfFit:
 
     Infinite for a state without a law: one whose equation has no term, which noise alone moves.
     """
-    defects = squares_of_steps(fit)[0] / len(fit.path)
-    allowed = MAX_DEFECT**2 * fit.process[0] + np.square(EXACT * fit.level.noise[0])
+    defects = fit.squared_defects / len(fit.path)
+    allowed = MAX_DEFECT**2 * fit.process[0] + np.square(EXACT * fit.noise[0])
     moves = fit.problem.coef(fit.free).any(axis=0)
     return LackOfFit(np.where(moves, np.sqrt(defects / allowed), np.inf), 1.0)
 
@@ -157,7 +133,7 @@ def _test_innovations(fit: TrajectoryFit) -> list[LackOfFit]:
     explains beside the terms of the equation, and the share that all of them explain: what an
     equation lacks is a function of the states, and lasts as long as these.
     """
-    problem, found = fit.problem, np.nan_to_num(filtered(*linearise(fit))[0])
+    problem, found = fit.problem, np.nan_to_num(filter_states(*linearise(fit))[0])
     new = [part[SETTLING:] for part in problem.split(found)]
     joined = np.concatenate(new)
     if not (np.abs(joined) < RUNAWAY).all():
@@ -170,11 +146,8 @@ def _test_innovations(fit: TrajectoryFit) -> list[LackOfFit]:
 
 
 def _largest_share(
-    fit: TrajectoryFit,
-    before: Float[np.ndarray, "samples d"],
-    powers: Float[np.ndarray, "samples _"],
-    new: Float[np.ndarray, "samples d"],
-) -> Float[np.ndarray, " d"]:
+    fit: TrajectoryFit, before: BySample, powers: Float[np.ndarray, "samples _"], new: BySample
+) -> ByState:
     """The most that one of the powers explains of innovations beside an equation's terms."""
     unit = np.sqrt(len(new)) * new / np.maximum(np.linalg.norm(new, axis=0), 1e-150)
     problem, found = fit.problem, np.zeros(unit.shape[1])

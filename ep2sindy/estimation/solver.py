@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +18,7 @@ from ep2sindy.data.numbers import least_squares
 from ep2sindy.estimation.likelihood import (
     FAR,
     MAX_DIVERGENCE,
-    Level,
+    Gram,
     TrajectoryFit,
     divergence_rate,
     enough_substeps,
@@ -28,21 +27,25 @@ from ep2sindy.estimation.likelihood import (
 )
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
 from ep2sindy.estimation.observation import (
-    DelayedGram,
     LackOfFit,
     Observation,
     Solution,
     delayed_gram,
+    without_delays,
 )
-from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
+from ep2sindy.estimation.problem import (
+    ByCoefficient,
+    BySample,
+    ByState,
+    EstimationProblem,
+    ScaledRecord,
+)
 from ep2sindy.estimation.supports import alternatives, best_support, excess, penalise, term_prices
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 
-SAMPLES_PER_TERM = 5  # of the library: fewer samples do not tell which terms are present
 ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap
 # Smoother settings (log10 of process to measurement noise) to try if no other start fits.
 OTHER_STARTS = (-2.0, 0.0, 2.0)
-SAMPLES_PER_COEFFICIENT = 10  # of an equation, if samples are few: more terms would fit noise
 MAX_PASSES = 4  # until noise and support agree; usually two
 # Model errors, and the share of a term's price charged there. Free states hide part of what a term
 # explains, and a term dropped too early would have to be found again.
@@ -61,59 +64,48 @@ COMPARED_AT = 0.003
 RELAXED, EXPLAINS_MORE = (1.0, 0.5), 4.0
 WITHIN, MAX_TRIED, MAX_ROUNDS = 12.0, 6, 6  # score above the chosen one; supports per round; rounds
 UNSURE = 0.05  # share of the RMS: least noise at a start where the smoother's is not trusted
+FINITE = float(np.finfo(np.float64).max)
+LASTS = "what is left of {state} lasts ({value:.2f} from sample to sample)"
 CUTOFF = 1e-8  # of singular values of unit columns: smaller ones fit noise
 
 
-def max_terms_for(problem: EstimationProblem, max_terms: int) -> int:
-    """Most terms allowed in one equation; fewer than asked for if the samples are few."""
-    if enough_samples(problem):
-        return max_terms
-    return max(1, min(max_terms, problem.n_samples // SAMPLES_PER_COEFFICIENT))
-
-
-def enough_samples(problem: EstimationProblem) -> bool:
-    """True if there are enough samples to tell which terms of the library are present."""
-    return problem.n_samples >= SAMPLES_PER_TERM * len(problem.candidates.library)
-
-
-def from_smooth(
-    problem: EstimationProblem, log10_ratio: float | None, *, max_terms: int
-) -> Solution:
+def from_smooth(problem: EstimationProblem, log10_ratio: float | None) -> Solution:
     """The exact solution from smoothed states, first with their noise, then with the residuals'.
 
     log10_ratio: of the smoother, see `start_from_smooth`.
     """
-    return settle(start_from_smooth(problem, log10_ratio), CONTINUATION, max_terms=max_terms)
+    return settle(start_from_smooth(problem, log10_ratio), CONTINUATION)
 
 
 def settle(
-    start: TrajectoryFit, schedule: Sequence[tuple[float, float]] = NEARLY_EXACT, *, max_terms: int
+    start: TrajectoryFit, schedule: Sequence[tuple[float, float]] = NEARLY_EXACT
 ) -> Solution:
     """The exact solution near a fit whose states leave the flow.
 
     Continues again until noise and support agree, and compares with what is nearly as likely.
     """
     prices = term_prices(start.problem, float(start.problem.n_samples))
-    fit = fit_by_continuation(start, prices, schedule, max_terms=max_terms)
+    fit = fit_by_continuation(start, prices, schedule)
     for _ in range(MAX_PASSES):
         before, noise = fit.support, noise_beside(fit)
         prices = _prices_beside(fit, noise)
-        start = replace(fit, level=replace(fit.level, noise=noise.effective))
-        fit = fit_by_continuation(start, prices, NEARLY_EXACT, max_terms=max_terms)
+        fit = replace(fit, noise=noise.effective)
+        fit = fit_by_continuation(fit, prices, NEARLY_EXACT)
         if np.array_equal(before, fit.support):
             break
-    fit, around = polish(fit, prices, max_terms=max_terms)
-    fit, around = restart_relaxed(fit, around, prices, max_terms=max_terms)
+    fit, around = polish(fit, prices)
+    fit, around = restart_relaxed(fit, around, prices)
     noise, error, divergence = noise_beside(fit), 0.0, 0.0
     if np.isfinite(fit.total) and (noise.std > FLOOR).any():
         error = flow_error(fit, noise)
-        defect = np.sqrt((squares_of_steps(fit)[0] / np.square(noise.std)).max() / len(fit.path))
-        error = error if defect < EXACT else max(error, float(defect))  # it lives on the slack
-        divergence = divergence_rate(replace(fit, level=replace(fit.level, noise=noise.white)))
+        squares = fit.squared_defects / np.square(noise.std)
+        defect = float(np.sqrt(squares.max() / len(fit.path)))
+        error = error if defect < EXACT else max(error, defect)  # it lives on the slack
+        divergence = divergence_rate(replace(fit, noise=noise.white))
     return replace(_exact_solution(fit, noise, prices, error, divergence), around=around)
 
 
-def _prices_beside(fit: TrajectoryFit, noise: Noise) -> Float[np.ndarray, " free"]:
+def _prices_beside(fit: TrajectoryFit, noise: Noise) -> ByCoefficient:
     """Prices of the terms for samples whose noise is correlated in time."""
     return term_prices(fit.problem, fit.problem.n_samples * float(noise.independent.mean()))
 
@@ -121,7 +113,7 @@ def _prices_beside(fit: TrajectoryFit, noise: Noise) -> Float[np.ndarray, " free
 def unfinished_solution(fit: TrajectoryFit) -> Solution:
     """What a search that was ended on its way has, whose states still leave the flow."""
     noise = noise_beside(fit)
-    return _exact_solution(fit, noise, _prices_beside(fit, noise), fit.level.model_error, 0.0)
+    return _exact_solution(fit, noise, _prices_beside(fit, noise), fit.model_error, 0.0)
 
 
 def _exact_solution(
@@ -131,93 +123,63 @@ def _exact_solution(
     none = np.zeros(len(noise.std))
     apart = np.exp(min(divergence, 100.0) / 2.0)
     tests = (
-        LackOfFit(
-            none + fit.total,
-            float(np.finfo(np.float64).max),
-            "whatever was tried runs away between two samples",
-        ),
-        LackOfFit(
-            none + error, 0.0, "the states leave the model by {value:g} of the noise per sample"
-        ),
-        LackOfFit(
+        (none + fit.total, FINITE, "whatever was tried runs away between two samples"),
+        (none + error, 0.0, "the states leave the model by {value:g} of the noise per sample"),
+        (
             none + apart,
             float(np.exp(MAX_DIVERGENCE / 2.0)),
             "paths beside the fit part by a factor of {value:.2g} per sample, so it could follow "
             "any samples",
         ),
-        LackOfFit(
-            noise.unexplained, 0.0, "what is left of {state} lasts ({value:.2f} from sample to "
-            "sample)",
-        ),
-        LackOfFit(
-            noise.patterned, 0.0, "what is left of {state} holds a line or follows the states"
-        ),
-        LackOfFit(
-            hidden_defects(fit), MAX_HIDDEN_DEFECT, "{state} does not follow its own equation"
-        ),
-    )  # fmt: skip
+        (noise.unexplained, 0.0, LASTS),
+        (noise.patterned, 0.0, "what is left of {state} holds a line or follows the states"),
+        (hidden_defects(fit), MAX_HIDDEN_DEFECT, "{state} does not follow its own equation"),
+    )
     return Solution(
         fit=fit,
         observation=Observation(noise, none, none),
         prices=prices,
         deviance=noise.deviance,
-        tests=tests,
+        tests=tuple(LackOfFit(*test) for test in tests),
         flow_error=error,
     )
 
 
-def hidden_defects(fit: TrajectoryFit) -> Float[np.ndarray, " d"]:
+def hidden_defects(fit: TrajectoryFit) -> ByState:
     """RMS defect of the flow of hidden states, as a share of their steps; zero for measured ones.
 
     One that has become very small leaves the flow freely, and large coefficients make it count.
     """
-    defects, steps = squares_of_steps(fit)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(defects > 0.0, np.sqrt(defects / steps), defects)
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        steps = np.diff(fit.path, axis=0)
+        steps[fit.problem.all_records.breaks] = 0.0
+        share = np.sqrt(fit.squared_defects / np.square(steps).sum(axis=0))
+        share = np.where(fit.squared_defects > 0.0, share, fit.squared_defects)
     return np.where(fit.problem.measured, 0.0, share)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
-def squares_of_steps(
-    fit: TrajectoryFit,
-) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-    """Sums of squares, by state: of what the flow from each sample misses, and of the steps."""
-    record, path, n = fit.problem.all_records, fit.path, fit.level.n_substeps
-    steps = np.diff(path, axis=0)
-    defects = fit.problem.ends(record, path[:-1], fit.free, n) - path[1:]
-    defects[record.breaks] = steps[record.breaks] = 0.0
-    return np.square(defects).sum(axis=0), np.square(steps).sum(axis=0)
-
-
-def _penalised(fit: TrajectoryFit, prices: Float[np.ndarray, " free"]) -> float:
+def _penalised(fit: TrajectoryFit, prices: ByCoefficient) -> float:
     """The squares plus the prices of the terms, which decide between supports at one level."""
     return float(fit.total + prices[fit.support].sum())
 
 
 def fit_by_continuation(
-    fit: TrajectoryFit,
-    prices: Float[np.ndarray, " free"],
-    schedule: Sequence[tuple[float, float]],
-    *,
-    max_terms: int,
+    fit: TrajectoryFit, prices: ByCoefficient, schedule: Sequence[tuple[float, float]]
 ) -> TrajectoryFit:
     """Fit level by level; at each level, exchange terms as long as squares plus prices fall.
 
-    The noise is that of the fit's level.
+    The noise is that of the fit.
     """
-    monitor, level = fit.problem.monitor, replace(fit.level, n_substeps=1, process_noise=None)
+    monitor, fit = fit.problem.monitor, replace(fit, n_substeps=1, process_noise=None)
     for model_error, share in schedule:
-        fit = at_level(fit, replace(level, model_error=model_error))
-        level = fit.level
-        fit = exchange_terms(fit, share * prices, max_terms)
+        fit = refit(replace(fit, model_error=model_error))
+        fit = exchange_terms(fit, share * prices)
         if not isinstance(monitor.best, Solution):
             monitor.best = fit
     return fit
 
 
-def polish(
-    fit: TrajectoryFit, prices: Float[np.ndarray, " free"], *, max_terms: int
-) -> tuple[TrajectoryFit, DelayedGram | None]:
+def polish(fit: TrajectoryFit, prices: ByCoefficient) -> tuple[TrajectoryFit, Gram | None]:
     """Refit each support that is nearly as likely by the linear model, and keep a likelier one.
 
     Returns the linearisation in which none is likelier too; None if it tells nothing, as about a
@@ -226,21 +188,20 @@ def polish(
     problem = fit.problem
     if not fit.total < FAR * problem.n_squares:
         return fit, None
-    fit = at_level(fit, fit.level)
+    fit = refit(fit)
     tried = {fit.support.tobytes()}
     for _ in range(MAX_ROUNDS):
-        warm = at_level(fit, replace(fit.level, model_error=COMPARED_AT))
+        warm = refit(replace(fit, model_error=COMPARED_AT))
         around = delayed_gram(warm)
-        if not (around.at_rest.finite and np.isfinite(fit.total)):
+        at_rest = without_delays(around, problem.n_free)
+        if not (at_rest.finite and np.isfinite(fit.total)):
             break
-        others = alternatives(
-            problem, around.at_rest, prices, warm.support, within=WITHIN, max_terms=max_terms
-        )
+        others = alternatives(problem, at_rest, prices, warm.support, within=WITHIN)
         others = [each for each in others if each.support.tobytes() not in tried]
         for each in others[:MAX_TRIED]:
             tried.add(each.support.tobytes())
-            other = at_level(replace(warm, support=each.support, free=each.free), warm.level)
-            other = at_level(other, replace(other.level, model_error=fit.level.model_error))
+            other = refit(replace(warm, support=each.support, free=each.free))
+            other = refit(replace(other, model_error=fit.model_error))
             if _is_likelier(other, fit, prices):
                 fit = other
                 break
@@ -249,9 +210,7 @@ def polish(
     return fit, None
 
 
-def _is_likelier(
-    fit: TrajectoryFit, than: TrajectoryFit, prices: Float[np.ndarray, " free"]
-) -> bool:
+def _is_likelier(fit: TrajectoryFit, than: TrajectoryFit, prices: ByCoefficient) -> bool:
     """True if a fit is likelier, prices included, and does not live on steering its path."""
     return (
         _penalised(fit, prices) < _penalised(than, prices) and divergence_rate(fit) < MAX_DIVERGENCE
@@ -259,12 +218,8 @@ def _is_likelier(
 
 
 def restart_relaxed(
-    fit: TrajectoryFit,
-    around: DelayedGram | None,
-    prices: Float[np.ndarray, " free"],
-    *,
-    max_terms: int,
-) -> tuple[TrajectoryFit, DelayedGram | None]:
+    fit: TrajectoryFit, around: Gram | None, prices: ByCoefficient
+) -> tuple[TrajectoryFit, Gram | None]:
     """Continue again if states that are let go show a better support; the likelier of both.
 
     Exchanges between nearly exact flows cannot leave a wrong optimum of many terms. Free states
@@ -274,47 +229,42 @@ def restart_relaxed(
     if not fit.total < FAR * fit.problem.n_squares:
         return fit, around
     model_error, share = RELAXED
-    relaxed = at_level(fit, replace(fit.level, model_error=model_error))
+    relaxed = refit(replace(fit, model_error=model_error))
     pair, cheap = gram(relaxed), share * prices
     if not pair.finite:
         return fit, around
     here = penalise(pair, relaxed.support, cheap)
-    other = best_support(fit.problem, pair, cheap, relaxed.support, max_terms=max_terms)
+    other = best_support(fit.problem, pair, cheap, relaxed.support)
     n_more = int(other.support.sum()) - int(here.support.sum())
     gain = here.score - other.score - float(cheap[here.support].sum() - cheap[other.support].sum())
     if n_more > 0 or gain < EXPLAINS_MORE:
         return fit, around
     start = replace(relaxed, support=other.support, free=other.free)
-    again = fit_by_continuation(
-        start, prices, (*CONTINUATION, NEARLY_EXACT[-1]), max_terms=max_terms
-    )
-    again, beside = polish(again, prices, max_terms=max_terms)
+    again = fit_by_continuation(start, prices, (*CONTINUATION, NEARLY_EXACT[-1]))
+    again, beside = polish(again, prices)
     return (again, beside) if _is_likelier(again, fit, prices) else (fit, around)
 
 
-def at_level(fit: TrajectoryFit, level: Level) -> TrajectoryFit:
-    """Fit at a level, with as many substeps as it needs."""
-    n_substeps = enough_substeps(replace(fit, level=level))
-    fit = replace(fit, level=replace(level, n_substeps=n_substeps))
+def refit(fit: TrajectoryFit) -> TrajectoryFit:
+    """Fit under the errors of a fit, with as many substeps as it needs."""
+    fit = replace(fit, n_substeps=enough_substeps(fit))
     if not np.isfinite(fit.squares).all():
         fit = replace(fit, free=np.zeros_like(fit.free))  # the zero flow is finite
     return fit_paths(fit)
 
 
-def exchange_terms(
-    fit: TrajectoryFit, prices: Float[np.ndarray, " free"], max_terms: int
-) -> TrajectoryFit:
+def exchange_terms(fit: TrajectoryFit, prices: ByCoefficient) -> TrajectoryFit:
     """Exchange terms by the Gram matrix, refit, and accept any fall of squares plus prices."""
     problem = fit.problem
     for _ in range(MAX_EXCHANGES):
         pair, score = gram(fit), _penalised(fit, prices)
         if not (pair.finite and np.isfinite(score)):
             break
-        found = best_support(problem, pair, prices, fit.support, max_terms=max_terms)
+        found = best_support(problem, pair, prices, fit.support)
         if np.array_equal(found.support, fit.support):
             break
         tried = fit_paths(replace(fit, support=found.support, free=found.free))
-        too_large = excess(problem, fit.support, max_terms) > 0
+        too_large = excess(problem, fit.support) > 0
         if not (_penalised(tried, prices) < score or (too_large and np.isfinite(tried.total))):
             break
         fit = tried
@@ -326,20 +276,19 @@ def start_from_smooth(problem: EstimationProblem, log10_ratio: float | None) -> 
 
     log10_ratio: of the smoother, process to measurement noise; None takes the most likely ratio of
     each record and state. Below about twenty samples a period this ratio may take signal for noise.
-    The noise of its level is that of the residuals.
+    The noise is that of the residuals.
     """
-    start = smooth_states(problem, log10_ratio)
-    values = np.concatenate([start.path, problem.all_records.inputs], axis=1)
-    free = _regress(problem, problem.library.evaluate(values), start.rates)
-    support = np.ones(problem.n_free, dtype=np.bool_)
-    return TrajectoryFit(problem, Level(start.noise, 1.0), start.path, free, support)
+    path, rates, noise = smooth_states(problem, log10_ratio)
+    values = np.concatenate([path, problem.all_records.inputs], axis=1)
+    free = _regress(problem, problem.library.evaluate(values), rates)
+    return TrajectoryFit(problem, noise, 1.0, path, free, np.ones(len(free), dtype=np.bool_))
 
 
 def _smooth_record(
     problem: EstimationProblem, record: ScaledRecord, log10_ratio: float | None
 ) -> KalmanEstimate:
     """Smooth every state over the samples that it has; between these it follows a cubic."""
-    smoother, own = KalmanSmoother(log10_ratio), record.at_hand | ~problem.measured
+    smoother, own = KalmanSmoother(log10_ratio), ~(record.missing & problem.measured)
     found = smoother.estimate(record.times, record.samples)
     lacking = np.flatnonzero(~own.all(axis=0))
     if not lacking.size:
@@ -358,19 +307,13 @@ def _smooth_record(
     return replace(found, smoothed=smooth, derivative=rates, noise_std=std)
 
 
-class SmoothedStates(NamedTuple):
+def smooth_states(
+    problem: EstimationProblem, log10_ratio: float | None
+) -> tuple[BySample, BySample, BySample]:
     """Smoothed states, in the domains of the library's functions, their rates, and the noise.
 
-    noise: standard deviations at all samples.
+    The latter are standard deviations at all samples. log10_ratio: as in `start_from_smooth`.
     """
-
-    path: Float[np.ndarray, "samples d"]
-    rates: Float[np.ndarray, "samples d"]
-    noise: Float[np.ndarray, "samples d"]
-
-
-def smooth_states(problem: EstimationProblem, log10_ratio: float | None) -> SmoothedStates:
-    """Smooth the samples; log10_ratio as in `start_from_smooth`."""
     estimates, paths = [], []
     for record in problem.records:
         problem.monitor.look()
@@ -386,21 +329,18 @@ def smooth_states(problem: EstimationProblem, log10_ratio: float | None) -> Smoo
     std = np.maximum(np.sqrt(variance), FLOOR if log10_ratio is None else UNSURE)
     std[~problem.measured] = std[problem.measured].mean()
     rates = np.concatenate([each.derivative for each in estimates])
-    return SmoothedStates(np.concatenate(paths), rates, np.tile(std, (len(rates), 1)))
+    return np.concatenate(paths), rates, np.tile(std, (len(rates), 1))
 
 
 def _regress(
-    problem: EstimationProblem,
-    theta: Float[np.ndarray, "samples terms"],
-    rates: Float[np.ndarray, "samples d"],
-) -> Float[np.ndarray, " free"]:
+    problem: EstimationProblem, theta: Float[np.ndarray, "samples terms"], rates: BySample
+) -> ByCoefficient:
     """Least squares of all equations at once, under the relations."""
     n, d = rates.shape
     if problem.C is not None:
         rows = np.zeros((n, d, len(problem.equation)))
-        for k, (equation, column) in enumerate(zip(problem.equation, problem.column, strict=True)):
-            rows[:, equation, k] = theta[:, column]
-        target = (rates - rows @ problem.fixed).reshape(-1)
+        rows[:, problem.equation, np.arange(rows.shape[2])] = theta[:, problem.column]
+        target = (rates - rows @ (problem.fixed_SI / problem.to_SI)).reshape(-1)
         return least_squares(rows.reshape(n * d, -1) @ problem.C, target, cutoff=CUTOFF)
     free = np.zeros(problem.n_free)
     for equation in range(d):  # far smaller systems, one per equation

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.likelihood import Gram, within_bounds
-from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.problem import ByCoefficient, EstimationProblem, Support
 from ep2sindy.regression.exchanges import exchange_terms
 from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, invert_gram
 from ep2sindy.regression.searches import search_subsets
@@ -32,12 +32,12 @@ MAX_ALTERNATIVES = 24  # supports of one equation for which the others are searc
 class PenalisedFit:
     """A support, the best free coefficients on it, and its squares plus the prices of its terms."""
 
-    support: Bool[np.ndarray, " free"]
-    free: Float[np.ndarray, " free"]
+    support: Support
+    free: ByCoefficient
     score: float
 
 
-def term_prices(problem: EstimationProblem, n_samples: float) -> Float[np.ndarray, " free"]:
+def term_prices(problem: EstimationProblem, n_samples: float) -> ByCoefficient:
     """Price of each coefficient: the fall of the squares that justifies it.
 
     The price is log n plus a cost of choosing among terms. A term of degree q is one of d C(d + q,
@@ -55,21 +55,20 @@ def term_prices(problem: EstimationProblem, n_samples: float) -> Float[np.ndarra
 def best_support(
     problem: EstimationProblem,
     gram: Gram,
-    prices: Float[np.ndarray, " free"],
-    start: Bool[np.ndarray, " free"],
+    prices: ByCoefficient,
+    start: Support,
     *,
-    max_terms: int,
     held: int | None = None,
 ) -> PenalisedFit:
     """The support of least score, by sweeps over the equations until none changes.
 
-    Each equation's support is found exactly, given the others'. max_terms: of one equation.
-    Required terms are always in. held: an equation that is not changed.
+    Each equation's support is found exactly, given the others'. Required terms are
+    always in. held: an equation that is not changed.
     """
 
     def rank(each: PenalisedFit) -> tuple[int, int, float]:
         negative = int((each.free[problem.positive] < 0.0).sum())
-        return negative, excess(problem, each.support, max_terms), each.score
+        return negative, excess(problem, each.support), each.score
 
     best = penalise(gram, start, prices)
     for _ in range(MAX_SWEEPS):
@@ -78,41 +77,22 @@ def best_support(
             own = problem.block == block
             if block == held or problem.required[own].all():
                 continue
-            offered = _offer_supports(problem, gram, best.support, own, max_terms)
-            first = min(offered, key=lambda each: each.squares + prices[each.support].sum())
+            offered = offer_supports(problem, gram, prices, best.support, own)
+            first = min(offered, key=lambda each: each.score)
             best = min([best, penalise(gram, first.support, prices)], key=rank)
         if best is before:
             return best
     return best
 
 
-def excess(problem: EstimationProblem, support: Bool[np.ndarray, " free"], max_terms: int) -> int:
-    """Number of terms above max_terms, summed over the equations, required terms not counted."""
+def excess(problem: EstimationProblem, support: Support) -> int:
+    """Number of terms above the most allowed, over all equations, required terms not counted."""
     sizes = np.bincount(problem.block[support & ~problem.required], minlength=1)
-    return int(np.maximum(sizes - max_terms, 0).sum())
-
-
-def supports_by_size(
-    problem: EstimationProblem,
-    gram: Gram,
-    chosen: Bool[np.ndarray, " free"],
-    block: int,
-    *,
-    max_terms: int,
-) -> list[Bool[np.ndarray, " free"]]:
-    """The best few supports of every size of one equation, the other equations as chosen."""
-    own = problem.block == block
-    return [each.support for each in _offer_supports(problem, gram, chosen, own, max_terms)]
+    return int(np.maximum(sizes - problem.max_terms, 0).sum())
 
 
 def alternatives(
-    problem: EstimationProblem,
-    gram: Gram,
-    prices: Float[np.ndarray, " free"],
-    chosen: Bool[np.ndarray, " free"],
-    *,
-    within: float,
-    max_terms: int,
+    problem: EstimationProblem, gram: Gram, prices: ByCoefficient, chosen: Support, *, within: float
 ) -> list[PenalisedFit]:
     """Supports whose score lies no further than `within` above the chosen one's, best first.
 
@@ -122,24 +102,21 @@ def alternatives(
     limit = penalise(gram, chosen, prices).score + within
     found: dict[bytes, PenalisedFit] = {}
     for block in np.unique(problem.block).tolist():
-        offered = _offer_supports(problem, gram, chosen, problem.block == block, max_terms)
-        scored = [(each.squares + prices[each.support].sum(), each.support) for each in offered]
+        offered = offer_supports(problem, gram, prices, chosen, problem.block == block)
         near = [
-            (score, support)
-            for score, support in scored
-            if score <= limit + within and not np.array_equal(support, chosen)
+            each
+            for each in sorted(offered, key=lambda each: each.score)
+            if each.score <= limit + within and not np.array_equal(each.support, chosen)
         ]
-        for _, support in sorted(near, key=lambda each: each[0])[:MAX_ALTERNATIVES]:
-            each = best_support(problem, gram, prices, support, max_terms=max_terms, held=block)
-            if each.score <= limit and excess(problem, each.support, max_terms) == 0:
+        for other in near[:MAX_ALTERNATIVES]:
+            each = best_support(problem, gram, prices, other.support, held=block)
+            if each.score <= limit and excess(problem, each.support) == 0:
                 found[each.support.tobytes()] = each
     found.pop(chosen.tobytes(), None)
     return sorted(found.values(), key=lambda each: each.score)
 
 
-def penalise(
-    gram: Gram, support: Bool[np.ndarray, " free"], prices: Float[np.ndarray, " free"]
-) -> PenalisedFit:
+def penalise(gram: Gram, support: Support, prices: ByCoefficient) -> PenalisedFit:
     """Least squares on a support, and their score: the squares plus its terms' prices."""
     free = np.zeros(len(support))
     quadratic, linear = gram.quadratic[np.ix_(support, support)], gram.linear[support]
@@ -152,29 +129,26 @@ def penalise(
 
 
 class Offered(NamedTuple):
-    """A support, and the squares that it leaves."""
+    """A support, and the squares that it leaves plus the prices of its terms."""
 
-    support: Bool[np.ndarray, " free"]
-    squares: float
+    support: Support
+    score: float
 
 
-def _offer_supports(
-    problem: EstimationProblem,
-    gram: Gram,
-    chosen: Bool[np.ndarray, " free"],
-    own: Bool[np.ndarray, " free"],
-    max_terms: int,
+def offer_supports(
+    problem: EstimationProblem, gram: Gram, prices: ByCoefficient, chosen: Support, own: Support
 ) -> list[Offered]:
-    """Best supports of one equation; the other equations' and required coefficients stay free."""
+    """The best few supports of every size of one equation, the other equations as chosen.
+
+    Their coefficients and required ones stay free. own: mask of the equation's coefficients.
+    """
     kept = (chosen & ~own) | problem.required
     own = own & ~problem.required
-    inverse = invert_gram(gram.quadratic[np.ix_(kept, kept)])
-    yy = max(gram.offset - gram.linear[kept] @ inverse @ gram.linear[kept], 1.0)
+    either = kept | own
+    rest = gram.select(either).minimise(kept[either])
+    xx, xy, yy = rest.quadratic, rest.linear, max(rest.offset, 1.0)
     if not own.any():
-        return [Offered(kept, yy)]
-    share = gram.quadratic[np.ix_(own, kept)] @ inverse
-    xx = gram.quadratic[np.ix_(own, own)] - share @ gram.quadratic[np.ix_(kept, own)]
-    xy = gram.linear[own] - share @ gram.linear[kept]
+        return [Offered(kept, yy + prices[kept].sum())]
     # A column that the kept ones span leaves only rounding: it is not available.
     square = np.diag(xx).copy()
     square[~(square > DEPENDENT * np.abs(np.diag(gram.quadratic)[own]))] = 0.0
@@ -183,7 +157,7 @@ def _offer_supports(
     unit = np.where(at_hand[:, None] & at_hand, xx / np.outer(size, size), 0.0)
     target = np.where(at_hand, xy / size, 0.0)
     problem_of_one = unit[None], (target / np.sqrt(yy))[None], np.ones(1)
-    n_own = int(own.sum())
+    max_terms, n_own = problem.max_terms, int(own.sum())
     masks, proven = search_subsets(
         *problem_of_one,
         max_terms=min(max_terms, PROVEN_TERMS, n_own),
@@ -196,27 +170,26 @@ def _offer_supports(
     for mask, gain in zip(masks, _gains(unit, target, masks), strict=True):
         support = kept.copy()
         support[own] = mask
-        found.append(Offered(support, yy - gain))
-    return _admissible(problem, gram, found) if problem.positive.any() else found
+        found.append(Offered(support, yy - gain + prices[support].sum()))
+    return _admit(problem, gram, prices, found) if problem.positive.any() else found
 
 
-def _admissible(
-    problem: EstimationProblem, gram: Gram, offered: Sequence[Offered]
+def _admit(
+    problem: EstimationProblem, gram: Gram, prices: ByCoefficient, offered: Sequence[Offered]
 ) -> list[Offered]:
     """The supports on which coefficients that must be positive are.
 
     One that has negative ones is replaced by what least squares with bounds leaves of it.
     """
     found = {}
-    for support, squares in offered:
-        none = np.zeros(len(support))
-        free = penalise(gram, support, none).free
-        if (free[problem.positive] < 0.0).any():
+    for each in offered:
+        support = each.support
+        if (penalise(gram, support, prices).free[problem.positive] < 0.0).any():
             own, quadratic = np.flatnonzero(support), gram.quadratic[np.ix_(support, support)]
             kept = within_bounds(quadratic, gram.linear[support], problem.positive[support])
             support = np.isin(np.arange(len(support)), own[kept])
-            squares = penalise(gram, support, none).score
-        found[support.tobytes()] = Offered(support, squares)
+            each = Offered(support, penalise(gram, support, prices).score)
+        found[support.tobytes()] = each
     return list(found.values())
 
 

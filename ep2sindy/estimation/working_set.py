@@ -21,23 +21,28 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.cost import SMALL
-from ep2sindy.estimation.kernels import departures, eliminate
+from ep2sindy.estimation.kernels import marginalise, smooth_corrections
 from ep2sindy.estimation.likelihood import (
     FREE_START,
-    Level,
+    Gram,
     Linearised,
     TrajectoryFit,
     hessian_on,
     observe,
 )
 from ep2sindy.estimation.observation import Solution
-from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.problem import (
+    SAMPLES_PER_COEFFICIENT,
+    ByCoefficient,
+    BySample,
+    EstimationProblem,
+    Support,
+)
 from ep2sindy.estimation.solver import (
     COMPARED_AT,
     OTHER_STARTS,
-    SAMPLES_PER_COEFFICIENT,
-    at_level,
     from_smooth,
+    refit,
     settle,
     smooth_states,
 )
@@ -53,37 +58,29 @@ DEPENDENT = 1e-6  # share of a score's scatter that the chosen terms leave, if t
 N_PROBES = 40  # draws of noise that tell how far a score scatters: to 22 % of its square
 
 
-def search_within(problem: EstimationProblem, *, max_terms: int) -> Solution:
+def search_within(problem: EstimationProblem) -> Solution:
     """The solution from smoothed states by a working set, whose terms its problem has.
 
     Of a library that is large for its samples the linear terms are tried alone first: where they
     explain the samples and no other term would pay for itself, that is the solution. A search that
     begins with all terms would take products that stand in for linear terms over a transient.
     """
-    part = problem.restricted(first_set(problem, max_terms))
+    part = problem.restricted(first_set(problem))
     linear = problem.restricted(problem.required | (problem.degrees <= 1))
     few = problem.n_samples < SAMPLES_PER_COEFFICIENT * len(problem.library)
     if few and linear.n_free < problem.n_free > part.n_free:
-        found = _linear_solution(linear, max_terms)
-        if found.fits and admit_terms(found, max_terms=max_terms) is found:
+        with problem.monitor.stage(_weighed(linear)):
+            tried = [from_smooth(linear, log10_ratio) for log10_ratio in (None, *OTHER_STARTS)]
+        found = min(tried, key=lambda each: each.rank)
+        if found.fits and admit_terms(found) is found:
             return found
     with problem.monitor.stage(_weighed(part)):
-        found = from_smooth(part, None, max_terms=max_terms)
+        found = from_smooth(part, None)
     # About a solution that does not fit first order tells little, and other starts cost less.
-    return admit_terms(found, max_terms=max_terms) if found.fits else found
+    return admit_terms(found) if found.fits else found
 
 
-def _linear_solution(linear: EstimationProblem, max_terms: int) -> Solution:
-    """The likeliest solution of the linear terms alone that fits, from any start."""
-    with linear.monitor.stage(_weighed(linear)):
-        tried = [
-            from_smooth(linear, log10_ratio, max_terms=max_terms)
-            for log10_ratio in (None, *OTHER_STARTS)
-        ]
-    return min(tried, key=lambda each: each.rank)
-
-
-def admit_terms(found: Solution, *, max_terms: int) -> Solution:
+def admit_terms(found: Solution) -> Solution:
     """Let terms into the working set as long as they make the solution likelier."""
     problem = found.problem.candidates
     problem.monitor.best = found
@@ -97,12 +94,12 @@ def admit_terms(found: Solution, *, max_terms: int) -> Solution:
         widened = replace(
             fit,
             problem=whole,
-            level=replace(fit.level, noise=found.noise.effective),
+            noise=found.noise.effective,
             free=_spread(fit.free, kept)[larger],
             support=_spread(fit.support, kept)[larger] | entering[larger],
         )
         with problem.monitor.stage(_weighed(whole)):
-            tried = settle(widened, max_terms=max_terms)
+            tried = settle(widened)
         if tried.rank >= found.rank:
             break
         found = problem.monitor.best = tried
@@ -115,7 +112,7 @@ def _weighed(part: EstimationProblem) -> str:
     return f"weighing {part.n_free}{of} coefficients"
 
 
-def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " free"]:
+def first_set(problem: EstimationProblem) -> Support:
     """Required terms, and of each equation the terms of its best few supports of every size.
 
     All of them if the equations are small, or tied together by relations or hidden states.
@@ -124,23 +121,22 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
     sizes = np.bincount(problem.block[~kept], minlength=len(problem.states))
     if problem.C is not None or not problem.measured.all() or (sizes <= SMALL).all():
         return np.ones_like(kept)
-    start = smooth_states(problem, None)
-    steps = _integrals(problem, start.path)
+    path, _, noise = smooth_states(problem, None)
+    steps = _integrals(problem, path)
     for block in np.flatnonzero(sizes).tolist():
         own = np.flatnonzero((problem.block == block) & ~problem.required)
         if len(own) <= SMALL:
             kept[own] = True
             continue
         for model_error in FIRST_MODEL_ERRORS:
-            level = Level(start.noise, model_error)
-            fit = TrajectoryFit(problem, level, start.path, np.zeros(problem.n_free), kept)
-            quadratic, linear, offset = _own_squares(fit, steps, block, own)
-            size = np.sqrt(zero_to_one(np.diag(quadratic)))
+            fit = TrajectoryFit(problem, noise, model_error, path, np.zeros(problem.n_free), kept)
+            pair = _own_squares(fit, steps, block, own)
+            size = np.sqrt(zero_to_one(np.diag(pair.quadratic)))
             masks = exchange_terms(
-                (quadratic / np.outer(size, size))[None],
-                (linear / size)[None],
-                np.array([offset]),
-                max_terms=max_terms,
+                (pair.quadratic / np.outer(size, size))[None],
+                (pair.linear / size)[None],
+                np.array([pair.offset]),
+                max_terms=problem.max_terms,
                 n_best=N_BEST,
             )
             kept[own[masks.any(axis=0)]] = True
@@ -161,9 +157,7 @@ def _mimicked(
     return (degrees <= 1) & ~factors[:, ~has].any(axis=1)
 
 
-def _integrals(
-    problem: EstimationProblem, path: Float[np.ndarray, "samples d"]
-) -> Float[np.ndarray, "steps terms"]:
+def _integrals(problem: EstimationProblem, path: BySample) -> Float[np.ndarray, "steps terms"]:
     """Integral of every term over each step along all paths, by the trapezoidal rule.
 
     It is zero from one path to the next. A term that overflows is not available: zero.
@@ -180,36 +174,26 @@ def _integrals(
 
 @np.errstate(over="ignore", invalid="ignore")  # a term that overflows is not chosen
 def _own_squares(
-    fit: TrajectoryFit,
-    steps: Float[np.ndarray, "steps terms"],
-    block: int,
-    own: np.ndarray,
-) -> tuple[Float[np.ndarray, "own own"], Float[np.ndarray, " own"], float]:
+    fit: TrajectoryFit, steps: Float[np.ndarray, "steps terms"], block: int, own: np.ndarray
+) -> Gram:
     """The squares as a quadratic function of one equation's coefficients, the other states held.
 
-    steps: integrals of the terms over each step. Returns the parts of `likelihood.Gram`.
+    steps: integrals of the terms over each step.
     """
     record, path, one = fit.problem.all_records, fit.path, slice(block, block + 1)
     columns = steps[:, fit.problem.column[own]]
     flow = np.concatenate([np.ones((len(columns), 1)), columns], axis=1)[:, None]
-    residuals, apparent, _ = observe(record, path, np.square(fit.level.noise))
     defects = -np.diff(path[:, one], axis=0)
     flow[record.breaks] = defects[record.breaks] = 0.0
-    quadratic, linear, offset, _ = eliminate(
-        np.ascontiguousarray(flow), defects, np.ascontiguousarray(residuals[:, one]),
-        np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(fit.process[:, one]),
-        FREE_START,
-    )  # fmt: skip
+    residuals, variance, _ = observe(record, path, np.square(fit.noise))
+    case = (np.ascontiguousarray(each[:, one]) for each in (residuals, variance, fit.process))
+    quadratic, linear, offset, _ = marginalise(flow, defects, *case, FREE_START)
     tells = np.isfinite(np.diag(quadratic)) & np.isfinite(linear)
     pairs = np.isfinite(quadratic) & tells & tells[:, None]
-    return np.where(pairs, quadratic, 0.0), np.where(tells, linear, 0.0), float(offset)
+    return Gram(np.where(pairs, quadratic, 0.0), np.where(tells, linear, 0.0), float(offset))
 
 
-def _would_pay(
-    problem: EstimationProblem,
-    kept: Bool[np.ndarray, " free"],
-    found: Solution,
-) -> Bool[np.ndarray, " free"]:
+def _would_pay(problem: EstimationProblem, kept: Support, found: Solution) -> Support:
     """Terms that would lower the squares by more than their price, at most a few per equation.
 
     Score tests: the derivative of the squares by each coefficient, against its scatter if the
@@ -220,7 +204,7 @@ def _would_pay(
     enters = np.zeros_like(kept)
     if kept.all() or not np.isfinite(found.score):
         return enters
-    fit = at_level(found.fit, replace(found.fit.level, model_error=COMPARED_AT))
+    fit = refit(replace(found.fit, model_error=COMPARED_AT))
     gains = _gains(problem, fit) - term_prices(problem, float(problem.n_samples))
     gains[kept] = -np.inf
     for block in range(len(problem.states)):
@@ -229,13 +213,13 @@ def _would_pay(
     return enters
 
 
-def _gains(problem: EstimationProblem, fit: TrajectoryFit) -> Float[np.ndarray, " free"]:
+def _gains(problem: EstimationProblem, fit: TrajectoryFit) -> ByCoefficient:
     """Fall of the squares that each coefficient by itself would bring, to first order."""
     quadratic, _, _, about = hessian_on(fit, fit.support)
     if not np.isfinite(quadratic).all():
         return np.zeros(problem.n_free)
     # Neither terms nor slopes lead from one record to the next, whatever is missed there.
-    terms, std = _integrals(problem, fit.path), fit.level.noise
+    terms, std = _integrals(problem, fit.path), fit.noise
     score = np.square(terms.T @ (about.defects / about.process))
     with_states, with_all = np.zeros_like(score), np.zeros_like(score)
     rng, inverse = np.random.default_rng(0), invert_gram(quadratic)
@@ -253,9 +237,7 @@ def _gains(problem: EstimationProblem, fit: TrajectoryFit) -> Float[np.ndarray, 
 
 
 def _weighted_defects(
-    about: Linearised,
-    noise: Float[np.ndarray, "samples d"],
-    change: Float[np.ndarray, " support"],
+    about: Linearised, noise: BySample, change: Float[np.ndarray, " support"]
 ) -> Float[np.ndarray, "steps d"]:
     """How far states that follow a draw of noise leave the flow, the coefficients changed.
 
@@ -264,11 +246,11 @@ def _weighted_defects(
     d, states = noise.shape[1], about.of_states
     moved = about.slopes[:, :, d:] @ change
     draw = np.where(np.isfinite(about.residuals), noise, np.nan)
-    off = departures(*states._replace(defects=moved, residuals=draw))
+    off = smooth_corrections(*states._replace(defects=moved, residuals=draw))
     return (np.einsum("kij,kj->ki", states.slopes, off[:-1]) + moved - off[1:]) / about.process
 
 
-def _spread(values: np.ndarray, kept: Bool[np.ndarray, " free"]) -> np.ndarray:
+def _spread(values: np.ndarray, kept: Support) -> np.ndarray:
     """Values of the set's coefficients among all, zero (or False) for the others."""
     every = np.zeros(len(kept), dtype=values.dtype)
     every[kept] = values

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.runs import Run, trajectory_of
+from ep2sindy.data.sensor import Bounds
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import with_guess_by
-from ep2sindy.estimation.kernels import filtered
+from ep2sindy.estimation.kernels import filter_states
 from ep2sindy.estimation.likelihood import (
     FREE_START,
-    Level,
     TrajectoryFit,
     enough_substeps,
     fit_paths,
@@ -111,7 +111,7 @@ class StateEstimator:
         """
         record = self.problem.record(_select_variables(self.model, history)).end(self.memory)
         fit = self.fit_path(record, record.samples)
-        _, mean, covariance = filtered(*linearise(fit))
+        _, mean, covariance = filter_states(*linearise(fit))
         end, scale = fit.path[-1] + mean, self.problem.scale
         if not (np.isfinite(end).all() and np.isfinite(covariance).all()):
             # The model runs away between two samples: they tell no more than a guess does.
@@ -144,11 +144,10 @@ class StateEstimator:
     def fit_path(self, record: ScaledRecord, path: Float[np.ndarray, "samples d"]) -> TrajectoryFit:
         """The most likely path near the given one, by way of larger process noise that fades."""
         samples, process = self.scaled_noise()
-        level = Level(np.tile(samples, (len(path), 1)), 1.0, self.n_substeps)
-        fit = _fix(self.problem, [record], [path], self.free, level)
+        fit = _fix(self.problem, [record], [path], self.free, samples)
+        fit = replace(fit, n_substeps=self.n_substeps)
         for share in (*CONTINUATION, 0.0):
-            level = replace(level, process_noise=np.maximum(process, share * samples))
-            fit = fit_paths(replace(fit, level=level))
+            fit = fit_paths(replace(fit, process_noise=np.maximum(process, share * samples)))
         return fit
 
 
@@ -189,12 +188,11 @@ def tune_estimator(
     differences = np.concatenate([np.diff(path, n=3, axis=0) for path in paths])
     rough = np.sqrt(np.square(differences).mean(axis=0) / 20.0)
     rough = np.clip(rough, LEAST_NOISE, MOST)
-    level = Level(np.tile(rough, (sum(map(len, paths)), 1)), 1.0)
     estimator = StateEstimator(
         model=model,
         problem=problem,
         free=free,
-        n_substeps=enough_substeps(_fix(problem, problem.records, paths, free, level)),
+        n_substeps=enough_substeps(_fix(problem, problem.records, paths, free, rough)),
         per_period=_count_per_period(own, names),
         noise=_noise_of(problem, rough, 0.1 * rough),
     )
@@ -234,10 +232,10 @@ def _with_likely_noise(
     records = estimator.problem.records
     paths = [estimator.fit_path(*pair).path for pair in zip(records, paths, strict=True)]
     samples, process = estimator.scaled_noise()
-    level = Level(np.tile(samples, (sum(map(len, paths)), 1)), 1.0, estimator.n_substeps, process)
-    errors = likely_errors(_fix(estimator.problem, records, paths, estimator.free, level))
-    noise = _noise_of(estimator.problem, errors.noise, errors.process)
-    return replace(estimator, noise=noise), paths
+    fit = _fix(estimator.problem, records, paths, estimator.free, samples)
+    fit = replace(fit, n_substeps=estimator.n_substeps, process_noise=process)
+    likely = _noise_of(estimator.problem, *likely_errors(fit)[:2])
+    return replace(estimator, noise=likely), paths
 
 
 def _fix(
@@ -245,15 +243,16 @@ def _fix(
     records: Sequence[ScaledRecord],
     paths: Sequence[np.ndarray],
     free: np.ndarray,
-    level: Level,
+    noise: np.ndarray,
 ) -> TrajectoryFit:
-    """A fit of these paths, whose coefficients stay as they are.
+    """A fit of these paths, whose coefficients stay as they are. noise: (d,), of the samples.
 
     Clipped and rounded samples are taken as they are: forecasts are compared with them.
     """
-    problem = replace(problem, records=tuple(replace(each, limits=None) for each in records))
-    fixed = np.zeros(len(free), dtype=np.bool_)
-    return TrajectoryFit(problem, level, np.concatenate(paths), free, fixed)
+    exact = [replace(each, limits=Bounds(each.samples, each.samples, ())) for each in records]
+    problem = replace(problem, records=tuple(exact))
+    path, fixed = np.concatenate(paths), np.zeros(len(free), dtype=np.bool_)
+    return TrajectoryFit(problem, np.tile(noise, (len(path), 1)), 1.0, path, free, fixed)
 
 
 def _noise_of(problem: EstimationProblem, samples: np.ndarray, process: np.ndarray) -> ModelNoise:
