@@ -15,16 +15,14 @@ from ep2sindy.model.inputs import curve_through, driven
 from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.runge_kutta import dormand_prince, step
-from ep2sindy.model.solve import Border, Driven, Solved, _first_step, solve_stages
+from ep2sindy.model.solve import Driven, Integration, _first_step, solve_stages
 from ep2sindy.model.vector_field import VectorField
 from tests.models import model_of
 
-NO_BORDER = Border((), lambda _, y: y)
 
-
-def run(rates: Callable, t: np.ndarray, y: np.ndarray, **settings: object) -> Solved:
+def run(rates: Callable, t: np.ndarray, y: np.ndarray, **settings: object) -> Integration:
     given = {"blow_up": 1e6, "bound": "one", "rtol": 1e-8, "limit_s": 300.0}
-    return solve_stages(rates, NO_BORDER, t, y, **given | settings)
+    return solve_stages(rates, t, y, **given | settings)
 
 
 def products(model: SparseModel) -> Driven:
