@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.library.library import Library
+from ep2sindy.library.units import Clock
 
 
 @runtime_checkable
@@ -37,6 +38,16 @@ class Equations(Protocol):
 
     @property
     def field(self) -> VectorField: ...
+
+    @property
+    def covariance(self) -> np.ndarray | None: ...
+
+    @property
+    def clock(self) -> Clock: ...
+
+    def terms(self, state: str) -> dict[str, float]: ...
+
+    def intervals(self, state: str) -> dict[str, tuple[float, float]]: ...
 
 
 @dataclass(frozen=True, eq=False)

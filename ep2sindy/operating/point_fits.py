@@ -44,9 +44,6 @@ from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
 from ep2sindy.signals.spectrum import dominant_frequency, samples_in_periods
 
-# Directions that the rows of a draw hold to less than this share of their squares count as absent.
-UNSEEN = 1e-14
-
 MIN_BLOCKS = 5  # fewest blocks in a record: with fewer, draws differ too little from one another
 
 
