@@ -8,7 +8,6 @@ import ep2sindy as ep
 from ep2sindy.model import stability
 from ep2sindy.model.stability import LimitCycle, share_reaching
 from ep2sindy.model.vector_field import VectorField
-from ep2sindy.refinement.kernels import gap_sizes, squares, triangles
 from ep2sindy.refinement.ode import ODE, Drive, ScaledEquations
 from ep2sindy.refinement.steps import FusedRungeKutta, RungeKutta, fastest_step
 from tests.models import model_of
@@ -48,31 +47,6 @@ def test_fused_steps_are_those_of_torchdiffeq(case: str, n_substeps: int) -> Non
 def test_only_products_are_fused() -> None:
     assert isinstance(fastest_step(ep.polynomial(["x"])), FusedRungeKutta)
     assert isinstance(fastest_step(ep.polynomial(["x"], functions=["sin"])), RungeKutta)
-
-
-def test_triangles_are_those_of_lapack() -> None:
-    rows = np.random.default_rng(0).normal(size=(3, 9, 4))
-    rows[1, :, 2] = 0.0
-    plain = np.linalg.qr(rows, mode="r")
-    for ours, theirs in zip(triangles(rows), plain, strict=True):
-        np.testing.assert_allclose(ours.T @ ours, theirs.T @ theirs, atol=1e-13)
-        np.testing.assert_array_equal(np.tril(ours, -1), 0.0)
-    rows[2, 3, 1] = np.nan
-    assert np.isfinite(triangles(rows)).all(axis=(1, 2)).tolist() == [True, True, False]
-
-
-def test_sizes_of_residuals_and_gaps_are_those_of_arrays() -> None:
-    rng = np.random.default_rng(1)
-    nodes, data = rng.normal(size=(2, 3, 4, 5, 2))
-    maps, weights = rng.normal(size=(3, 4, 4, 2, 6)), rng.normal(size=(3, 2))
-    plain = np.square(weights[:, None, None] * (nodes - data)).sum(axis=(1, 2, 3))
-    np.testing.assert_allclose(squares(nodes, data, weights), plain, rtol=1e-14)
-    gaps = maps[..., -1] - nodes[:, :, 1:]
-    norm, largest = gap_sizes(maps, nodes)
-    np.testing.assert_allclose(norm, np.sqrt(np.square(gaps).sum(axis=(1, 2, 3))), rtol=1e-14)
-    np.testing.assert_array_equal(largest, np.abs(gaps).max(axis=(1, 2, 3)))
-    maps[1, 2, 1, 0, -1] = np.nan
-    assert np.isnan(gap_sizes(maps, nodes)).tolist() == [[False, True, False]] * 2
 
 
 def test_starts_that_a_kernel_brings_near_the_end_reach_what_a_loop_reaches(

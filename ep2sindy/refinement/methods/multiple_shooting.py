@@ -9,11 +9,8 @@ import torch
 
 from ep2sindy.refinement.kernels import (
     condense,
-    gap_sizes,
     propagate,
-    squares,
     starts,
-    triangles,
 )
 from ep2sindy.refinement.problem import (
     Iteration,
@@ -27,6 +24,8 @@ from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
 
 # Directions of the scalings weaker than this share of the strongest are dropped.
 RANK = 1e-12
+
+OVERFLOWING = 1e150  # tangents of this size overflow when they are squared
 
 # A stage with a pull has done its work once gaps, in std, and relative changes are below this.
 ROUGH = 0.3
@@ -187,7 +186,7 @@ class _Walk:
 
     def note_memory(self, memory: int, points: np.ndarray) -> None:
         """Note this memory at the points that it leaves without gaps."""
-        ends = self.pull(self.maps[points], points, memory)
+        ends = self.pull(self._maps_of(points), points, memory)
         closed = (gap_sizes(ends, self.nodes[points])[1] < ROUGH) & self.finite[points]
         self.memory[points[self.problem.agree(closed, np.all)]] = memory
 
@@ -204,7 +203,7 @@ class _Walk:
         """Close the gaps that are left, by the nodes alone; where it fails, all stays as it was."""
         self.damping[:] = 0.0
         for _ in range(JOINING_STEPS):
-            _, defect = gap_sizes(self.maps[points], self.nodes[points])
+            _, defect = gap_sizes(self._maps_of(points), self.nodes[points])
             is_open = self.finite[points] & ~self.finished[points] & (defect > JOINED)
             is_open = self.problem.agree(is_open, np.any)
             if not is_open.any():
@@ -221,7 +220,7 @@ class _Walk:
         hold: leave the scalings as they are, by which the maps then hold no derivatives.
         """
         problem, damping = self.problem, self.damping[active]
-        maps = self.pull(self.maps[active], active, memory)
+        maps = self.pull(self._maps_of(active), active, memory)
         scaling, nodes = self.scaling[active], self.nodes[active]
         unknowns, change, moved = self._newton_step(maps, active, None if hold else damping)
         share = step_share(moved, problem.ranges[active]) / (1.0 + damping)
@@ -248,7 +247,10 @@ class _Walk:
         self._tell(memory, active, relative, defect)
         if self.theta is not None and better.all():
             self.theta = self.theta + share[0] * unknowns
-        self.maps[active[better]] = raw[better]
+        if better.all() and len(active) == len(self.maps):
+            self.maps = raw
+        else:
+            self.maps[active[better]] = raw[better]
         self.damping[active] = _next_damping(damping, better, hold=hold)
 
     def _newton_step(
@@ -262,7 +264,7 @@ class _Walk:
         """
         problem, law, n_start = self.problem, self.problem.law, self.problem.n_start
         nodes, data = self.nodes[active], problem.data[active]
-        condensed = condense(maps, nodes, data, self.weights[active], self.window, n_start)
+        condensed = condense(maps, nodes, data, self.weights[active], n_start)
         if damping is None:
             unknowns = np.zeros_like(self.scaling[active] if self.theta is None else self.theta)
         else:
@@ -271,8 +273,8 @@ class _Walk:
         if problem.free_start:
             first = starts(condensed, change, n_start)
         else:
-            first = np.ascontiguousarray(data[:, :, :1] - nodes[:, :, :1])
-        return unknowns, change, propagate(maps, nodes, first, change, self.window)
+            first = data[:, :, 0] - nodes[:, :, 0]
+        return unknowns, change, propagate(maps, nodes, first, change)
 
     def _is_better(
         self,
@@ -303,6 +305,10 @@ class _Walk:
             fine = problem.agree(size_ahead - FINE * np.sqrt(loss), np.max) <= 0.0
             better: np.ndarray = merit_ahead <= merit + problem.agree(slack, np.sum)
         return better | (gains & fine)
+
+    def _maps_of(self, points: np.ndarray) -> np.ndarray:
+        """Maps of some points, without a copy if these are all: they are large."""
+        return self.maps if len(points) == len(self.maps) else self.maps[points]
 
     def pull(self, maps: np.ndarray, points: np.ndarray, memory: int) -> np.ndarray:
         """One-step maps of the points, with every step's end pulled towards the data."""
@@ -351,23 +357,22 @@ def step_maps(
 
 
 def least_change(
-    by_block: np.ndarray, law: LawMap | None = None, damping: np.ndarray | None = None
+    by_window: np.ndarray, law: LawMap | None = None, damping: np.ndarray | None = None
 ) -> np.ndarray:
-    """Change of the unknowns that minimises the condensed residuals of all blocks, or NaN.
+    """Change of the unknowns that minimises the condensed residuals of all windows, or NaN.
 
-    by_block: triangles, (points, windows, blocks, size, size), by scaling. Without a law the
+    by_window: triangles, (points, windows, size, size), by scaling. Without a law the
     unknowns are the scalings, (points, free), and each point is solved separately. With a law they
     are theta, common to all points: H = sum_p spread_p^T R_p^T R_p spread_p, by QR of each R_p,
     then of all.
     """
-    size = by_block.shape[-1]
-    # Of a single block this would be a view, and the kernel compiled again for its strides.
-    rows = np.ascontiguousarray(by_block[..., :-1, :].reshape(len(by_block), -1, size))
+    size = by_window.shape[-1]
+    rows = by_window[..., :-1, :].reshape(len(by_window), -1, size)
     if law is None:
         return least_squares(rows, damping)
-    if not np.isfinite(rows).all():
+    if not (np.abs(rows) < OVERFLOWING).all():
         return np.full(law.n_theta, np.nan)
-    rows = law.rows(triangles(rows)[:, None]).reshape(1, -1, law.n_theta + 1)
+    rows = law.rows(np.linalg.qr(rows, mode="r")[:, None]).reshape(1, -1, law.n_theta + 1)
     return least_squares(rows, None if damping is None else damping[:1])[0]
 
 
@@ -379,20 +384,31 @@ def least_squares(rows: np.ndarray, damping: np.ndarray | None = None) -> np.nda
     The solution has the least norm if the rows do not determine a direction.
     """
     size = rows.shape[-1]
-    joined = triangles(rows)
-    lost = ~np.isfinite(joined).all(axis=(1, 2))
-    joined = np.where(lost[:, None, None], 0.0, joined)
+    lost = ~(np.abs(rows) < OVERFLOWING).all(axis=(1, 2))
+    rows = np.where(lost[:, None, None], 0.0, rows)
     if damping is not None and damping.any():
-        length = np.sqrt(np.square(joined[..., :-1]).sum(axis=1))
-        extra = np.zeros((len(joined), size - 1, size))
+        length = np.sqrt(np.square(rows[..., :-1]).sum(axis=1))
+        extra = np.zeros((len(rows), size - 1, size))
         each = np.arange(size - 1)
         extra[:, each, each] = np.sqrt(damping)[:, None] * length
-        joined = triangles(np.concatenate([joined, extra], axis=1))
-    u, strength, vt = np.linalg.svd(joined[:, : size - 1, : size - 1])
+        rows = np.concatenate([rows, extra], axis=1)
+    u, strength, vt = np.linalg.svd(rows[..., :-1], full_matrices=False)
     inverse = np.where(strength > RANK * strength[:, :1], 1.0, 0.0) / np.maximum(strength, 1e-300)
-    seen = inverse * (u.transpose(0, 2, 1) @ joined[:, : size - 1, size - 1 :])[..., 0]
+    seen = inverse * (u.transpose(0, 2, 1) @ rows[..., -1:])[..., 0]
     change = -(vt.transpose(0, 2, 1) @ seen[..., None])[..., 0]
     return np.where(lost[:, None], np.nan, change)
+
+
+def squares(nodes: np.ndarray, data: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Sum of squares of weights (points, n) * (nodes - data), by point."""
+    return np.square(weights[:, None, None] * (nodes - data)).sum(axis=(1, 2, 3))
+
+
+def gap_sizes(maps: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Norm of the gaps between ends of steps and nodes, and the largest gap, (points,) each."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        gaps = np.abs(maps[..., -1] - nodes[:, :, 1:])
+        return np.sqrt(np.square(gaps).sum(axis=(1, 2, 3))), gaps.max(axis=(1, 2, 3))
 
 
 def step_share(moved: np.ndarray, ranges: np.ndarray) -> np.ndarray:
