@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ep2sindy.data.numbers import band_of, zero_to_one
 from ep2sindy.data.trajectory import Trajectory, as_dataframe, as_dataset, check_time
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.model.inputs import Curve, curve_through, driven
+from ep2sindy.model.inputs import Curve, driven
 from ep2sindy.model.solve import Border, Driven, Edge, Integration, edges_of, solve_stages
 from ep2sindy.model.vector_field import Equations, VectorField
 from ep2sindy.runtime.screen import one_screen, text_table
@@ -112,37 +112,6 @@ class Rollout:
         )
 
 
-def rollout(
-    model: Equations,
-    trajectory: Trajectory,
-    *,
-    start: int,
-    n_samples: int | None,
-    initial: Float[np.ndarray, " n_states"] | None,
-    blow_up: float,
-    rtol: float,
-    limit_s: float,
-) -> Rollout:
-    """Integrate a model along a trajectory; see `SparseModel.rollout`."""
-    stop = trajectory.n_samples if n_samples is None else start + n_samples
-    window = trajectory.window(start, stop)
-    data = window.columns(model.states)
-    inputs = window.columns(model.inputs)
-    found = _integrate(
-        model,
-        window.t,
-        data[0] if initial is None else initial,
-        drive=curve_through(window.t, inputs, list(map(model.courses.get, model.inputs))),
-        samples=inputs,
-        scale=np.abs(data).max(axis=0),
-        blow_up=blow_up,
-        bound="the data's largest value",
-        rtol=rtol,
-        limit_s=limit_s,
-    )
-    return replace(found, clock=trajectory.clock)
-
-
 def simulate(
     model: Equations,
     t: ArrayLike,
@@ -166,7 +135,7 @@ def simulate(
     # An input may begin at zero as well: its largest sample tells what it does to a state.
     driving = np.take_along_axis(samples, np.abs(samples).argmax(axis=0, keepdims=True), axis=0)
     sizes = start_scale(model, start, driving[0], float(times[-1] - times[0]))
-    return _integrate(
+    return integrate(
         model,
         times,
         start,
@@ -227,7 +196,7 @@ def check_start(
     return start
 
 
-def _integrate(
+def integrate(
     model: Equations,
     t: np.ndarray,
     x0: np.ndarray,
