@@ -16,7 +16,7 @@ import numpy as np
 import ep2sindy as ep
 from benchmarks.timing import cpu_s
 from ep2sindy.model.inputs import Curve, curve_through
-from ep2sindy.model.solve import Border, Driven, Solved, solve_stages
+from ep2sindy.model.solve import Driven, Integration, solve_stages
 from ep2sindy.model.vector_field import VectorField
 
 PERIODS, PER_PERIOD = 10, 60
@@ -28,10 +28,9 @@ SYSTEMS = {
 }
 
 
-def run(rates: Callable, t: np.ndarray, y: np.ndarray, rtol: float) -> Solved:
+def run(rates: Callable, t: np.ndarray, y: np.ndarray, rtol: float) -> Integration:
     """Without a bound or an edge."""
-    free = Border((), lambda _, state: state)
-    return solve_stages(rates, free, t, y, blow_up=np.inf, bound="", rtol=rtol, limit_s=300.0)
+    return solve_stages(rates, t, y, rtol=rtol, limit_s=300.0)
 
 
 def equations(system: ep.systems.System, drive: Curve) -> Driven:

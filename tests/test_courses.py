@@ -7,8 +7,9 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.model.draws import draw_runs
-from ep2sindy.model.inputs import COURSES
-from ep2sindy.model.many import DrivenWindows, Ensemble
+from ep2sindy.model.inputs import COURSES, curve_through
+from ep2sindy.model.many import WindowSteps, run_many
+from ep2sindy.model.vector_field import VectorField
 from tests.models import model_of
 
 TAU_S = 0.7
@@ -103,10 +104,10 @@ def test_refinement_follows_the_same_course() -> None:
 
 def test_many_models_at_once_take_set_inputs_as_held() -> None:
     run = lag("held", hold=20, seed=5)
-    windows = DrivenWindows.of(run, run.states, ["u"], np.array([0, 150]), 200)
-    paths = Ensemble(LAG.library, ["x"], LAG.coef[..., None]).paths(
-        windows, centre=np.zeros(1), spread=np.ones(1)
-    )
+    starts, curve = np.array([0, 150]), curve_through(run.t, run.inputs, [None])
+    steps = WindowSteps.along(run.t, curve, starts, 201, n_substeps=2)
+    field = VectorField.of(LAG, LAG.coef[None])
+    paths = run_many(field, run.states[starts], steps, centre=np.zeros(1), reach=np.full(1, 20.0))
     np.testing.assert_allclose(paths[0, 0], run.states[:201], atol=1e-6)
 
 

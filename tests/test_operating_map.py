@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.model.fixed_point import eigenvalues, fixed_point
+from ep2sindy.model.fixed_point import rest_point
 from ep2sindy.operating.branch import (
     BranchSettings,
     StructureCase,
@@ -87,13 +87,13 @@ def test_a_model_that_runs_away_has_no_cycle() -> None:
 
 def test_fixed_points_and_their_eigenvalues_are_exact() -> None:
     model = model_of({"x": {"x": 2.0, "x*y": -1.0}, "y": {"x*y": 1.0, "y": -3.0}})
-    state = fixed_point(model, np.array([2.5, 2.5]), scale=ONES, positive=ONES > 0.0)
-    assert state is not None
-    np.testing.assert_allclose(state, [3.0, 2.0], rtol=1e-8)
-    turning = np.sort_complex(eigenvalues(model, state))
-    np.testing.assert_allclose(turning, [-1j * 6**0.5, 1j * 6**0.5], atol=1e-8)
+    rest = rest_point(model, np.array([2.5, 2.5]), ONES, ONES > 0.0)
+    assert rest is not None
+    np.testing.assert_allclose(rest.state, [3.0, 2.0], rtol=1e-8)
+    assert rest.growth_per_s == pytest.approx(0.0, abs=1e-8)
+    assert 2.0 * np.pi * rest.frequency_Hz == pytest.approx(6**0.5, abs=1e-8)
     drift = model_of({"x": {"1": 1.0}, "y": {"1": 1.0}})
-    assert fixed_point(drift, ONES, scale=ONES, positive=ONES > 0.0) is None
+    assert rest_point(drift, ONES, ONES, ONES > 0.0) is None
 
 
 def test_the_structure_and_degree_of_a_known_family_are_chosen() -> None:

@@ -12,19 +12,17 @@ from scipy.interpolate import make_interp_spline
 import ep2sindy as ep
 from ep2sindy.model import kernels
 from ep2sindy.model.inputs import curve_through, driven
-from ep2sindy.model.many import DrivenWindows, Ensemble
+from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.runge_kutta import dormand_prince, step
-from ep2sindy.model.solve import Border, Driven, Solved, _first_step, solve_stages
+from ep2sindy.model.solve import Driven, Integration, _first_step, solve_stages
 from ep2sindy.model.vector_field import VectorField
 from tests.models import model_of
 
-NO_BORDER = Border((), lambda _, y: y)
 
-
-def run(rates: Callable, t: np.ndarray, y: np.ndarray, **settings: object) -> Solved:
+def run(rates: Callable, t: np.ndarray, y: np.ndarray, **settings: object) -> Integration:
     given = {"blow_up": 1e6, "bound": "one", "rtol": 1e-8, "limit_s": 300.0}
-    return solve_stages(rates, NO_BORDER, t, y, **given | settings)
+    return solve_stages(rates, t, y, **given | settings)
 
 
 def products(model: SparseModel) -> Driven:
@@ -175,10 +173,10 @@ def test_many_compiled_runs_are_runge_kutta_steps_to_the_last_digit() -> None:
     """Against the scheme written for arrays; one start leaves the bounds, and stays there."""
     system, rng = ep.lotka_volterra(), np.random.default_rng(0)
     coef = system.model.coef[..., None] * (1.0 + 0.1 * rng.standard_normal((1, 1, 5)))
-    ensemble = Ensemble(system.model.library, system.model.states, coef)
     start = np.array([[1.0, 0.5, 40.0], [0.5, 1.0, 3.0]])
-    windows = DrivenWindows.free(start, step_s=0.1, n_samples=80)
-    paths = ensemble.paths(windows, centre=np.zeros(2), spread=np.ones(2))
+    steps = WindowSteps(np.full((3, 158), 0.05), np.empty((3, 158, 0, 3)), n_substeps=2)
+    field = VectorField.of(system.model, coef.transpose(2, 0, 1))
+    paths = run_many(field, start.T, steps, centre=np.zeros(2), reach=np.full(2, 20.0))
     for m in range(5):
 
         def slope(x: np.ndarray, _: np.ndarray, m: int = m) -> np.ndarray:

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 import ep2sindy as ep
-from ep2sindy.model.many import DrivenWindows, Ensemble
+from ep2sindy.model.many import WindowSteps, run_many
+from ep2sindy.model.vector_field import VectorField
 from ep2sindy.runtime.compilation import (
     ANNOUNCEMENT,
     SHARED,
@@ -121,11 +122,9 @@ def _refinement() -> None:
     for step in (ep.refinement.RungeKutta(), ep.refinement.FusedRungeKutta()):
         method = ep.refinement.MultipleShooting(step=step)
         ep.refine(system.model, system.trajectory(), window=20, n_windows=2, method=method)
-    model = system.model
-    windows = DrivenWindows.free(np.ones((2, 1)), step_s=0.1, n_samples=3)
-    Ensemble(model.library, model.states, model.coef[..., None]).paths(
-        windows, centre=np.ones(2), spread=np.ones(2)
-    )
+    steps = WindowSteps.along(np.array([0.0, 0.1]), None, np.zeros(1, np.int64), 2, 1)
+    field = VectorField.of(system.model, system.model.coef[None])
+    run_many(field, np.ones((1, 2)), steps, centre=np.ones(2), reach=np.ones(2))
 
 
 def _plane() -> None:

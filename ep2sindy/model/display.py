@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
-
-import numpy as np
 
 from ep2sindy.library.equations import Sum, equation_html, equation_parts
 from ep2sindy.library.processes import groups_of
@@ -18,23 +15,8 @@ from ep2sindy.runtime.screen import N_LINES, cut, wrap
 MAX_TERMS = 40  # largest number of terms shown per equation in a notebook
 
 
-@runtime_checkable
-class Readable(Equations, Protocol):
-    """Interface of a model that can be displayed, such as a SparseModel."""
-
-    @property
-    def covariance(self) -> np.ndarray | None: ...
-
-    @property
-    def clock(self) -> Clock: ...
-
-    def terms(self, state: str) -> dict[str, float]: ...
-
-    def intervals(self, state: str) -> dict[str, tuple[float, float]]: ...
-
-
 def model_lines(
-    model: Readable, held: Constraint | None = None, *, n_lines: int = N_LINES
+    model: Equations, held: Constraint | None = None, *, n_lines: int = N_LINES
 ) -> list[str]:
     """Equations with their units, then the units of the variables; at most n_lines.
 
@@ -61,7 +43,7 @@ def model_lines(
     return [*lines, *tail]
 
 
-def model_html(model: Readable, held: Constraint | None = None) -> str:
+def model_html(model: Equations, held: Constraint | None = None) -> str:
     """Equations with their units and the units of the variables, as HTML for a notebook."""
     lines = []
     for state in model.states:
@@ -75,14 +57,14 @@ def model_html(model: Readable, held: Constraint | None = None) -> str:
     return "\n".join([*lines, f"<div><small>{html.escape(_units_text(model))}</small></div>"])
 
 
-def half_widths(model: Readable, state: str) -> Mapping[str, float]:
+def half_widths(model: Equations, state: str) -> Mapping[str, float]:
     """Half-width of each coefficient's 95 % interval; empty without a covariance."""
     if model.covariance is None:
         return {}
     return {name: (high - low) / 2.0 for name, (low, high) in model.intervals(state).items()}
 
 
-def grouped(model: Readable, held: Constraint | None, clock: Clock = SECONDS) -> Mapping[str, Sum]:
+def grouped(model: Equations, held: Constraint | None, clock: Clock = SECONDS) -> Mapping[str, Sum]:
     """State -> terms of its equation per time unit; by process, if roles hold the model."""
     if held is None or not held.processes:
         return {
@@ -95,18 +77,18 @@ def grouped(model: Readable, held: Constraint | None, clock: Clock = SECONDS) ->
 
 
 def _per_time_unit(
-    model: Readable, state: str, held: Constraint | None
+    model: Equations, state: str, held: Constraint | None
 ) -> tuple[Sum, Mapping[str, float]]:
     """Coefficients and half-widths per unit of the model's clock."""
     terms, widths = grouped(model, held, model.clock)[state], half_widths(model, state)
     return terms, {name: model.clock.seconds * value for name, value in widths.items()}
 
 
-def _rate_unit(model: Readable, state: str) -> str:
+def _rate_unit(model: Equations, state: str) -> str:
     return model.clock.rate_unit(model.units[state])
 
 
-def _units_text(model: Readable) -> str:
+def _units_text(model: Equations) -> str:
     known = [f"{name} in {unit}" for name, unit in model.units.items() if unit != "1"]
     return ", ".join([*known, f"t in {model.clock.unit}"]) + (
         "" if model.covariance is None else "; ± 95 % intervals"

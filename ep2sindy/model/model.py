@@ -14,15 +14,17 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
+from ep2sindy.data.coerce import check_domain, keep_inside, noise_inside
 from ep2sindy.data.runs import Run, is_run, trajectory_of
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.draws import draw_coef, draw_runs
-from ep2sindy.model.inputs import check_courses, driven, inputs_at_samples
-from ep2sindy.model.rollout import Rollout, check_start, rollout, simulate
-from ep2sindy.model.scores import derivative_r2
+from ep2sindy.model.inputs import check_courses, curve_through, driven, inputs_at_samples
+from ep2sindy.model.rollout import Rollout, check_start, integrate, simulate
+from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
 from ep2sindy.model.vector_field import VectorField
 from ep2sindy.runtime.files import write_text
@@ -170,16 +172,22 @@ class SparseModel:
         and with a message, after some hundred evaluations per sample or `limit_s` of work.
         Raises ValueError for a window outside the trajectory or a missing variable.
         """
-        return rollout(
+        run = trajectory_of(trajectory)
+        window = run.window(start, run.n_samples if n_samples is None else start + n_samples)
+        data, samples = window.columns(self.states), window.columns(self.inputs)
+        found = integrate(
             self,
-            trajectory_of(trajectory),
-            start=start,
-            n_samples=n_samples,
-            initial=initial,
+            window.t,
+            data[0] if initial is None else initial,
+            drive=curve_through(window.t, samples, list(map(self.courses.get, self.inputs))),
+            samples=samples,
+            scale=np.abs(data).max(axis=0),
             blow_up=blow_up,
+            bound="the data's largest value",
             rtol=rtol,
             limit_s=limit_s,
         )
+        return replace(found, clock=run.clock)
 
     def simulate(
         self,
@@ -265,9 +273,20 @@ class SparseModel:
         Raises ValueError for a missing variable, a wrong shape, a derivative that is constant, or
         a sample outside the domain of a function of the model.
         """
-        return derivative_r2(
-            self, trajectory_of(run), x_dot=x_dot, smoother=smoother or SavitzkyGolay()
-        )
+        run, library = trajectory_of(run), self.field.library
+        check_domain([run], library, smooth=x_dot is None)
+        values, shape = run.columns(library.variables), (run.n_samples, len(self.states))
+        if x_dot is None:
+            values, truth = _smooth_samples(library, run, self.states, smoother or SavitzkyGolay())
+        else:
+            truth = np.asarray(x_dot, dtype=np.float64)
+            if truth.shape != shape:
+                raise ValueError(
+                    f"x_dot must have shape {shape}, a row per sample and a column for each of "
+                    f"{list(self.states)}: {truth.shape} came"
+                )
+        pairs = zip(truth.T, self.field.rates(values).T, strict=True)
+        return float(np.mean([r2(truth=y, prediction=p[None])[0] for y, p in pairs]))
 
     def text(self, *, digits: int = 3) -> str:
         """Text with one line per equation: `n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
@@ -330,6 +349,19 @@ class SparseModel:
     def field(self) -> VectorField:
         """The right-hand side over the states, then the inputs, and its derivatives, in SI."""
         return VectorField.of(self)
+
+
+def _smooth_samples(
+    library: Library, run: Trajectory, states: Sequence[str], smoother: Smoother
+) -> tuple[Float[np.ndarray, "samples variables"], Float[np.ndarray, "samples n_states"]]:
+    """The library's variables, inside its domain, and the derivatives of the states."""
+    smooth, slopes = [], []
+    for each in run.stretches():
+        samples = each.columns(library.variables)
+        inside = noise_inside(library, samples)
+        smooth.append(keep_inside(library, smoother.smooth(each.t, samples), inside))
+        slopes.append(smoother.derivative(each.t, each.columns(states)))
+    return np.concatenate(smooth), np.concatenate(slopes)
 
 
 def coef_matrix(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from ep2sindy.data.numbers import band_of, zero_to_one
 from ep2sindy.data.trajectory import Trajectory, as_dataframe, as_dataset, check_time
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.model.inputs import Curve, curve_through, driven
-from ep2sindy.model.solve import Border, Driven, edges_of, solve_stages
+from ep2sindy.model.inputs import Curve, driven
+from ep2sindy.model.solve import Border, Driven, Edge, Integration, edges_of, solve_stages
 from ep2sindy.model.vector_field import Equations, VectorField
 from ep2sindy.runtime.screen import one_screen, text_table
 
@@ -112,37 +112,6 @@ class Rollout:
         )
 
 
-def rollout(
-    model: Equations,
-    trajectory: Trajectory,
-    *,
-    start: int,
-    n_samples: int | None,
-    initial: Float[np.ndarray, " n_states"] | None,
-    blow_up: float,
-    rtol: float,
-    limit_s: float,
-) -> Rollout:
-    """Integrate a model along a trajectory; see `SparseModel.rollout`."""
-    stop = trajectory.n_samples if n_samples is None else start + n_samples
-    window = trajectory.window(start, stop)
-    data = window.columns(model.states)
-    inputs = window.columns(model.inputs)
-    found = _integrate(
-        model,
-        window.t,
-        data[0] if initial is None else initial,
-        drive=curve_through(window.t, inputs, list(map(model.courses.get, model.inputs))),
-        samples=inputs,
-        scale=np.abs(data).max(axis=0),
-        blow_up=blow_up,
-        bound="the data's largest value",
-        rtol=rtol,
-        limit_s=limit_s,
-    )
-    return replace(found, clock=trajectory.clock)
-
-
 def simulate(
     model: Equations,
     t: ArrayLike,
@@ -166,7 +135,7 @@ def simulate(
     # An input may begin at zero as well: its largest sample tells what it does to a state.
     driving = np.take_along_axis(samples, np.abs(samples).argmax(axis=0, keepdims=True), axis=0)
     sizes = start_scale(model, start, driving[0], float(times[-1] - times[0]))
-    return _integrate(
+    return integrate(
         model,
         times,
         start,
@@ -208,9 +177,9 @@ def start_scale(
 
 
 def check_start(
-    states: Sequence[str], x0: ArrayLike | Mapping[str, float], *, hint: str = ""
+    states: Sequence[str], x0: ArrayLike | Mapping[str, float], *, name: str = "x0", hint: str = ""
 ) -> Float[np.ndarray, " n_states"]:
-    """Return x0, which may be a mapping, as an array.
+    """Return x0, which may be a mapping, as an array; name: by which an error calls it.
 
     Raises ValueError unless it has a finite number for each state.
     """
@@ -222,12 +191,12 @@ def check_start(
     if start.shape != (len(states),) or not np.isfinite(start).all():
         came = f"shape {start.shape}" if start.size > 8 else f"{start.tolist()}"
         raise ValueError(
-            f"x0 must give a finite number for each of {list(states)}: {came} came{hint}"
+            f"{name} must give a finite number for each of {list(states)}: {came} came{hint}"
         )
     return start
 
 
-def _integrate(
+def integrate(
     model: Equations,
     t: np.ndarray,
     x0: np.ndarray,
@@ -241,59 +210,43 @@ def _integrate(
     limit_s: float,
 ) -> Rollout:
     """Integrate from x0 over t in units of `scale`, until a scaled state exceeds `blow_up`."""
-    border = _border(model.field, np.append(x0, samples[0]), drive, scale)
-    if edge := border.beyond(t[0], x0 / scale):
+    y, border = x0 / scale, _border(model.field, np.append(x0, samples[0]), drive, scale)
+    if border and (edge := border(t[0], y)):
         message = f"the start, at t = {t[0]:.6g} s, is outside {edge.text}"
-        return _rollout_of(model, t[:1], x0[None], samples, message, edge.function.name)
-    found = solve_stages(
-        Driven(model.field.scaled(scale), drive),
-        border,
-        t,
-        x0 / scale,
-        stops=drive.stops,
-        blow_up=blow_up,
-        bound=bound,
-        rtol=rtol,
-        limit_s=limit_s,
-    )
-    return _rollout_of(
-        model,
-        found.t,
-        found.y * scale,
-        samples,
-        found.message,
-        found.edge.function.name if found.edge else "",
-        diverged=found.ended_early,
-    )
-
-
-def _rollout_of(
-    model: Equations,
-    t: np.ndarray,
-    states: np.ndarray,
-    samples: np.ndarray,
-    message: str,
-    outside: str = "",
-    *,
-    diverged: bool = True,
-) -> Rollout:
+        found = Integration(t[:1], y[None], -1, message, edge)
+    else:
+        found = solve_stages(
+            Driven(model.field.scaled(scale), drive),
+            t,
+            y,
+            border=border,
+            stops=drive.stops,
+            blow_up=blow_up,
+            bound=bound,
+            rtol=rtol,
+            limit_s=limit_s,
+        )
     return Rollout(
-        t=t,
-        states=states,
-        diverged=diverged,
-        message=message,
+        t=found.t,
+        states=found.y * scale,
+        diverged=found.ended_early,
+        message=found.message,
         state_names=tuple(model.states),
-        inputs=samples[: len(t)],
+        inputs=samples[: len(found.t)],
         input_names=tuple(model.inputs),
         units=model.units,
-        outside=outside,
+        outside=found.edge.function.name if found.edge else "",
     )
 
 
-def _border(field: VectorField, start: np.ndarray, drive: Curve, scale: np.ndarray) -> Border:
-    """Border of the domain of the functions that the equations use."""
+def _border(
+    field: VectorField, start: np.ndarray, drive: Curve, scale: np.ndarray
+) -> Border | None:
+    """Border of the domain of the functions that the equations use; None without an edge."""
+    edges = edges_of(field.library.functions, field.library.variables, start)
 
-    def values(t: float, y: np.ndarray) -> np.ndarray:
-        return np.append(y * scale, drive(t))
+    def first_beyond(t: float, y: np.ndarray) -> Edge | None:
+        values = np.append(y * scale, drive(t))
+        return next((edge for edge in edges if edge.margin(values) <= 0.0), None)
 
-    return Border(edges_of(field.library.functions, field.library.variables, start), values)
+    return first_beyond if edges else None

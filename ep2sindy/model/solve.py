@@ -1,8 +1,8 @@
 """Time integration with a budget of evaluations.
 
 Equations of products are integrated by compiled code, equations with functions by SciPy, and stiff
-equations by an implicit method. A run ends at the border of the domain of its model's functions,
-which `Border` finds.
+equations by an implicit method. A run ends at the edge of the domain of its model's functions:
+beyond it the rates are not finite, and no step gets across.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ STABLE = 2.0
 CALLS_PER_LOOK = 100_000
 
 Rates = Callable[[float, np.ndarray], np.ndarray]
+Border = Callable[[float, np.ndarray], "Edge | None"]
 Clock = Callable[[], float]  # seconds since an arbitrary origin
 
 
@@ -71,31 +72,47 @@ class Driven:
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class Integration:
     """States at the times that were reached, and how the run ended.
 
-    edge: the edge of the domain that the run left; None if it left none.
+    status: as in SciPy's `solve_ivp`, 0 at the end, 1 at an event and -1 if steps became too
+    small. edge: the edge of the domain that the run left; None if it left none. last_s, last: time
+    and state of the event, if there was one.
     """
 
     t: Float[np.ndarray, " samples"]
     y: Float[np.ndarray, "samples n_states"]
-    ended_early: bool
-    message: str
+    status: int
+    message: str = ""
     edge: Edge | None = None
+    last_s: float = np.nan
+    last: Float[np.ndarray, " n_states"] | None = None
+
+    @property
+    def ended_early(self) -> bool:
+        return self.status != 0
 
 
 @dataclass
 class Counted:
-    """Right-hand side with a budget of evaluations and time, and with its domain's border."""
+    """Right-hand side with bounds, and with a budget of evaluations and time.
+
+    border: the edge of the domain that a state lies beyond, where the rates are NaN; None for rates
+    that are defined everywhere. bound: the quantity that `blow_up` is a multiple of, in words.
+    """
 
     rates: Rates
-    border: Border
-    budget: int
-    clock: Clock
-    deadline: float
+    border: Border | None
     stops: Float[np.ndarray, " _"]
     n_bounded: int
-    began_s: float = np.inf
+    blow_up: float
+    bound: str
+    rtol: float
+    budget: int
+    clock: Clock
+    started: float
+    limit_s: float
+    began_s: float
     calls: int = 0
     look_at: int = FIRST_LOOK
     stiff: bool = False
@@ -105,11 +122,18 @@ class Counted:
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         self.calls += 1
-        if edge := self.border.beyond(t, y):
-            self.beyond, self.beyond_s = edge, t
-        elif t > self.beyond_s and np.isfinite(y).all():  # a shorter step stayed in the domain
+        if self.is_beyond(t, y):
+            return np.full(len(y), np.nan)
+        if t > self.beyond_s and np.isfinite(y).all():  # a shorter step stayed in the domain
             self.beyond = None
         return self.rates(t, y)
+
+    def is_beyond(self, t: float, y: np.ndarray) -> bool:
+        """True, and noted, for a state beyond an edge of the domain."""
+        edge = self.border(t, y) if self.border else None
+        if edge:
+            self.beyond, self.beyond_s = edge, t
+        return edge is not None
 
     def left_s(self, t: float, y: np.ndarray) -> float:
         """Integration time until the run is given up: when first called with no budget left."""
@@ -117,7 +141,8 @@ class Counted:
             if self.calls > self.look_at:
                 self.look_at *= 2
                 self.stiff = self._is_stiff(t, y)
-            if self.stiff or self.calls > self.budget or self.clock() > self.deadline:
+            late = self.clock() > self.started + self.limit_s
+            if self.stiff or self.calls > self.budget or late:
                 self.given_up_s = t
         return self.given_up_s - t
 
@@ -128,95 +153,75 @@ class Counted:
         return bool(fastest.real < -abs(fastest.imag) and abs(fastest) * step_s > STABLE)
 
 
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """Part of a run integrated by one method: states at the times reached, and why it stopped.
-
-    status: as in SciPy's `solve_ivp`, 0 at the end, 1 at an event and -1 if steps became too
-    small. last_s, last: time and state of the event, if there was one. crossed: true if the event
-    was the border of the equations' domain.
-    """
-
-    t: Float[np.ndarray, " samples"]
-    y: Float[np.ndarray, "samples n_states"]
-    status: int
-    message: str = ""
-    last_s: float = np.nan
-    last: Float[np.ndarray, " n_states"] | None = None
-    crossed: bool = False
-
-
 def solve_stages(
     rates: Rates,
-    border: Border,
     t: Float[np.ndarray, " samples"],
     y: Float[np.ndarray, " n_states"],
     *,
+    border: Border | None = None,
     stops: Sequence[float] | Float[np.ndarray, " _"] = (),
-    blow_up: float,
-    bound: str,
+    blow_up: float = np.inf,
+    bound: str = "",
     rtol: float,
     limit_s: float,
     n_bounded: int | None = None,
     clock: Clock = monotonic,
-) -> Solved:
+) -> Integration:
     """Integrate from y over t, first explicitly, then implicitly if the equations are stiff.
 
     The run ends early if a state exceeds `blow_up`, leaves the domain or exhausts the budget.
     A `Driven` field of products is integrated by compiled functions. If stability limits the steps,
     an implicit method continues the run, with the same number of evaluations again.
-    stops: times among t at which the inputs jump or bend; every method starts anew there.
-    bound: the quantity that `blow_up` is a multiple of, in words. n_bounded: number of the first
-    states, which `blow_up` bounds; None for all. clock: measures `limit_s`.
+    border: see `Counted`. stops: times among t at which the inputs jump or bend; every method
+    starts anew there. bound: the quantity that `blow_up` is a multiple of, in words. n_bounded:
+    number of the first states, which `blow_up` bounds; None for all. clock: measures `limit_s`.
     """
-    began = clock()
-    budget = CALLS + CALLS_PER_SAMPLE * len(t)
+    budget, n_bounded = CALLS + CALLS_PER_SAMPLE * len(t), n_bounded or len(y)
     rhs = Counted(
-        rates, border, budget, clock, began + limit_s, np.asarray(stops),
-        len(y) if n_bounded is None else n_bounded, float(t[0]),
+        rates, border, np.asarray(stops), n_bounded, blow_up, bound, rtol, budget, clock, clock(),
+        limit_s, float(t[0]),
     )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore"):  # on the way to a blow-up
         if not np.isfinite(rhs(t[0], y)).all():
             text = f"the first step overflows: a rate at t = {t[0]:.6g} s is not finite"
-            return Solved(t[:1], y[None], True, text)
+            return Integration(t[:1], y[None], -1, text)
         compiled = isinstance(rates, Driven) and rates.is_compiled
-        explicit = _compiled_stage if compiled else _scipy_stage
-        found = explicit(rhs, t, y, blow_up, rtol)
-        if rhs.stiff:
-            return _implicit(found, rhs, t, blow_up, bound, rtol)
-    return _outcome(found, rhs, blow_up, bound, clock() - began)
+        found = _compiled_stage(rhs, t, y) if compiled else _scipy_stage(rhs, t, y)
+        return _continue_implicitly(found, rhs, t) if rhs.stiff else _explain_end(found, rhs)
 
 
-def _implicit(
-    before: Stage, rhs: Counted, t: np.ndarray, blow_up: float, bound: str, rtol: float
-) -> Solved:
+def _continue_implicitly(before: Integration, rhs: Counted, t: np.ndarray) -> Integration:
     """Continue a stiff run by the implicit method, and join both parts."""
-    began, at, state = rhs.clock(), before.last_s, before.last
+    at, state = before.last_s, before.last
     assert state is not None, "a run that is found to be stiff has been stopped there"
-    # began_s is left at infinity, so that this part is never taken for stiff.
-    rest = Counted(
-        rhs.rates, rhs.border, rhs.budget, rhs.clock, rhs.deadline, rhs.stops, rhs.n_bounded
+    # began_s at infinity: this part is never taken for stiff.
+    rest = replace(
+        rhs, began_s=np.inf, started=rhs.clock(), calls=0, stiff=False, given_up_s=np.inf
     )
+    rest.limit_s -= rest.started - rhs.started
     try:
-        found = _scipy_stage(rest, np.append(at, t[t > at]), state, blow_up, rtol, IMPLICIT)
+        found = _scipy_stage(rest, np.append(at, t[t > at]), state, IMPLICIT)
     except (ValueError, np.linalg.LinAlgError):  # raised for slopes that are not finite
         text = f"the equations are stiff, and overflow, at t = {at:.6g} s"
-        return Solved(before.t, before.y, True, text)
-    ended = _outcome(found, rest, blow_up, bound, rhs.clock() - began)
-    text = f"{ended.message}; stiff from t = {at:.6g} s on, and implicit there"
-    states = np.concatenate([before.y, ended.y[1:]])
-    times = np.append(before.t, ended.t[1:])
-    return Solved(times, states, ended.ended_early, text, ended.edge)
+        return replace(before, status=-1, message=text)
+    ended = _explain_end(found, rest)
+    return replace(
+        ended,
+        t=np.append(before.t, ended.t[1:]),
+        y=np.concatenate([before.y, ended.y[1:]]),
+        message=f"{ended.message}; stiff from t = {at:.6g} s on, and implicit there",
+    )
 
 
-def _scipy_stage(
-    rhs: Counted, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float, method: str = EXPLICIT
-) -> Stage:
+def _scipy_stage(rhs: Counted, t: np.ndarray, y: np.ndarray, method: str = EXPLICIT) -> Integration:
     """Integrate by one method of SciPy, from each stop of the inputs to the next."""
     places = [0, *(np.flatnonzero(np.isin(t[1:-1], rhs.stops)) + 1).tolist(), len(t) - 1]
     times, states = [t[:1]], [y[None]]
     for first, last in pairwise(places):
-        part = _smooth_stage(rhs, method, t[first : last + 1], states[-1][-1], blow_up, rtol)
+        if rhs.is_beyond(t[first], states[-1][-1]):  # inputs have jumped out of the domain
+            part = Integration(t[:0], y[None][:0], -1)
+            break
+        part = _smooth_stage(rhs, method, t[first : last + 1], states[-1][-1])
         times.append(part.t[1:])
         states.append(part.y[1:])
         if part.status:
@@ -224,10 +229,8 @@ def _scipy_stage(
     return replace(part, t=np.concatenate(times), y=np.concatenate(states))
 
 
-def _smooth_stage(
-    rhs: Counted, method: str, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float
-) -> Stage:
-    """Integrate between two stops; the first event is a blow-up or the end of the budget."""
+def _smooth_stage(rhs: Counted, method: str, t: np.ndarray, y: np.ndarray) -> Integration:
+    """Integrate between two stops; the event is a blow-up or the end of the budget."""
     from scipy.integrate import solve_ivp
 
     before_end = np.nextafter(t[-1], -np.inf)  # at a stop itself the inputs have jumped already
@@ -236,27 +239,24 @@ def _smooth_stage(
         return rhs(min(now, before_end), y)
 
     def ends(t: float, y: np.ndarray) -> float:
-        return min(blow_up - float(np.abs(y[: rhs.n_bounded]).max()), rhs.left_s(t, y))
+        return min(rhs.blow_up - float(np.abs(y[: rhs.n_bounded]).max()), rhs.left_s(t, y))
 
     ends.terminal = True  # type: ignore[attr-defined]
-    events = [ends, rhs.border] if rhs.border.edges else [ends]
     found = solve_ivp(
-        rates, (t[0], t[-1]), y, method=method, t_eval=t, events=events, rtol=rtol, atol=rtol
+        rates, (t[0], t[-1]), y, method=method, t_eval=t, events=ends, rtol=rhs.rtol, atol=rhs.rtol
     )
     # A solver that failed in its first step gives an empty list.
     states = np.asarray(found.y, dtype=np.float64).reshape(len(y), -1).T
-    times = np.asarray(found.t, dtype=np.float64)
-    met = [k for k, at in enumerate(found.t_events) if at.size] if found.status == 1 else []
-    if not met:
-        return Stage(times, states, found.status, found.message)
-    first = met[-1]  # a border takes precedence over a budget that ends in the same step
-    last_s, last = float(found.t_events[first][0]), found.y_events[first][0]
-    return Stage(times, states, found.status, found.message, last_s, last, crossed=first == 1)
+    solution = Integration(
+        np.asarray(found.t, dtype=np.float64), states, found.status, found.message
+    )
+    if found.status == 1:
+        last_s, last = float(found.t_events[0][0]), found.y_events[0][0]
+        return replace(solution, last_s=last_s, last=last)
+    return solution
 
 
-def _compiled_stage(
-    rhs: Counted, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float
-) -> Stage:
+def _compiled_stage(rhs: Counted, t: np.ndarray, y: np.ndarray) -> Integration:
     """Integrate by the compiled explicit method, which takes the same steps as SciPy's."""
     from ep2sindy.model import kernels
 
@@ -264,21 +264,21 @@ def _compiled_stage(
     equations, times, stops = rhs.rates.parts, np.array(t), np.append(rhs.stops, t[-1])
     now, state, out = float(t[0]), np.array(y), np.empty((len(t), len(y)))
     slope = rhs.rates(now, state)
-    h = _first_step(rhs.rates, now, float(t[-1]) - now, state, slope, rtol)
+    h = _first_step(rhs.rates, now, float(t[-1]) - now, state, slope, rhs.rtol)
     rhs.calls += 2
     place, status = 0, kernels.LOOK
     while status == kernels.LOOK and rhs.left_s(now, state) > 0.0:
         limit = min(rhs.look_at, rhs.budget, rhs.calls + CALLS_PER_LOOK)
         status, now, h, place, rhs.calls = kernels.advance(
             equations, dormand_prince(), times, stops, out, state, slope, now, h, place, rhs.calls,
-            limit, rhs.n_bounded, blow_up, rtol,
+            limit, rhs.n_bounded, rhs.blow_up, rhs.rtol,
         )  # fmt: skip
     if status == kernels.FINISHED:
-        return Stage(times, out, 0)
+        return Integration(times, out, 0)
     if status == kernels.FAILED:
         text = "Required step size is less than spacing between numbers."
-        return Stage(times[:place], out[:place], -1, text)
-    return Stage(times[:place], out[:place], 1, "", now, state)
+        return Integration(times[:place], out[:place], -1, text)
+    return Integration(times[:place], out[:place], 1, last_s=now, last=state)
 
 
 def _first_step(
@@ -308,36 +308,28 @@ def fastest_rate(rates: Rates, t: float, y: np.ndarray) -> complex:
     return complex(values[np.argmax(np.abs(values))])
 
 
-def _outcome(found: Stage, rhs: Counted, blow_up: float, bound: str, took_s: float) -> Solved:
-    edge = _left(found, rhs)
-    message = _text(found, rhs, blow_up, bound, took_s)
-    if edge:
-        at = found.t[-1] if len(found.t) else np.nan
-        message = f"the run left {edge.text}, at t = {at:.6g} s"
-    return Solved(found.t, found.y, found.status != 0, message, edge)
-
-
-def _left(found: Stage, rhs: Counted) -> Edge | None:
-    """Edge at which a run ended, if any: crossed, or too steep for the solver to cross."""
-    if found.crossed and found.last is not None:
-        return rhs.border.nearest(found.last_s, found.last)
-    return rhs.beyond if found.status == -1 else None
-
-
-def _text(found: Stage, rhs: Counted, blow_up: float, bound: str, took_s: float) -> str:
+def _explain_end(found: Integration, rhs: Counted) -> Integration:
+    """The solution with the edge at which it ended, if any, and with its end in words."""
+    edge = rhs.beyond if found.status == -1 else None
     last = found.t[-1] if len(found.t) else float("nan")
+    message = f"the run left {edge.text}, at t = {last:.6g} s" if edge else _text(found, rhs, last)
+    return replace(found, message=message, edge=edge)
+
+
+def _text(found: Integration, rhs: Counted, last: float) -> str:
     if found.status == 0:
         return f"integrated to t = {last:.6g} s"
-    if found.status == 1 and np.isfinite(rhs.given_up_s):
-        if rhs.calls > rhs.budget:
-            return (
-                f"the solver gave up at t = {rhs.given_up_s:.6g} s, after {rhs.calls} evaluations "
-                "of the equations: its steps became too small for the samples"
-            )
-        return f"the solver gave up at t = {rhs.given_up_s:.6g} s, after {took_s:.3g} s of work"
-    if found.status == 1:
-        return f"a state grew past {blow_up:g} times {bound} at t = {last:.6g} s"
-    return f"the solver stopped at t = {last:.6g} s: {found.message}"
+    if found.status == -1:
+        return f"the solver stopped at t = {last:.6g} s: {found.message}"
+    if not np.isfinite(rhs.given_up_s):
+        return f"a state grew past {rhs.blow_up:g} times {rhs.bound} at t = {last:.6g} s"
+    gave_up = f"the solver gave up at t = {rhs.given_up_s:.6g} s, after"
+    if rhs.calls > rhs.budget:
+        return (
+            f"{gave_up} {rhs.calls} evaluations of the equations: its steps became too small for "
+            "the samples"
+        )
+    return f"{gave_up} {rhs.clock() - rhs.started:.3g} s of work"
 
 
 # Edges at which a run leaves the domain of its model's functions, such as x = 0 for log(x).
@@ -377,30 +369,3 @@ def edges_of(
         if interval is None or np.isfinite(interval).any():
             edges.append(Edge(function, place, interval))
     return tuple(edges)
-
-
-@dataclass(frozen=True)
-class Border:
-    """All edges of a model along one run, as a terminal event for a solver.
-
-    values: function of time in s and scaled states; returns states and inputs in SI.
-    """
-
-    edges: tuple[Edge, ...]
-    values: Callable[[float, np.ndarray], np.ndarray]
-    terminal: bool = True
-
-    def __call__(self, t: float, y: np.ndarray) -> float:
-        at = self.values(t, y)
-        return min(edge.margin(at) for edge in self.edges)
-
-    def nearest(self, t: float, y: np.ndarray) -> Edge:
-        at = self.values(t, y)
-        return min(self.edges, key=lambda edge: edge.margin(at))
-
-    def beyond(self, t: float, y: np.ndarray) -> Edge | None:
-        """First edge that the state lies beyond; None if there is none."""
-        if not self.edges:
-            return None
-        at = self.values(t, y)
-        return next((edge for edge in self.edges if edge.margin(at) <= 0.0), None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -11,11 +12,11 @@ from jaxtyping import Complex, Float
 from ep2sindy.model.draws import starts_around
 from ep2sindy.model.kernels import approach
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.rollout import simulate, start_scale
+from ep2sindy.model.rollout import check_start, simulate, start_scale
 from ep2sindy.model.runge_kutta import CLASSICAL, step
-from ep2sindy.model.solve import Border, Driven, solve_stages
+from ep2sindy.model.solve import Driven, solve_stages
 from ep2sindy.model.vector_field import VectorField, entries_of
-from ep2sindy.runtime.values import check_positive, read_only
+from ep2sindy.runtime.values import check_positive, locked, read_only
 
 # A multiplier whose modulus is this close to one counts as neutral: a departure then takes at least
 # a thousand periods to change e-fold, longer than any record. The multipliers themselves are exact
@@ -65,8 +66,7 @@ class LimitCycle:
     model: SparseModel = field(repr=False)
 
     def __post_init__(self) -> None:
-        multipliers = np.array(self.multipliers, dtype=np.complex128)
-        multipliers.flags.writeable = False
+        multipliers = locked(np.array(self.multipliers, dtype=np.complex128))
         object.__setattr__(self, "states", read_only(self.states))
         object.__setattr__(self, "multipliers", multipliers)
         check_positive("period_s", self.period_s)
@@ -110,14 +110,14 @@ def limit_cycle(
     Raises ValueError for a model with inputs, or a wrong start, period or number of samples.
     Source: Seydel 2010, Practical Bifurcation and Stability Analysis, chapter 7.
     """
-    start = np.asarray(start, dtype=np.float64)
-    _check_search(model, start, period_s=period_s, n_samples=n_samples)
-    run = _run(model, start, period_s=period_s, n_periods=RETURNS[1])
-    cycle = _cycle(model, run, period_s=period_s, n_samples=n_samples)
-    if run is not None and cycle is None:
-        run = _run(model, start, period_s=period_s, n_periods=N_SETTLING + RETURNS[1])
-        late = None if run is None else run[N_SETTLING * N_SAMPLES :]
-        cycle = _cycle(model, late, period_s=period_s, n_samples=n_samples)
+    _check_free(model)
+    start = check_start(model.states, start, name="start")
+    if not (np.isfinite(period_s) and period_s > 0.0):
+        raise ValueError(f"period_s must be a positive time in s: {period_s} came")
+    if n_samples < 8:
+        raise ValueError(f"n_samples must be 8 or more, to draw a cycle: {n_samples} came")
+    find = partial(_find_orbit, period_s=period_s, n_samples=n_samples)
+    cycle = find(model, start) or find(model, start, n_settling=N_SETTLING)
     if cycle is None:
         return _backwards(model, start, period_s=period_s, n_samples=n_samples)
     if cycle.stability is not CycleStability.REPELLING:
@@ -127,25 +127,12 @@ def limit_cycle(
     return _backwards(model, start, period_s=period_s, n_samples=n_samples) or cycle
 
 
-def _cycle(
-    model: SparseModel, run: np.ndarray | None, *, period_s: float, n_samples: int
-) -> LimitCycle | None:
-    """Cycle by Newton's method from the first state of a run; None also if the run diverged."""
-    if run is None:
-        return None
-    orbit = find_closed_orbit(model, run, period_s=period_s, n_samples=n_samples)
-    if orbit is None:
-        return None
-    return LimitCycle(orbit.period * period_s, orbit.states * orbit.scale, orbit.multipliers, model)
-
-
 def _backwards(
     model: SparseModel, start: np.ndarray, *, period_s: float, n_samples: int
 ) -> LimitCycle | None:
     """Cycle found in reversed time, converted to forward time."""
     reverse = replace(model, coef=-model.coef, covariance=None)
-    run = _run(reverse, start, period_s=period_s, n_periods=RETURNS[1])
-    cycle = _cycle(reverse, run, period_s=period_s, n_samples=n_samples)
+    cycle = _find_orbit(reverse, start, period_s=period_s, n_samples=n_samples)
     if cycle is None or not cycle.multipliers.all():
         return None
     inverse = 1.0 / cycle.multipliers
@@ -257,21 +244,6 @@ def _approach(
     return points[kept], t[kept], left[kept]
 
 
-def _check_search(
-    model: SparseModel, start: np.ndarray, *, period_s: float, n_samples: int
-) -> None:
-    _check_free(model)
-    if start.shape != (len(model.states),) or not np.isfinite(start).all():
-        raise ValueError(
-            f"start must give a finite number for each of {list(model.states)}: "
-            f"{start.tolist()} came"
-        )
-    if not (np.isfinite(period_s) and period_s > 0.0):
-        raise ValueError(f"period_s must be a positive time in s: {period_s} came")
-    if n_samples < 8:
-        raise ValueError(f"n_samples must be 8 or more, to draw a cycle: {n_samples} came")
-
-
 def _check_free(model: SparseModel) -> None:
     if model.inputs:
         raise ValueError(
@@ -338,32 +310,6 @@ STILL = 1e-3
 N_SAMPLES = 200
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedOrbit:
-    """A closed orbit over its least period, in units of `scale` and of the guessed period.
-
-    states: evenly spaced, the first not repeated. monodromy: derivatives of the state after one
-    period by the initial state. flow: right-hand side at the initial state.
-    """
-
-    period: float
-    states: Float[np.ndarray, "samples n_states"]
-    monodromy: Float[np.ndarray, "n_states n_states"]
-    flow: Float[np.ndarray, " n_states"]
-    scale: Float[np.ndarray, " n_states"]
-
-    @property
-    def multipliers(self) -> Complex[np.ndarray, " n_states"]:
-        """Floquet multipliers: 1 for the flow, then those across it by decreasing modulus.
-
-        The flow is an eigenvector for the multiplier 1. In a basis that begins with it the other
-        multipliers belong to a separate block, so rounding does not split a second multiplier of 1.
-        """
-        basis = np.linalg.qr(self.flow[:, None], mode="complete")[0]
-        others = np.linalg.eigvals((basis.T @ self.monodromy @ basis)[1:, 1:])
-        return np.append(1.0 + 0.0j, others[np.argsort(-np.abs(others), kind="stable")])
-
-
 def _run(
     model: SparseModel, start: Float[np.ndarray, " n_states"], *, period_s: float, n_periods: float
 ) -> Float[np.ndarray, "samples n_states"] | None:
@@ -376,25 +322,30 @@ def _run(
     return None if run.diverged else run.states
 
 
-def find_closed_orbit(
+def _find_orbit(
     model: SparseModel,
-    run: Float[np.ndarray, "samples n_states"],
+    start: Float[np.ndarray, " n_states"],
     *,
     period_s: float,
     n_samples: int,
-) -> ClosedOrbit | None:
-    """Closed orbit near the first state of a free run; its closest return starts the search.
+    n_settling: int = 0,
+) -> LimitCycle | None:
+    """Closed orbit over its least period, near where a free run is after periods of settling.
 
-    None if Newton's method does not close the orbit, or ends on a fixed point.
+    The closest return of the run starts Newton's method. None if the run diverges, or if Newton's
+    method does not close the orbit, or ends on a fixed point.
     """
+    run = _run(model, start, period_s=period_s, n_periods=n_settling + RETURNS[1])
+    if run is None:
+        return None
+    run = run[n_settling * N_SAMPLES :]
     scale = deviations(run)
     field = model.field.scaled(scale, period_s)
     departing = Driven(field.with_departures())
     first, last = (round(N_SAMPLES * r) for r in RETURNS)
     distance = np.linalg.norm((run[first : last + 1] - run[0]) / scale, axis=1)
-    closed = _close_orbit(
-        field, departing, run[0] / scale, float(first + distance.argmin()) / N_SAMPLES
-    )
+    period = float(first + distance.argmin()) / N_SAMPLES
+    closed = _close_orbit(field, departing, run[0] / scale, period)
     if closed is None:
         return None
     y, period = closed
@@ -408,8 +359,24 @@ def find_closed_orbit(
     path = _path(departing, y, np.linspace(0.0, period, n_samples + 1), rtol=FINAL_RTOL)
     if path is None or not (path[:-1, :n].std(axis=0) > STILL).any():
         return None
-    monodromy = path[-1, n:].reshape(n, n).T
-    return ClosedOrbit(period, _without_rounding(path[:-1, :n]), monodromy, field.rates(y), scale)
+    multipliers = _multipliers(path[-1, n:].reshape(n, n).T, field.rates(y))
+    return LimitCycle(
+        period * period_s, _without_rounding(path[:-1, :n]) * scale, multipliers, model
+    )
+
+
+def _multipliers(
+    monodromy: Float[np.ndarray, "n_states n_states"], flow: Float[np.ndarray, " n_states"]
+) -> Complex[np.ndarray, " n_states"]:
+    """Floquet multipliers: 1 for the flow, then those across it by decreasing modulus.
+
+    monodromy: derivatives of the state after one period by the initial state. flow: right-hand
+    side there, an eigenvector for the multiplier 1. In a basis that begins with it the other
+    multipliers belong to a separate block, so rounding does not split a second multiplier of 1.
+    """
+    basis = np.linalg.qr(flow[:, None], mode="complete")[0]
+    others = np.linalg.eigvals((basis.T @ monodromy @ basis)[1:, 1:])
+    return np.append(1.0 + 0.0j, others[np.argsort(-np.abs(others), kind="stable")])
 
 
 def deviations(states: Float[np.ndarray, "samples n_states"]) -> Float[np.ndarray, " n_states"]:
@@ -467,7 +434,6 @@ def _path(
     n = len(y)
     found = solve_stages(
         departing,
-        Border((), lambda t, y: y),
         times,
         np.append(y, np.eye(n)),
         blow_up=ORBIT_BLOW_UP + float(np.abs(y).max()),

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.units import SECONDS, Clock
@@ -147,15 +148,12 @@ def covariance_in(rows: Any) -> Float[np.ndarray, "_ _"]:
     if not all(type(value) in (int, float) for row in rows for value in row):
         raise ValueError("a covariance that is not of numbers")
     found = np.array(rows, dtype=np.float64).reshape(len(rows), len(rows))
-    variances = np.diag(found)
-    if not np.isfinite(found).all() or (variances < 0.0).any():
+    if not np.isfinite(found).all() or (np.diag(found) < 0.0).any():
         raise ValueError("a covariance that is not finite, or has a variance below zero")
-    std = np.sqrt(variances)
-    scale = np.outer(std, std)
-    known = scale > 0.0
-    correlation = np.divide(found, scale, out=np.zeros_like(found), where=known)
-    if (found[~known] != 0.0).any() or not np.allclose(correlation, correlation.T, atol=ROUNDING):
-        raise ValueError("a covariance that is not symmetric, or of what does not vary")
-    if len(found) and np.linalg.eigvalsh(correlation).min() < -ROUNDING * len(found):
+    std = np.sqrt(zero_to_one(np.diag(found)))
+    correlation = found / np.outer(std, std)
+    if not np.allclose(correlation, correlation.T, atol=ROUNDING):
+        raise ValueError("a covariance that is not symmetric")
+    if np.linalg.eigvalsh(correlation).min(initial=0.0) < -ROUNDING * len(found):
         raise ValueError("a covariance that gives a combination of coefficients no variance")
     return found

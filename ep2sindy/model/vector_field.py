@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.library.library import Library
+from ep2sindy.library.units import Clock
 
 
 @runtime_checkable
@@ -37,6 +38,16 @@ class Equations(Protocol):
 
     @property
     def field(self) -> VectorField: ...
+
+    @property
+    def covariance(self) -> np.ndarray | None: ...
+
+    @property
+    def clock(self) -> Clock: ...
+
+    def terms(self, state: str) -> dict[str, float]: ...
+
+    def intervals(self, state: str) -> dict[str, tuple[float, float]]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +79,11 @@ class VectorField:
         Functions of other terms may be undefined at the states of the model. coefs: other
         coefficients of these terms; None takes the model's.
         """
-        used = np.flatnonzero(model.coef.any(axis=1))
-        if not len(used):
-            used = np.array([0])  # a library needs a term
+        coef = model.coef if coefs is None else coefs
+        used = coef.reshape(-1, *coef.shape[-2:]).any(axis=(0, 2))
+        used[0] |= not used.any()  # a library needs a term
         library = model.library.take(used).over([*model.states, *model.inputs])
-        return VectorField(library, (model.coef if coefs is None else coefs)[..., used, :])
+        return VectorField(library, coef[..., used, :])
 
     @property
     def n_states(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,7 +71,12 @@ def fit_law(
     >>> ep.operating.fit_law(shared, ep.polynomial(["a"], degree=1), parameters=at).law.parameters
     ('a',)
     """
-    at = _parameters_of(list(shared.models), parameters)
+    if set(parameters) != set(shared.models):
+        raise ValueError(
+            "every point needs parameters, and no other: the points are "
+            f"{list(shared.models)}, parameters came for {list(parameters)}"
+        )
+    at = {point: parameters[point] for point in shared.models}
     points = np.array([read_point(functions.variables, own) for own in at.values()])
     basis = make_basis(functions, points)
     fits = {s: _fit_equation(shared, s, basis) for s in shared.fronts}
@@ -86,17 +91,6 @@ def fit_law(
         "least squares",
     )
     return LawFit(law, {state: _test(each, shared, law, at) for state, each in fits.items()})
-
-
-def _parameters_of(
-    names: Sequence[str], parameters: Mapping[str, Mapping[str, float]]
-) -> dict[str, Mapping[str, float]]:
-    if set(parameters) != set(names):
-        raise ValueError(
-            f"every point needs parameters, and no other: the points are {names}, parameters "
-            f"came for {list(parameters)}"
-        )
-    return {name: parameters[name] for name in names}
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,15 +19,13 @@ from scipy.special import ndtri
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.library.equations import equation_text
-from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.relations import Constraint, Relation, constraint, relations_of
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
+from ep2sindy.model.storage import covariance_in, names_in, read_as, read_stored, texts_in
 from ep2sindy.operating.records import check_varying, point_label, read_point
 from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.files import read_json, write_text
-from ep2sindy.runtime.screen import words_of
 from ep2sindy.runtime.values import read_only
 
 FORMAT = "ep2sindy.OperatingLaw/1"
@@ -209,7 +207,7 @@ class OperatingLaw:
     @staticmethod
     def from_json(text: str) -> OperatingLaw:
         """Inverse of `to_json`, exact. Raises ValueError for anything else."""
-        try:
+        with read_as(f"a law file must hold {FORMAT} JSON"):
             content = read_json(text)
             if content["format"] != FORMAT:
                 raise ValueError(f"format {content['format']!r}")
@@ -225,10 +223,6 @@ class OperatingLaw:
                 units=texts_in(content["units"], "units"),
                 provenance=texts_in(content["provenance"], "provenance"),
             )
-        except UnknownFunctionError:
-            raise  # the file is valid, but a function in it must be registered before reading
-        except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
-            raise ValueError(f"a law file must hold {FORMAT} JSON: {words_of(error)}") from error
 
     def save(self, path: str | Path) -> None:
         write_text(Path(path), self.to_json())

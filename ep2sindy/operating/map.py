@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.model.fixed_point import eigenvalues, fixed_point
+from ep2sindy.model.fixed_point import rest_point
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import CycleStability, limit_cycle
@@ -118,12 +118,8 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, f
             fate = Fate.OSCILLATES if amplitude >= STILL else Fate.RESTS
     elif fate is Fate.RESTS:
         mean = late
-    scale = zero_to_one(record.cycle.std)
-    positive = record.run.states.min(axis=0) > 0.0
-    fixed = fixed_point(model, mean, scale=scale, positive=positive)
-    growth = np.nan
-    if fixed is not None:
-        growth = float(eigenvalues(model, fixed).real.max())
+    rest = rest_point(model, mean, record.cycle.std, record.run.states.min(axis=0) > 0.0)
+    growth = np.nan if rest is None else rest.growth_per_s
     if fate is Fate.DIVERGES and growth * period_s < -NEUTRAL:
         # The fixed point is stable, but the record's cycle lies outside its basin: the model rests.
         fate = Fate.RESTS

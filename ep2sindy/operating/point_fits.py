@@ -44,9 +44,6 @@ from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
 from ep2sindy.signals.spectrum import dominant_frequency, samples_in_periods
 
-# Directions that the rows of a draw hold to less than this share of their squares count as absent.
-UNSEEN = 1e-14
-
 MIN_BLOCKS = 5  # fewest blocks in a record: with fewer, draws differ too little from one another
 
 
@@ -136,108 +133,89 @@ def _fit_point(
 def _point_result(
     point: OperatingRecord, study: PointStudy, *, rng: np.random.Generator
 ) -> PointResult:
-    run = point.trajectory
+    run, status = point.trajectory, point.status
     if run is None:
-        return PointResult(point.parameters, point.status)
+        return PointResult(point.parameters, status)
+    if status == Oscillation.OSCILLATING:
+        status = oscillation(run.t, run.states)
     result = PointResult(
         parameters=point.parameters,
-        status=oscillation(run.t, run.states)
-        if point.status == Oscillation.OSCILLATING
-        else point.status,
+        status=status,
         n_samples=run.n_samples,
         dt_s=run.dt_s,
         f_Hz=dominant_frequency(run.t, run.states[:, 0]),
         spread=dict(zip(run.state_names, relative_spread(run.states).tolist(), strict=True)),
     )
-    if result.status != Oscillation.OSCILLATING:
+    if status != Oscillation.OSCILLATING:
         return result
-    period_s = 1.0 / result.f_Hz
     rows, *streams, last = rng.spawn(2 * len(study.cases) + 2)
     problems = study.formulation.assemble([run], study.library, rng=rows)
-    fits = {}
+    record, fits = _FittedRecord(run, problems, study, 1.0 / result.f_Hz), {}
     for k, (name, case) in enumerate(study.cases.items()):
-        fits[name] = _least_squares(run, problems, case, study, period_s, rng=streams[2 * k])
-        fits[name + REFINED] = _refined(
-            run, problems, case, study, period_s, start=fits[name].model, rng=streams[2 * k + 1]
+        fits[name] = record.fit(case, rng=streams[2 * k])
+        start = fits[name].model
+        fits[name + REFINED] = record.refine(case, start, rng=streams[2 * k + 1])
+    return replace(result, fits=fits, searched=record.search(rng=last))
+
+
+@dataclass(frozen=True, eq=False)
+class _FittedRecord:
+    """The record of one point with its rows and its period, to which every case is fitted."""
+
+    run: Trajectory
+    problems: Sequence[RegressionRows]
+    study: PointStudy
+    period_s: float
+
+    def fit(self, case: Case, *, rng: np.random.Generator) -> Fitted:
+        """Least squares, with intervals and covariance from a bootstrap in blocks of time."""
+        run, problems, bootstrap = self.run, self.problems, self.study.bootstrap
+        provenance = {"formulation": repr(self.study.formulation), "trajectories": run.label}
+        model = constrained_fit(problems, case.constraint, units=run.units, provenance=provenance)
+        n_groups = len(np.unique(np.concatenate([p.groups[~p.test] for p in problems])))
+        group_s = (run.t[-1] - run.t[0]) / n_groups
+        draws = resample_coefficients(
+            problems,
+            case.constraint,
+            model,
+            block=max(1, round(bootstrap.periods * self.period_s / group_s)),
+            n_draws=bootstrap.n_draws,
+            rng=rng,
         )
-    return replace(result, fits=fits, searched=_search_point(run, study, rng=last))
-
-
-def _least_squares(
-    run: Trajectory,
-    problems: Sequence[RegressionRows],
-    case: Case,
-    study: PointStudy,
-    period_s: float,
-    *,
-    rng: np.random.Generator,
-) -> Fitted:
-    """Least squares of a case, with intervals and covariance from a bootstrap in blocks of time."""
-    provenance = {"formulation": repr(study.formulation), "trajectories": run.label}
-    model = constrained_fit(problems, case.constraint, units=run.units, provenance=provenance)
-    n_groups = len(np.unique(np.concatenate([p.groups[~p.test] for p in problems])))
-    group_s = (run.t[-1] - run.t[0]) / n_groups
-    draws = resample_coefficients(
-        problems,
-        case.constraint,
-        model,
-        block=max(1, round(study.bootstrap.periods * period_s / group_s)),
-        n_draws=study.bootstrap.n_draws,
-        rng=rng,
-    )
-    coef = read_coefficients(model, case.constraint)
-    covariance = np.atleast_2d(np.cov(draws[:, coef != 0.0], rowvar=False))
-    estimates, drawn = estimate_from_draws(
-        coef, draws, case.quantities, case.constraint, study.library
-    )
-    return Fitted(
-        model=replace(model, covariance=covariance),
-        status=FITTED,
-        r2=_r2(problems, model),
-        estimates=estimates,
-        draws=drawn,
-    )
-
-
-def _refined(
-    run: Trajectory,
-    problems: Sequence[RegressionRows],
-    case: Case,
-    study: PointStudy,
-    period_s: float,
-    *,
-    start: SparseModel,
-    rng: np.random.Generator,
-) -> Fitted:
-    """The case's coefficients, refined so that integrated windows follow the data."""
-    samples = samples_in_periods(study.refining.periods, frequency_Hz=1.0 / period_s, dt_s=run.dt_s)
-    settings = RefinementSettings(
-        n_windows=study.refining.n_windows,
-        window=int(np.clip(samples, MIN_SAMPLES, run.n_samples)),
-        method=MultipleShooting(max_iter=study.refining.max_iter),
-        constraint=case.constraint,
-    )
-    found = refine(start, [run], settings, seed=rng)
-    known = found.model.covariance is not None
-    return Fitted(
-        model=found.model,
-        status=found.status,
-        r2=_r2(problems, found.model),
-        loss=found.loss,
-        estimates=estimate_from_covariance(
-            found.model, case.quantities, case.constraint, study.library
+        coef = read_coefficients(model, case.constraint)
+        covariance = np.atleast_2d(np.cov(draws[:, coef != 0.0], rowvar=False))
+        estimates, drawn = estimate_from_draws(
+            coef, draws, case.quantities, case.constraint, self.study.library
         )
-        if known
-        else {},
-    )
+        model, r2 = replace(model, covariance=covariance), _r2(problems, model)
+        return Fitted(model, FITTED, r2, estimates=estimates, draws=drawn)
 
+    def refine(self, case: Case, start: SparseModel, *, rng: np.random.Generator) -> Fitted:
+        """The case's coefficients, refined so that integrated windows follow the data."""
+        run, how = self.run, self.study.refining
+        samples = samples_in_periods(how.periods, frequency_Hz=1.0 / self.period_s, dt_s=run.dt_s)
+        settings = RefinementSettings(
+            n_windows=how.n_windows,
+            window=int(np.clip(samples, MIN_SAMPLES, run.n_samples)),
+            method=MultipleShooting(max_iter=how.max_iter),
+            constraint=case.constraint,
+        )
+        found = refine(start, [run], settings, seed=rng)
+        estimates = {}
+        if found.model.covariance is not None:
+            estimates = estimate_from_covariance(
+                found.model, case.quantities, case.constraint, self.study.library
+            )
+        r2 = _r2(self.problems, found.model)
+        return Fitted(found.model, found.status, r2, loss=found.loss, estimates=estimates)
 
-def _search_point(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -> Fitted:
-    found = discover(run, study.searched, study.method, seed=rng)
-    fronts = found.fronts.values()
-    problems = list(dict.fromkeys(front.problem for front in fronts if front.problem is not None))
-    no_rows = dict.fromkeys(found.model.states, float("nan"))  # a search of trajectories has none
-    return Fitted(model=found.model, status=SEARCHED, r2=no_rows | _r2(problems, found.model))
+    def search(self, *, rng: np.random.Generator) -> Fitted:
+        """The model that the study's method chooses."""
+        found = discover(self.run, self.study.searched, self.study.method, seed=rng)
+        fronts = found.fronts.values()
+        problems = list(dict.fromkeys(f.problem for f in fronts if f.problem is not None))
+        no_rows = dict.fromkeys(found.model.states, float("nan"))  # of a search of trajectories
+        return Fitted(found.model, SEARCHED, no_rows | _r2(problems, found.model))
 
 
 def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from typing import Unpack
 
 import numpy as np
 import torch
@@ -12,14 +13,13 @@ from jaxtyping import Float
 from torch import nn
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.judge import RefinementStatus, is_flat, status_of
+from ep2sindy.refinement.judge import RefinementStatus, is_flat, rollout, status_of
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
-from ep2sindy.refinement.methods.gradient_descent import trajectories as integrate
 from ep2sindy.refinement.ode import ScaledEquations
 from ep2sindy.refinement.problem import (
     Iteration,
+    RefinementChanges,
     RefinementFit,
     RefinementProblem,
     RefinementSettings,
@@ -97,17 +97,11 @@ def refine_with_correction(
     correction: nn.Module,
     settings: RefinementSettings = SETTINGS,
     *,
-    n_windows: int | None = None,
-    window: int | None = None,
-    periods: float | None = None,
-    method: GradientDescent | None = None,
-    constraint: Constraint | None = None,
-    free_start: bool | None = None,
-    n_reweights: int | None = None,
     seed: int | np.random.Generator = 0,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
     progress: Progress | bool = False,
+    **changes: Unpack[RefinementChanges],
 ) -> Corrected:
     """Train x' = model + correction(states, inputs) to follow windows of the trajectories.
 
@@ -116,57 +110,31 @@ def refine_with_correction(
     over the data. It is best zero initially (last layer of zeros), so that training starts from
     the known part. It is copied. Its initial weights come from the caller and are the only
     randomness besides the windows: seed them by torch.manual_seed.
-    n_windows to n_reweights: override `settings`, as in `refine`; no reweighting if left out.
-    window: begin with short ones, since a model that lacks a term can hardly follow long windows.
+    changes: any of the `settings`, as in `refine`; no reweighting if left out. Begin with a short
+    `window`, since a model that lacks a term can hardly follow long ones.
     method: None means GradientDescent(max_iter=60, tolerance=1e-3, patience=5). constraint:
     relations, or known coefficients that are kept fixed. Other arguments are as in `refine`.
     Raises ValueError as `refine`, for a correction of the wrong shape, and for another method. A
     failed fit is a result: see `status`.
     Source: Rackauckas et al. 2020, arXiv:2001.04385.
     """
-    settings = settings.override(
-        {
-            "n_windows": n_windows, "window": window, "periods": periods, "method": method,
-            "constraint": constraint, "free_start": free_start, "n_reweights": n_reweights,
-        }
-    )  # fmt: skip
-    with as_progress(progress).stage(None, "iteration", "refinement") as advance:
-        history, observe = record(callback, advance)
-        return _train(model, trajectories, correction, settings, seed, history, observe, device)
-
-
-def _train(
-    model: SparseModel,
-    trajectories: Sequence[Trajectory],
-    correction: nn.Module,
-    settings: RefinementSettings,
-    seed: int | np.random.Generator,
-    history: Sequence[Iteration],
-    observe: Callable[[Iteration], None],
-    device: str,
-) -> Corrected:
-    """Cut windows, train the model with its correction, and assemble the result."""
-    method = DESCENT if settings.method is None else settings.method
+    settings = settings.override(changes)
+    method = settings.method or DESCENT
     if not isinstance(method, GradientDescent):
         raise ValueError(f"a learned correction is trained by GradientDescent alone: {method} came")
     (batch,) = settings.cut([model], [trajectories], np.random.default_rng(seed))
-    known = RefinementProblem.of(
-        [model], [batch], [settings.constraint], free_start=settings.free_start,
-        n_reweights=settings.n_reweights, observe=observe, device=device,
-    )  # fmt: skip
-    rate = _typical_rate(known.equations[0], batch)
-    term = _Scaled(deepcopy(correction), rate).to(device, torch.float64)
-    _check_shape(term, known.equations[0], device)
-    problem = replace(known, correction=term)
-    return _result(
-        model,
-        correction,
-        known,
-        problem,
-        method.fit(problem),
-        history,
-        n_substeps=method.n_substeps,
-    )
+    with as_progress(progress).stage(None, "iteration", "refinement") as advance:
+        history, observe = record(callback, advance)
+        known = RefinementProblem.of(
+            [model], [batch], [settings.constraint], free_start=settings.free_start,
+            n_reweights=settings.n_reweights, observe=observe, device=device,
+        )  # fmt: skip
+        (equations,) = known.equations
+        term = _Scaled(deepcopy(correction), _typical_rate(equations, batch))
+        _check_shape(term.to(device, torch.float64), equations, device)
+        problem = replace(known, correction=term)
+        fit = method.fit(problem)
+    return _result(model, correction, known, problem, fit, history, method.n_substeps)
 
 
 def _result(
@@ -176,28 +144,31 @@ def _result(
     problem: RefinementProblem,
     fit: RefinementFit,
     history: Sequence[Iteration],
-    *,
     n_substeps: int,
 ) -> Corrected:
     """Result in SI; holds the model and term given if the fit did not stay finite."""
     (equations,), (batch,), term = problem.equations, problem.batches, problem.correction
-    nodes, window_loss, status = _judge(problem, fit, n_substeps)
-    trained = status is not RefinementStatus.NON_FINITE
-    scaling = fit.scaling[0] if trained else np.ones_like(fit.scaling[0])
     assert isinstance(term, _Scaled)
-    state_scale = batch.scale[: len(model.states)]
+    window_loss, status = _judge(problem, fit, n_substeps)
+    unchanged = replace(fit, scaling=np.ones_like(fit.scaling), nodes=known.data)
+    trained = status is not RefinementStatus.NON_FINITE
+    scaling = (fit if trained else unchanged).scaling[0]
+    path = rollout(known, unchanged, n_substeps=n_substeps)
+    with np.errstate(over="ignore", invalid="ignore"):
+        loss_before = float(np.square(path - known.data).mean())
+    size = batch.scale[: len(model.states)]
     return Corrected(
         model=with_coef(model, equations.relations, equations.coef(scaling))[0],
         correction=(term.inner if trained else deepcopy(correction)).to("cpu", torch.float64),
         scale=batch.scale,
-        rate=float(term.rate) * state_scale / batch.step_s,
-        loss_before=_loss_from_data(known, n_substeps),
+        rate=float(term.rate) * size / batch.step_s,
+        loss_before=loss_before if np.isfinite(loss_before) else float("inf"),
         loss=float(window_loss.mean()) if trained else float("inf"),
         window_loss=window_loss,
         status=status,
         history=tuple(history),
         batch=batch,
-        trajectories=nodes * state_scale,
+        trajectories=fit.nodes[0] * size,
     )
 
 
@@ -237,37 +208,23 @@ def _check_shape(term: nn.Module, known: ScaledEquations, device: str) -> None:
 
 def _judge(
     problem: RefinementProblem, fit: RefinementFit, n_substeps: int
-) -> tuple[np.ndarray, np.ndarray, RefinementStatus]:
-    """Trajectories in std, the loss of each window, and the most severe status that applies."""
-    nodes, data = fit.nodes[0], problem.data[0]
+) -> tuple[Float[np.ndarray, " windows"], RefinementStatus]:
+    """The loss of each window, and the most severe status that applies."""
     with np.errstate(over="ignore", invalid="ignore"):  # a blow-up is a status
-        window_loss = np.square(nodes - data).mean(axis=(1, 2))
+        window_loss = np.square(fit.nodes - problem.data)[0].mean(axis=(1, 2))
     loss = float(window_loss.mean())
-    allowed = max(ERROR_PER_RESIDUAL * np.sqrt(loss), MIN_ERROR)
+
+    def is_coarse() -> bool:
+        """True if half the time step changes the trajectories by much, rms in std."""
+        finer = rollout(problem, fit, n_substeps=2 * n_substeps)
+        error = np.sqrt(np.square(finer - fit.nodes).mean())
+        return not error < max(ERROR_PER_RESIDUAL * np.sqrt(loss), MIN_ERROR)
+
     status = status_of(
         finite=bool(fit.finite[0] and np.isfinite(loss)),
-        flat=is_flat(loss, data, free_start=problem.free_start),
+        flat=is_flat(loss, problem.data, free_start=problem.free_start),
         unidentifiable=False,  # the coefficients have no covariance
         settled=bool(fit.finished[0]),
-        coarse=lambda: not _step_error(problem, fit, n_substeps) < allowed,
+        coarse=is_coarse,
     )
-    return nodes, window_loss, status
-
-
-def _step_error(problem: RefinementProblem, fit: RefinementFit, n_substeps: int) -> float:
-    """Rms change of the trajectories, in std, under half the time step."""
-    nodes = fit.nodes[0]
-    problem.ode.set(fit.scaling, problem.whole)
-    start = torch.tensor(nodes[:, 0].copy(), device=problem.device)
-    with torch.no_grad():
-        finer = integrate(problem.ode, problem.whole, start, nodes.shape[1], 2 * n_substeps)
-    return float((finer - torch.tensor(nodes, device=problem.device)).square().mean().sqrt())
-
-
-def _loss_from_data(known: RefinementProblem, n_substeps: int) -> float:
-    """Loss of equations integrated over each window from the window's first sample."""
-    data = torch.tensor(known.data[0], device=known.device)
-    with torch.no_grad():
-        path = integrate(known.ode, known.whole, data[:, 0], data.shape[1], n_substeps)
-    loss = float((path - data).square().mean())
-    return loss if np.isfinite(loss) else float("inf")
+    return window_loss, status

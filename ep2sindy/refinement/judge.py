@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -122,15 +122,14 @@ def judge(
     blows up, all points that share its law count as not finite.
     """
     fit, maps = follow(problem, fit)
-    n_start, window = problem.n_start, fit.nodes.shape[2]
     sound = maps if fit.finite.all() else np.where(np.isfinite(maps), maps, 0.0)
-    condensed = condense(sound, fit.nodes, problem.data, fit.weights, window, n_start)
-    triangles = condensed[:, :, 0, n_start:, n_start:]
+    condensed = condense(sound, fit.nodes, problem.data, fit.weights, problem.n_start)
+    triangles = condensed[:, :, problem.n_start :, problem.n_start :]
     overflown = ~np.isfinite(triangles).all(axis=(1, 2, 3))
     triangles[overflown] = 0.0
     fit = replace(fit, finite=problem.agree(fit.finite & ~overflown, np.all))
     bias = least_change(step_triangles(problem, fit, sound), problem.law)
-    change = least_change(triangles[:, :, None], problem.law)
+    change = least_change(triangles, problem.law)
     points = np.arange(len(problem.equations))
     if problem.law is not None:
         rows = problem.law.rows(triangles)
@@ -162,7 +161,7 @@ def _judge_points(
     """
     data = problem.data[points]
     n_residuals = data.size - problem.n_start * len(rows) - law.n_theta
-    batch = _join_windows([problem.batches[p] for p in points])
+    batch = WindowBatch.join([problem.batches[p] for p in points])
     robust, naive = covariances(rows, batch, n_residuals=max(n_residuals, 1))
     with np.errstate(invalid="ignore", over="ignore"):
         left = np.concatenate([fit.nodes[p] - problem.data[p] for p in points])
@@ -184,22 +183,6 @@ def _judge_points(
         coarse=lambda: any(is_coarse(*step) for step in steps),
     )
     return RefinementVerdict(status, window_loss, robust, naive, explains)
-
-
-def _join_windows(batches: Sequence[WindowBatch]) -> WindowBatch:
-    """Join the windows of all points into one batch, to find overlaps; keeps the first scale."""
-    if len(batches) == 1:
-        return batches[0]
-    offset = np.cumsum([0, *(batch.trajectory.max() + 1 for batch in batches)])
-    numbers = [b.trajectory + int(k) for b, k in zip(batches, offset[:-1], strict=True)]
-    return replace(
-        batches[0],
-        steps=np.concatenate([batch.steps for batch in batches]),
-        data=np.concatenate([batch.data for batch in batches]),
-        inputs=np.concatenate([batch.inputs for batch in batches]),
-        trajectory=np.concatenate(numbers),
-        start=np.concatenate([batch.start for batch in batches]),
-    )
 
 
 def follow(problem: RefinementProblem, fit: RefinementFit) -> tuple[RefinementFit, np.ndarray]:
@@ -240,7 +223,7 @@ def close_gaps(
     nodes, the largest gap of every window (points, windows), in std, and the one-step maps.
     """
     nodes, points = fit.nodes.copy(), np.arange(len(fit.nodes))
-    start = np.zeros((*nodes.shape[:2], 1, nodes.shape[-1]))
+    start = np.zeros_like(nodes[:, :, 0])
     maps = fit.maps
     for _ in range(CLOSING_STEPS):
         if maps is None:
@@ -250,7 +233,7 @@ def close_gaps(
         is_open = np.isfinite(gaps) & ~(gaps < CLOSED)
         if not is_open.any():
             break
-        change = propagate(maps, nodes, start, np.zeros_like(fit.scaling), nodes.shape[2])
+        change = propagate(maps, nodes, start, np.zeros_like(fit.scaling))
         nodes[is_open] += change[is_open]
         maps = None
     if maps is None:
@@ -307,9 +290,8 @@ def step_triangles(problem: RefinementProblem, fit: RefinementFit, maps: np.ndar
     error = fit.step.finer(problem.ode, fit.nodes) - maps[..., -1]
     shifted = maps.copy()
     shifted[..., -1] = fit.nodes[:, :, 1:] + error
-    n_start, window = problem.n_start, fit.nodes.shape[2]
-    condensed = condense(shifted, fit.nodes, fit.nodes, fit.weights, window, n_start)
-    return condensed[..., n_start:, n_start:]
+    condensed = condense(shifted, fit.nodes, fit.nodes, fit.weights, problem.n_start)
+    return condensed[..., problem.n_start :, problem.n_start :]
 
 
 def is_stationary(

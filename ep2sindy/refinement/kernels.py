@@ -2,9 +2,8 @@
 
 maps: (points, windows, steps, n, n + p + 1): derivatives of the end of each step by its node and
 by the p scalings, then this end itself. nodes: (points, windows, samples, n).
-A block is a stretch of `block` samples with its own start. n_start is n if the starts are free,
-0 if they are fixed to the data. Columns of a condensed system: the block's start, the scalings,
-the right-hand side.
+n_start is n if the starts of the windows are free, 0 if they are fixed to the data. Columns of a
+condensed system: the window's start, the scalings, the right-hand side.
 """
 
 import numpy as np
@@ -72,154 +71,90 @@ def _advance(by: np.ndarray, nodes: np.ndarray, x: np.ndarray, new: np.ndarray) 
 
 
 def condense(
-    maps: np.ndarray,
-    nodes: np.ndarray,
-    data: np.ndarray,
-    weights: np.ndarray,
-    block: int,
-    n_start: int,
+    maps: np.ndarray, nodes: np.ndarray, data: np.ndarray, weights: np.ndarray, n_start: int
 ) -> np.ndarray:
-    """Triangular factors R of weights * (linearised trajectory - data), block by block.
+    """Triangular factors R of weights * (linearised trajectory - data), window by window.
 
     data: (points, windows, samples, n); weights: (points, n).
-    Returns (points, windows, blocks, columns, columns).
+    Returns (points, windows, columns, columns).
     """
-    n_points, n_windows, n_steps, n, width = maps.shape
-    n_columns, n_blocks = n_start + width - n, (n_steps + block) // block
-    out = np.zeros((n_points, n_windows, n_blocks, n_columns, n_columns))
-    columns, (x, new) = np.empty((n_columns, block * n)), np.empty((2, n, n_columns))
-    _condense(maps, nodes, data, weights, block, n_start, out, columns, x, new)
+    (n_points, n_windows, n_samples, n), width = nodes.shape, maps.shape[-1]
+    n_columns = n_start + width - n
+    out = np.zeros((n_points, n_windows, n_columns, n_columns))
+    columns, (x, new) = np.empty((n_columns, n_samples * n)), np.empty((2, n, n_columns))
+    _condense(maps, nodes, data, weights, n_start, out, columns, x, new)
     return out
 
 
 @compiled(**REORDERED)
-def _condense(maps, nodes, data, weights, block, n_start, out, columns, x, new):
+def _condense(maps, nodes, data, weights, n_start, out, columns, x, new):
     n_samples, (n, n_columns) = nodes.shape[2], x.shape
     for p in range(len(maps)):
         for w in range(maps.shape[1]):
-            for b in range(out.shape[2]):
-                first = b * block
-                last = min(first + block, n_samples)
-                # dx of the first node, by the start (the identity), the scalings (zero) and one.
+            # dx of the first node, by the start (the identity), the scalings (zero) and one.
+            for j in range(n):
+                for c in range(n_columns):
+                    x[j, c] = 0.0
+                if n_start:
+                    x[j, j] = 1.0
+                else:
+                    x[j, n_columns - 1] = data[p, w, 0, j] - nodes[p, w, 0, j]
+            for k in range(n_samples):
+                # Rows of the least squares: W (dx_k + x_k - data_k).
                 for j in range(n):
+                    row = k * n + j
                     for c in range(n_columns):
-                        x[j, c] = 0.0
-                    if n_start:
-                        x[j, j] = 1.0
-                    else:
-                        x[j, n_columns - 1] = data[p, w, first, j] - nodes[p, w, first, j]
-                for k in range(first, last):
-                    # Rows of the least squares: W (dx_k + x_k - data_k).
-                    for j in range(n):
-                        row = (k - first) * n + j
-                        for c in range(n_columns):
-                            columns[c, row] = weights[p, j] * x[j, c]
-                        columns[n_columns - 1, row] += weights[p, j] * (
-                            nodes[p, w, k, j] - data[p, w, k, j]
-                        )
-                    if k + 1 < last:
-                        _advance(maps[p, w, k], nodes[p, w, k + 1], x, new)
-                _triangle(columns, (last - first) * n, out[p, w, b])
-
-
-def triangles(rows: np.ndarray) -> np.ndarray:
-    """R of QR decompositions, (problems, size, size), of rows (problems, rows, size)."""
-    n_problems, n_rows, size = rows.shape
-    out = np.zeros((n_problems, size, size))
-    _triangles(rows, np.empty((size, n_rows)), out)
-    return out
-
-
-@compiled(**REORDERED)
-def _triangles(rows, columns, out):
-    for p in range(len(rows)):
-        for r in range(rows.shape[1]):
-            for c in range(rows.shape[2]):
-                columns[c, r] = rows[p, r, c]
-        _triangle(columns, rows.shape[1], out[p])
-
-
-@compiled(fastmath={"reassoc", "contract"})
-def squares(nodes: np.ndarray, data: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Sum of squares of weights (points, n) * (nodes - data), by point."""
-    out = np.zeros(len(nodes))
-    for p in range(len(nodes)):
-        ours, theirs = nodes[p].reshape(-1, nodes.shape[3]), data[p].reshape(-1, nodes.shape[3])
-        for j in range(nodes.shape[3]):
-            total = 0.0
-            for k in range(len(ours)):
-                total += (ours[k, j] - theirs[k, j]) ** 2
-            out[p] += weights[p, j] ** 2 * total
-    return out
-
-
-@compiled
-def gap_sizes(maps: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Root of the sum of squares of the gaps between ends of steps and nodes, and the largest gap.
-
-    (points,) each, NaN where a gap is.
-    """
-    n_points, n_windows, n_steps, n, width = maps.shape
-    norm, largest = np.empty(n_points), np.empty(n_points)
-    for p in range(n_points):
-        total = most = 0.0
-        for w in range(n_windows):
-            for k in range(n_steps):
-                for j in range(n):
-                    gap = maps[p, w, k, j, width - 1] - nodes[p, w, k + 1, j]
-                    total += gap * gap
-                    most = max(most, abs(gap))
-        norm[p] = np.sqrt(total)
-        largest[p] = total if np.isnan(total) else most  # a maximum may pass over NaN
-    return norm, largest
+                        columns[c, row] = weights[p, j] * x[j, c]
+                    off = nodes[p, w, k, j] - data[p, w, k, j]
+                    columns[n_columns - 1, row] += weights[p, j] * off
+                if k + 1 < n_samples:
+                    _advance(maps[p, w, k], nodes[p, w, k + 1], x, new)
+            _triangle(columns, n_samples * n, out[p, w])
 
 
 @compiled
 def starts(condensed: np.ndarray, change: np.ndarray, n: int) -> np.ndarray:
-    """Best change of each block's free start for a given change of the scalings (points, p).
+    """Best change of each window's free start for a given change of the scalings (points, p).
 
-    Returns (points, windows, blocks, n).
+    Returns (points, windows, n).
     """
-    n_points, n_windows, n_blocks, n_columns, _ = condensed.shape
-    out = np.empty((n_points, n_windows, n_blocks, n))
+    n_points, n_windows, n_columns, _ = condensed.shape
+    out = np.empty((n_points, n_windows, n))
     for p in range(n_points):
         for w in range(n_windows):
-            for b in range(n_blocks):
-                # Back substitution in R_start d_start = -(R_scaling d_scaling + r).
-                r = condensed[p, w, b]
-                for i in range(n - 1, -1, -1):
-                    total = -r[i, n_columns - 1]
-                    for c in range(n, n_columns - 1):
-                        total -= r[i, c] * change[p, c - n]
-                    for c in range(i + 1, n):
-                        total -= r[i, c] * out[p, w, b, c]
-                    out[p, w, b, i] = total / r[i, i]
+            # Back substitution in R_start d_start = -(R_scaling d_scaling + r).
+            r = condensed[p, w]
+            for i in range(n - 1, -1, -1):
+                total = -r[i, n_columns - 1]
+                for c in range(n, n_columns - 1):
+                    total -= r[i, c] * change[p, c - n]
+                for c in range(i + 1, n):
+                    total -= r[i, c] * out[p, w, c]
+                out[p, w, i] = total / r[i, i]
     return out
 
 
 @compiled
 def propagate(
-    maps: np.ndarray, nodes: np.ndarray, start: np.ndarray, change: np.ndarray, block: int
+    maps: np.ndarray, nodes: np.ndarray, start: np.ndarray, change: np.ndarray
 ) -> np.ndarray:
-    """Changes of the nodes that close the linearised defects inside each block.
+    """Changes of the nodes that close the linearised defects inside each window.
 
-    start: (points, windows, blocks, n), change of each block's first node; change: (points, p) and
-    more, of which the columns that the maps lack have no effect.
+    start: (points, windows, n), change of each window's first node; change: (points, p) and more,
+    of which the columns that the maps lack have no effect.
     """
     n_points, n_windows, n_steps, n, width = maps.shape
     out = np.empty(nodes.shape)
     for p in range(n_points):
         for w in range(n_windows):
-            for k in range(n_steps + 1):
-                if k % block == 0:
-                    out[p, w, k] = start[p, w, k // block]
-                    continue
-                # dx_k = F_x dx_(k-1) + F_s ds + the defect F(x_(k-1)) - x_k.
+            out[p, w, 0] = start[p, w]
+            for k in range(n_steps):
+                # dx_(k+1) = F_x dx_k + F_s ds + the defect F(x_k) - x_(k+1).
                 for j in range(n):
-                    total = maps[p, w, k - 1, j, width - 1] - nodes[p, w, k, j]
+                    total = maps[p, w, k, j, width - 1] - nodes[p, w, k + 1, j]
                     for v in range(n):
-                        total += maps[p, w, k - 1, j, v] * out[p, w, k - 1, v]
+                        total += maps[p, w, k, j, v] * out[p, w, k, v]
                     for i in range(width - 1 - n):
-                        total += maps[p, w, k - 1, j, n + i] * change[p, i]
-                    out[p, w, k, j] = total
+                        total += maps[p, w, k, j, n + i] * change[p, i]
+                    out[p, w, k + 1, j] = total
     return out

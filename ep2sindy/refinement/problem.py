@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypedDict, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -30,6 +30,18 @@ from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.runtime.values import read_only, set_counts
 
 Values = TypeVar("Values", bound=np.ndarray)
+
+
+class RefinementChanges(TypedDict, total=False):
+    """Fields of `RefinementSettings` as keywords of a function; None changes nothing."""
+
+    n_windows: int | None
+    window: int | None
+    periods: float | None
+    method: Method | None
+    constraint: Constraint | None
+    free_start: bool | None
+    n_reweights: int | None
 
 
 @dataclass(frozen=True)
@@ -76,9 +88,9 @@ class RefinementSettings:
                     "half"
                 )
 
-    def override(self, given: Mapping[str, Any]) -> RefinementSettings:
+    def override(self, given: RefinementChanges) -> RefinementSettings:
         """Copy of the settings, with the given values that are not None replaced."""
-        changes = {name: value for name, value in given.items() if value is not None}
+        changes: dict[str, Any] = {k: value for k, value in given.items() if value is not None}
         if changes.keys() & {"window", "periods"}:  # both set the length of a window
             changes = {"window": None, "periods": None} | changes
         return replace(self, **changes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast, overload
+from typing import Any, Unpack, cast, overload
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,10 +23,11 @@ from ep2sindy.refinement.judge import (
     follow_windows,
 )
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.ode import all_fixed, unconstrained
+from ep2sindy.refinement.ode import all_fixed
 from ep2sindy.refinement.problem import (
     Iteration,
     Method,
+    RefinementChanges,
     RefinementFit,
     RefinementProblem,
     RefinementSettings,
@@ -89,17 +90,11 @@ def refine(
     trajectories: Runs,
     settings: RefinementSettings = SETTINGS,
     *,
-    n_windows: int | None = None,
-    window: int | None = None,
-    periods: float | None = None,
-    method: Method | None = None,
-    constraint: Constraint | None = None,
-    free_start: bool | None = None,
-    n_reweights: int | None = None,
     seed: int | np.random.Generator = 0,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
     progress: Progress | bool = False,
+    **changes: Unpack[RefinementChanges],
 ) -> Refinement: ...
 
 
@@ -109,19 +104,13 @@ def refine(
     trajectories: Sequence[Sequence[Trajectory]],
     settings: RefinementSettings = SETTINGS,
     *,
-    n_windows: int | None = None,
-    window: int | None = None,
-    periods: float | None = None,
-    method: Method | None = None,
-    constraint: Constraint | None = None,
-    free_start: bool | None = None,
-    n_reweights: int | None = None,
     constraints: Sequence[Constraint | None] | None = None,
     points_per_batch: int = 8,
     seed: int | np.random.Generator = 0,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
     progress: Progress | bool = False,
+    **changes: Unpack[RefinementChanges],
 ) -> list[Refinement]: ...
 
 
@@ -131,27 +120,21 @@ def refine(
     trajectories: Runs | Sequence[Sequence[Trajectory]],
     settings: RefinementSettings = SETTINGS,
     *,
-    n_windows: int | None = None,
-    window: int | None = None,
-    periods: float | None = None,
-    method: Method | None = None,
-    constraint: Constraint | None = None,
-    free_start: bool | None = None,
-    n_reweights: int | None = None,
     constraints: Sequence[Constraint | None] | None = None,
     points_per_batch: int = 8,
     seed: int | np.random.Generator = 0,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
     progress: Progress | bool = False,
+    **changes: Unpack[RefinementChanges],
 ) -> Refinement | list[Refinement]:
     """Fit the free coefficients to windows spread over trajectories, by least squares.
 
     model: one model, or a list of models of the same states. trajectories: one run or a list, as
-    `discover` takes them; for a list of models a list each, and the result is a list. n_windows to
-    n_reweights: override `settings`, see there. constraints: for a list, the constraint of each
-    model or None, in place of `constraint`. points_per_batch: models integrated together, few
-    enough for the processor's cache; thousands on a GPU. progress: see `Progress`.
+    `discover` takes them; for a list of models a list each, and the result is a list. changes: any
+    of the `settings`, such as window=50, which they replace. constraints: for a list, the
+    constraint of each model or None, in place of `constraint`. points_per_batch: models integrated
+    together, few enough for the processor's cache; thousands on a GPU. progress: see `Progress`.
     Raises ValueError for a window that fits no trajectory, a missing variable, a model without
     terms, a constraint that leaves out one, or models that differ in their variables or the number
     of their windows. A failed fit is a result: see `status` and `message`.
@@ -160,10 +143,6 @@ def refine(
     >>> str(refined.status)
     'converged'
     """
-    changes = {
-        "n_windows": n_windows, "window": window, "periods": periods, "method": method,
-        "constraint": constraint, "free_start": free_start, "n_reweights": n_reweights,
-    }  # fmt: skip
     settings = settings.override(changes)
     models, records = _by_model(model, trajectories)
     relations = resolve_constraints(settings, models, constraints)
@@ -239,7 +218,7 @@ def _refine(
     )
     fit, verdicts = fit_and_judge(problem, settings.method or MultipleShooting())
     return [
-        _result(model, problem, fit, p, verdict, relations[p], history)
+        _result(model, problem, fit, p, verdict, history)
         for p, (model, verdict) in enumerate(zip(models, verdicts, strict=True))
     ]
 
@@ -254,15 +233,14 @@ def _result(
     fit: RefinementFit,
     point: int,
     verdict: RefinementVerdict,
-    constraint: Constraint | None,
     history: Sequence[Iteration],
 ) -> Refinement:
     """Result of one point, in SI and in the model's own order of coefficients."""
     batch, equations = problem.batches[point], problem.equations[point]
-    relations = unconstrained(model) if constraint is None else constraint
     finite = verdict.status is not RefinementStatus.NON_FINITE
     refined, naive = replace(model, covariance=None), None
     if finite:
+        relations = equations.relations
         values = equations.coef(fit.scaling[point, : equations.n_free])
         refined, order = with_coef(model, relations, values)
         by_scaling = (relations.C * equations.free0)[order]
@@ -341,18 +319,18 @@ def refine_batch(
     models finished.
     Raises ValueError for a model without terms.
     """
-    relations = [unconstrained(model) for model in models] if constraints is None else constraints
+    relations = [None] * len(models) if constraints is None else constraints
     refined: list[SparseModel] = []
     finished, losses = [], []
     for some in _chunks(len(models), points_per_batch):
-        chunk, relations_of = models[some], relations[some]
+        chunk = models[some]
         problem = RefinementProblem.of(
-            chunk, [batch] * len(chunk), relations_of, n_reweights=n_reweights
+            chunk, [batch] * len(chunk), relations[some], n_reweights=n_reweights
         )
         fit = method.fit(problem)
         for p, (model, equations) in enumerate(zip(chunk, problem.equations, strict=True)):
             values = equations.coef(fit.scaling[p, : equations.n_free])
-            moved, _ = with_coef(model, relations_of[p], values)
+            moved, _ = with_coef(model, equations.relations, values)
             refined.append(moved if fit.finite[p] else model)
         finished.append(fit.finished & fit.finite)
         with np.errstate(over="ignore", invalid="ignore"):

@@ -164,11 +164,11 @@ class HermiteSimpson:
         points, _, _, n = nodes.shape
         left, right = (nodes[:, :, cut].reshape(points, -1, n) for cut in (np.s_[:-1], np.s_[1:]))
         halves = np.stack([left, 0.5 * (left + right), right], axis=2)
-        start, still = np.zeros((points, left.shape[1], 1, n)), np.zeros((points, 0))
+        start, still = np.zeros_like(left), np.zeros((points, 0))
         whole, ode.drive = ode.drive, _half(ode.drive)
         for _ in range(NEWTON_STEPS):
             maps = self.maps(ode, halves, by_scaling=False)
-            change = propagate(maps, halves, start, still, 3)
+            change = propagate(maps, halves, start, still)
             halves = halves + change
             if not np.abs(change).max() > 1e-12:
                 break

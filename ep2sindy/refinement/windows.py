@@ -12,11 +12,14 @@ from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.inputs import curve_through
+from ep2sindy.runtime.values import locked
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum, steps_in
 
 PERIODS = 1.5  # default length of a window, in periods of the dominant frequency
 
 MIN_SAMPLES = 5  # fewest samples in a window; fewer do not determine the dynamics
+
+BY_WINDOW = ("steps", "data", "inputs", "trajectory", "start")  # fields with an entry per window
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +46,7 @@ class WindowBatch:
         for item in fields(self):
             value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
-                copy = value.copy()
-                copy.flags.writeable = False
-                object.__setattr__(self, item.name, copy)
+                object.__setattr__(self, item.name, locked(value.copy()))
 
     @property
     def multiplicity(self) -> float:
@@ -60,16 +61,20 @@ class WindowBatch:
     def split(self) -> list[WindowBatch]:
         """Split into batches of one window each, in the same scale."""
         return [
-            replace(
-                self,
-                steps=self.steps[[w]],
-                data=self.data[[w]],
-                inputs=self.inputs[[w]],
-                trajectory=self.trajectory[[w]],
-                start=self.start[[w]],
-            )
+            replace(self, **{name: getattr(self, name)[[w]] for name in BY_WINDOW})
             for w in range(len(self.start))
         ]
+
+    @staticmethod
+    def join(batches: Sequence[WindowBatch]) -> WindowBatch:
+        """The windows of all batches, no two of which share trajectories; keeps the first scale."""
+        offsets = np.cumsum([0, *(batch.trajectory.max() + 1 for batch in batches)])
+        apart = [
+            replace(batch, trajectory=batch.trajectory + offset)
+            for batch, offset in zip(batches, offsets[:-1], strict=True)
+        ]
+        joined = {name: np.concatenate([getattr(b, name) for b in apart]) for name in BY_WINDOW}
+        return replace(batches[0], **joined)
 
 
 def cut_windows(
@@ -90,7 +95,6 @@ def cut_windows(
     samples, or a missing variable.
     """
     rng = np.random.default_rng(rng)
-    _check_trajectories(trajectories)
     check_windows(n_windows, window)
     _check_room(trajectories, window)
     values = [trajectory.columns([*states, *inputs]) for trajectory in trajectories]
@@ -99,7 +103,9 @@ def cut_windows(
     spread, rms = joined[:, :n].std(axis=0), np.sqrt(np.square(joined[:, n:]).mean(axis=0))
     scale = zero_to_one(np.append(spread, rms))
     step_s = mean_step(*(each.t for each in trajectories))
-    stretches = _stretches(trajectories, window)
+    stretches = np.array(
+        [(j, *each) for j, run in enumerate(trajectories) for each in between_gaps(run.t)]
+    )  # trajectory, first and last sample (exclusive) of every stretch without a gap
     lengths = (stretches[:, 2] - stretches[:, 1]).tolist()
     piece, start = _places(lengths, n_windows, window, rng)
     index, start = stretches[piece, 0], start + stretches[piece, 1]
@@ -130,15 +136,13 @@ def dominant_window(
     length is the median over trajectories, and at most half of the longest stretch without a gap.
     Raises ValueError for no trajectory.
     """
-    _check_trajectories(trajectories)
-    samples = []
+    longest, samples = _longest(trajectories), []
     for each in trajectories:
         columns = each.columns(states).T
         sharpest = columns[int(np.argmax([_peak_share(each.t, column) for column in columns]))]
         frequency = dominant_frequency(each.t, sharpest)
         if frequency > 0.0:
             samples.append(steps_in(periods, frequency_Hz=frequency, dt_s=each.dt_s))
-    longest = _longest(trajectories)
     wanted = np.median(samples) if samples else longest / 2
     return int(np.clip(round(float(wanted)), min(10, longest), max(longest // 2, 10)))
 
@@ -159,13 +163,10 @@ def check_windows(n_windows: int, window: int | None) -> None:
         )
 
 
-def _check_trajectories(trajectories: Sequence[Trajectory]) -> None:
+def _longest(trajectories: Sequence[Trajectory]) -> int:
+    """Samples in the longest stretch without a gap; ValueError for no trajectory."""
     if not trajectories:
         raise ValueError("refinement needs at least one trajectory: none came")
-
-
-def _longest(trajectories: Sequence[Trajectory]) -> int:
-    """Samples in the longest stretch without a gap."""
     return max(stop - start for run in trajectories for start, stop in between_gaps(run.t))
 
 
@@ -176,13 +177,6 @@ def _check_room(trajectories: Sequence[Trajectory], window: int) -> None:
             f"a window must fit into a trajectory, between its gaps: {window} samples were asked "
             f"of at most {longest}; shorten it, or leave it out to have it chosen"
         )
-
-
-def _stretches(trajectories: Sequence[Trajectory], window: int) -> Int[np.ndarray, "pieces 3"]:
-    """Trajectory, first and last sample (exclusive) of every stretch without a gap."""
-    return np.array(
-        [(j, *each) for j, run in enumerate(trajectories) for each in between_gaps(run.t)]
-    )
 
 
 def _places(

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.model.solve import Border, solve_stages
+from ep2sindy.model.solve import solve_stages
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +76,8 @@ def _integrated(
     t = np.arange(round(system.duration_s * system.rate_Hz)) / system.rate_Hz
     found = solve_stages(
         lambda _, x: system.model.derivative(x, np.empty(0)),
-        Border((), lambda _, x: x),
         t,
         start.initial,
-        blow_up=np.inf,
-        bound="",
         rtol=1e-10,
         limit_s=60.0,
     )

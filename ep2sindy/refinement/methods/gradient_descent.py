@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from ep2sindy.refinement.ode import ODE, Drive
 from ep2sindy.refinement.problem import (
     Iteration,
     RefinementFit,
@@ -50,88 +49,63 @@ class GradientDescent:
         return
 
     def _fit_point(self, problem: RefinementProblem, point: int) -> RefinementFit:
-        ode, data = problem.ode, torch.tensor(problem.data[0], device=problem.device)
+        data = torch.tensor(problem.data[0], device=problem.device)
         start = nn.Parameter(data[:, 0].clone(), requires_grad=problem.free_start)
-        weights, used = np.ones((1, data.shape[-1])), np.ones((1, data.shape[-1]))
-        finished, path = False, data
-        for _ in range(problem.n_reweights + 1):
-            used = weights
-            finished = self.descend(
-                ode,
-                problem.whole,
-                data,
-                start,
-                weights[0],
-                observe=lambda loss: problem.observe(_iteration(point, data, ode, loss)),
-            )
+        weights = np.ones((1, data.shape[-1]))
+        for k in range(problem.n_reweights + 1):
+            if k:
+                weights = residual_weights(nodes, problem.data)
+            finished = self._descend(problem, point, start, weights[0])
             with torch.no_grad():
-                path = trajectories(ode, problem.whole, start, data.shape[1], self.n_substeps)
-            if not torch.isfinite(path).all():
+                nodes = self._integrate(problem, start)[None].cpu().numpy()
+            if not np.isfinite(nodes).all():
                 break
-            weights = residual_weights(path[None].cpu().numpy(), problem.data)
-        scaling = ode.scaling.detach().cpu().numpy().copy()
+        scaling = problem.ode.scaling.detach().cpu().numpy().copy()
         return RefinementFit(
             scaling=scaling,
-            nodes=path[None].cpu().numpy(),
-            weights=used,
+            nodes=nodes,
+            weights=weights,
             finished=np.array([finished]),
-            finite=np.array(
-                [bool(torch.isfinite(path).all()) and bool(np.isfinite(scaling).all())]
-            ),
+            finite=np.array([bool(np.isfinite(nodes).all() and np.isfinite(scaling).all())]),
             step=RungeKutta(self.n_substeps),
         )
 
-    def descend(
-        self,
-        ode: ODE,
-        drive: Drive,
-        data: torch.Tensor,
-        start: nn.Parameter,
-        weights: np.ndarray,
-        *,
-        observe: Callable[[float], None],
+    def _descend(
+        self, problem: RefinementProblem, point: int, start: nn.Parameter, weights: np.ndarray
     ) -> bool:
-        """Train every parameter of a module, and the starts if they require a gradient.
+        """Train every parameter of the module, and the starts if they require a gradient.
 
-        data: (windows, samples, n_states). Returns true if the loss has converged.
+        point: number by which it is reported. Returns true if the loss has converged.
         """
-        parameters = [*ode.parameters(), *([start] if start.requires_grad else [])]
-        optimizer = self.optimizer(parameters)
-        factor = torch.tensor(weights, device=data.device)
+        ode, data = problem.ode, torch.tensor(problem.data[0], device=problem.device)
+        optimizer = self.optimizer([*ode.parameters(), *([start] if start.requires_grad else [])])
+        factor = torch.tensor(weights, device=problem.device)
         losses: list[float] = []
 
         def closure() -> torch.Tensor:
             optimizer.zero_grad()
-            path = trajectories(ode, drive, start, data.shape[1], self.n_substeps)
-            loss = (factor * (path - data)).square().mean()
+            loss = (factor * (self._integrate(problem, start) - data)).square().mean()
             loss.backward()
             return loss
 
         for _ in range(self.max_iter):
             loss: Any = optimizer.step(closure)  # type: ignore[arg-type]
             losses.append(float(loss.detach()))
-            observe(losses[-1])
+            scaling = ode.scaling.detach().cpu().numpy()[0].copy()
+            problem.observe(Iteration(point, data.shape[1], losses[-1], scaling, 0.0, 0.0))
             if not np.isfinite(losses[-1]):
                 return False
             recent = losses[-self.patience - 1 :]
-            if (
-                len(recent) > self.patience
-                and recent[0] - min(recent) <= self.tolerance * recent[0]
-            ):
+            gained = recent[0] - min(recent)
+            if len(recent) > self.patience and gained <= self.tolerance * recent[0]:
                 return True
         return False
 
-
-def trajectories(
-    ode: ODE, drive: Drive, start: torch.Tensor, n_samples: int, n_substeps: int = 1
-) -> torch.Tensor:
-    """Trajectories (windows, samples, n_states) from starts (windows, n_states), differentiable."""
-    ode.drive = drive
-    column = start.T[None, None]
-    path = integrate(ode, column, n_segments=n_samples - 1, n_substeps=n_substeps)
-    return path[:, 0, 0].permute(2, 0, 1)
-
-
-def _iteration(point: int, data: torch.Tensor, ode: ODE, loss: float) -> Iteration:
-    scaling = ode.scaling.detach().cpu().numpy()[0].copy()
-    return Iteration(point, data.shape[1], loss, scaling, 0.0, 0.0)
+    def _integrate(self, problem: RefinementProblem, start: torch.Tensor) -> torch.Tensor:
+        """Trajectories (windows, samples, n_states) from starts (windows, n_states)."""
+        ode, n_segments = problem.ode, problem.data.shape[2] - 1
+        ode.drive = problem.whole
+        path = integrate(
+            ode, start.T[None, None], n_segments=n_segments, n_substeps=self.n_substeps
+        )
+        return path[:, 0, 0].permute(2, 0, 1)
