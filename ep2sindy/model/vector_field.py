@@ -80,7 +80,7 @@ class VectorField:
         coefficients of these terms; None takes the model's.
         """
         coef = model.coef if coefs is None else coefs
-        used = coef.reshape(-1, *coef.shape[-2:]).any(axis=(0, 2))
+        used = np.asarray(coef.reshape(-1, *coef.shape[-2:]).any(axis=(0, 2)))
         used[0] |= not used.any()  # a library needs a term
         library = model.library.take(used).over([*model.states, *model.inputs])
         return VectorField(library, coef[..., used, :])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -60,10 +61,9 @@ class WindowBatch:
 
     def split(self) -> list[WindowBatch]:
         """Split into batches of one window each, in the same scale."""
-        return [
-            replace(self, **{name: getattr(self, name)[[w]] for name in BY_WINDOW})
-            for w in range(len(self.start))
-        ]
+        values = {name: getattr(self, name) for name in BY_WINDOW}
+        numbers = range(len(self.start))
+        return [replace(self, **{k: v[[w]] for k, v in values.items()}) for w in numbers]
 
     @staticmethod
     def join(batches: Sequence[WindowBatch]) -> WindowBatch:
@@ -73,7 +73,9 @@ class WindowBatch:
             replace(batch, trajectory=batch.trajectory + offset)
             for batch, offset in zip(batches, offsets[:-1], strict=True)
         ]
-        joined = {name: np.concatenate([getattr(b, name) for b in apart]) for name in BY_WINDOW}
+        joined: dict[str, Any] = {
+            name: np.concatenate([getattr(b, name) for b in apart]) for name in BY_WINDOW
+        }
         return replace(batches[0], **joined)
 
 

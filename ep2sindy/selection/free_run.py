@@ -452,20 +452,21 @@ def run_over(
         run, x, cycle = records.runs[part.run], records.smoothed[part.run], cycles[part.run]
         per_period = steps_in(1.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
         first, n_samples = part.start, part.stop - part.start
-        if not inputs:
+        no_courses = [None] * len(inputs)
+        curve = curve_through(run.t, run.columns(inputs), no_courses) if inputs else None
+        if curve is None:
             n_samples = round(np.clip(n_samples, MIN_RUN * per_period, MAX_RUN * per_period))
             # Starts spread over as many periods, no two at the same phase.
             later = np.arange(n_starts) * (1.0 + 1.0 / n_starts) * per_period
             starts = np.minimum(first + later.round().astype(np.int64), part.stop - 1)
             t, begin = run.dt_s * np.arange(n_samples), cycle.waveform(cycle.phase[starts])
-            at = t, None, np.zeros(n_starts, dtype=np.int64)
+            times, begins = t, np.zeros(n_starts, dtype=np.int64)
         else:
             if n_samples < MIN_RUN * per_period:  # inputs end with the record
                 first, n_samples = 0, run.n_samples
             t, begin = run.t[first : first + n_samples], x[[first]]
-            curve = curve_through(run.t, run.columns(inputs), [None] * len(inputs))
-            at = run.t, curve, np.array([first])
-        steps = WindowSteps.along(*at, n_samples, N_SUBSTEPS)
+            times, begins = run.t, np.array([first])
+        steps = WindowSteps.along(times, curve, begins, n_samples, N_SUBSTEPS)
         paths = run_many(systems, begin, steps, centre=centre, reach=reach)
         for k in range(paths.shape[1]):
             yield t, paths[:, k], cycle

@@ -51,7 +51,7 @@ class GradientDescent:
     def _fit_point(self, problem: RefinementProblem, point: int) -> RefinementFit:
         data = torch.tensor(problem.data[0], device=problem.device)
         start = nn.Parameter(data[:, 0].clone(), requires_grad=problem.free_start)
-        weights = np.ones((1, data.shape[-1]))
+        nodes, weights = problem.data, np.ones((1, data.shape[-1]))
         for k in range(problem.n_reweights + 1):
             if k:
                 weights = residual_weights(nodes, problem.data)

@@ -372,7 +372,8 @@ def least_change(
         return least_squares(rows, damping)
     if not (np.abs(rows) < OVERFLOWING).all():
         return np.full(law.n_theta, np.nan)
-    rows = law.rows(np.linalg.qr(rows, mode="r")[:, None]).reshape(1, -1, law.n_theta + 1)
+    small = np.asarray(np.linalg.qr(rows, mode="r"))
+    rows = law.rows(small[:, None]).reshape(1, -1, law.n_theta + 1)
     return least_squares(rows, None if damping is None else damping[:1])[0]
 
 
@@ -384,7 +385,7 @@ def least_squares(rows: np.ndarray, damping: np.ndarray | None = None) -> np.nda
     The solution has the least norm if the rows do not determine a direction.
     """
     size = rows.shape[-1]
-    lost = ~(np.abs(rows) < OVERFLOWING).all(axis=(1, 2))
+    lost: np.ndarray = ~(np.abs(rows) < OVERFLOWING).all(axis=(1, 2))
     rows = np.where(lost[:, None, None], 0.0, rows)
     if damping is not None and damping.any():
         length = np.sqrt(np.square(rows[..., :-1]).sum(axis=1))
