@@ -13,6 +13,7 @@ from itertools import compress
 from math import log
 
 import numpy as np
+from jaxtyping import Float
 
 from ep2sindy.estimation.cost import OutOfTimeError
 from ep2sindy.estimation.likelihood import TrajectoryFit
@@ -28,7 +29,13 @@ from ep2sindy.estimation.observation import (
     shift_channels,
     suspect_delays,
 )
-from ep2sindy.estimation.problem import FIRST_MAX_TERMS, MIN_SAMPLES, ByState, EstimationProblem
+from ep2sindy.estimation.problem import (
+    FIRST_MAX_TERMS,
+    MIN_SAMPLES,
+    BySample,
+    ByState,
+    EstimationProblem,
+)
 from ep2sindy.estimation.process_noise import process_noise_words, solve_with_process_noise
 from ep2sindy.estimation.solver import (
     ENOUGH_SAMPLES,

@@ -186,8 +186,10 @@ def _own_squares(
     defects = -np.diff(path[:, one], axis=0)
     flow[record.breaks] = defects[record.breaks] = 0.0
     residuals, variance, _ = observe(record, path, np.square(fit.noise))
-    case = (np.ascontiguousarray(each[:, one]) for each in (residuals, variance, fit.process))
-    quadratic, linear, offset, _ = marginalise(flow, defects, *case, FREE_START)
+    values, noise, process = (
+        np.ascontiguousarray(each[:, one]) for each in (residuals, variance, fit.process)
+    )
+    quadratic, linear, offset, _ = marginalise(flow, defects, values, noise, process, FREE_START)
     tells = np.isfinite(np.diag(quadratic)) & np.isfinite(linear)
     pairs = np.isfinite(quadratic) & tells & tells[:, None]
     return Gram(np.where(pairs, quadratic, 0.0), np.where(tells, linear, 0.0), float(offset))
