@@ -33,7 +33,7 @@ from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, blocks_of, pointwise
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import ONE_BY_ONE, Dask, Workers

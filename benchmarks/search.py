@@ -33,7 +33,7 @@ import ep2sindy as ep
 from benchmarks.timing import cpu_s
 from ep2sindy.model.runge_kutta import step
 from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.front import ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso

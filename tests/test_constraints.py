@@ -16,10 +16,8 @@ from ep2sindy.library.relations import (
 )
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.constrained import constrained_fit
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential, RandomSplit, Weak
 from ep2sindy.regression.rows import Formulation, RegressionRows
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.weak import Weak
 from ep2sindy.systems.systems import lotka_volterra
 from tests.models import plain_rows
 

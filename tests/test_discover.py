@@ -13,13 +13,11 @@ from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.library.relations import relations_of
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential, Weak, WeightedWeak
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
-from ep2sindy.regression.weak import Weak, WeightedWeak
-from ep2sindy.selection.combinations import combinations
-from ep2sindy.selection.criteria import EBIC, Knee
+from ep2sindy.selection.criteria import EBIC, Knee, combinations
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.systems.systems import lotka_volterra
 from tests.rules import BySize

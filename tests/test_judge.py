@@ -11,8 +11,8 @@ import ep2sindy as ep
 from ep2sindy.data.trajectory import spread_blocks
 from ep2sindy.discovery import choice
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
-from ep2sindy.regression.test_functions import spectral_change_point
 from ep2sindy.regression.whitening import _covariance, _Sums
+from ep2sindy.regression.windows import spectral_change_point
 from tests.models import slopes_of
 
 

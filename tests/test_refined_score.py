@@ -11,8 +11,7 @@ from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_bat
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.selection import systems
-from ep2sindy.selection.combinations import MAX_ERROR
-from ep2sindy.selection.criteria import FLOOR
+from ep2sindy.selection.criteria import FLOOR, MAX_ERROR
 from ep2sindy.selection.refined import _refine
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, damped_oscillator

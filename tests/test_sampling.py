@@ -5,8 +5,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.test_functions import even_grid, is_even, keep_one_per_sample
 from ep2sindy.regression.whitening import whiten_rows
+from ep2sindy.regression.windows import even_grid, is_even, keep_one_per_sample
 from ep2sindy.systems.systems import System, van_der_pol
 
 EVERY_ROW = ep.Weak(split=ep.RandomSplit(0.0))

@@ -21,15 +21,13 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.constrained import constrained_fit
+from ep2sindy.regression.formulations import RandomSplit, Weak
 from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
 from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.whitening import NEGLIGIBLE, whiten_rows
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.combinations import cheapest_first, support_of
-from ep2sindy.selection.rule import Decision, OtherSystem, Selection
+from ep2sindy.selection.criteria import Decision, OtherSystem, Selection, cheapest_first, support_of
 
 # Most combinations, of the fronts that relations join, to look at for one with the terms.
 MAX_COMBINATIONS = 100_000

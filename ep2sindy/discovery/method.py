@@ -26,14 +26,13 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.roles import Roles
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
 from ep2sindy.regression.bootstraps import Bootstraps, Resamples, Supports, draw_resamples, pool
+from ep2sindy.regression.formulations import WeightedWeak
 from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.searches import BestSubset, Search
-from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.values import check_kind, set_counts
-from ep2sindy.selection.criteria import EBIC, Evidence
-from ep2sindy.selection.rule import Selection
+from ep2sindy.selection.criteria import EBIC, Evidence, Selection
 
 
 @dataclass(frozen=True, eq=False)

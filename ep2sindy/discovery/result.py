@@ -29,7 +29,7 @@ from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
-from ep2sindy.selection.rule import OtherSystem
+from ep2sindy.selection.criteria import OtherSystem
 
 FORMAT = "ep2sindy.Discovery/1"
 

@@ -12,9 +12,8 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.likelihood import Gram, within_bounds
 from ep2sindy.estimation.problem import EstimationProblem
-from ep2sindy.regression.exchanges import exchange_terms
 from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, invert_gram
-from ep2sindy.regression.searches import search_subsets
+from ep2sindy.regression.searches import exchange_terms, search_subsets
 
 MAX_SWEEPS = 10  # over the equations; two or three usually suffice
 # Weight of the cost of choosing among terms. Below 0.5 there are more false terms than true ones

@@ -22,8 +22,7 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_kind
-from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.rule import Selection
+from ep2sindy.selection.criteria import EBIC, Selection
 
 
 @dataclass(frozen=True, eq=False)

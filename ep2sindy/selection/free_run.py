@@ -28,9 +28,8 @@ from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
-from ep2sindy.selection.combinations import MAX_ERROR, score_combinations
+from ep2sindy.selection.criteria import MAX_ERROR, Basis, Decision, score_combinations
 from ep2sindy.selection.refined import RefinedScore
-from ep2sindy.selection.rule import Basis, Decision
 from ep2sindy.selection.systems import (
     Fold,
     Records,

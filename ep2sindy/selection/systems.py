@@ -19,9 +19,13 @@ from ep2sindy.refinement.refine import refine, with_coef
 from ep2sindy.refinement.steps import fastest_step
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.regression.front import Fronts
-from ep2sindy.selection.combinations import combinations, describe_left_out, support_of
-from ep2sindy.selection.criteria import FLOOR
-from ep2sindy.selection.rule import OtherSystem
+from ep2sindy.selection.criteria import (
+    FLOOR,
+    OtherSystem,
+    combinations,
+    describe_left_out,
+    support_of,
+)
 from ep2sindy.signals.kalman import KalmanSmoother
 
 # Most time steps, over windows and systems, of one refinement batch: more would not fit the cache.

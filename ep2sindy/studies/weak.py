@@ -17,10 +17,10 @@ from ep2sindy.discovery.choice import EquationFit, assemble_model, reweight
 from ep2sindy.library.library import Library
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.scores import r2
+from ep2sindy.regression.formulations import Weak
 from ep2sindy.regression.front import fit_support
 from ep2sindy.regression.rows import Formulation, RegressionRows
-from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
-from ep2sindy.regression.weak import Weak
+from ep2sindy.regression.windows import Boxes, Bumps, WindowFunctions
 from ep2sindy.report.document import Equation, Table, Text
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
