@@ -19,7 +19,7 @@ from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import Choice, choose, choose_system
+from ep2sindy.discovery.choice import IdentifiedEquations, choose, choose_system
 from ep2sindy.estimation.cost import check_limit_s
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
@@ -33,22 +33,6 @@ from ep2sindy.regression.searches import BestSubset, Search
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.values import check_kind, set_counts
 from ep2sindy.selection.criteria import EBIC, Evidence, Selection
-
-
-@dataclass(frozen=True, eq=False)
-class IdentifiedEquations:
-    """Result of applying a method to runs.
-
-    choice: the candidates of every equation, with their scores, and the model of the chosen ones.
-    ambiguities: terms that these data cannot tell apart, and warnings of too few rows for the
-    terms. remarks: sentences on where the samples deviate from the assumptions. estimate: of states
-    and coefficients together; None after a regression.
-    """
-
-    choice: Choice
-    ambiguities: Sequence[Ambiguity]
-    remarks: Sequence[str]
-    estimate: Estimate | None = None
 
 
 @dataclass(frozen=True)
@@ -147,8 +131,12 @@ class TrajectorySearch:
         found = self._estimate(task, progress)
         library = found.model.library  # with the terms of known equations
         task = replace(task, runs=found.runs, hidden=(), library=library)
-        choice = self._choose(found, task, progress)
-        return IdentifiedEquations(choice, _ambiguities_of_samples(task), found.remarks, found)
+        return replace(
+            self._choose(found, task, progress),
+            ambiguities=_ambiguities_of_samples(task),
+            remarks=found.remarks,
+            estimate=found,
+        )
 
     def _estimate(self, task: Task, progress: Progress) -> Estimate:
         provenance = self.provenance | _labels(task)
@@ -162,7 +150,7 @@ class TrajectorySearch:
             progress=progress,
         )
 
-    def _choose(self, found: Estimate, task: Task, progress: Progress) -> Choice:
+    def _choose(self, found: Estimate, task: Task, progress: Progress) -> IdentifiedEquations:
         """Candidates of every equation with their scores, and the model by the selection rule."""
         fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
         decision = self.selection.decide(fronts, task, progress=progress)
@@ -171,7 +159,9 @@ class TrajectorySearch:
             return replace(choice, model=replace(choice.model, courses=found.model.courses))
         scored = [front.with_scores(s) for front, s in zip(fronts, decision.scores, strict=True)]
         best = [front.best for front in scored]
-        return Choice(scored, best, found.model, found.note, constraint=found.constraint)
+        return IdentifiedEquations(
+            scored, best, found.model, found.note, constraint=found.constraint
+        )
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
@@ -195,22 +185,9 @@ def _front(
     kept = [support for k, support in ranked if k < depth or support.deviance == 0.0]
     if not kept or kept[0].coef:
         kept = [ScoredSupport({}, float("inf")), *kept]
-    return ParetoFront(state, [_candidate(state, support, library) for support in kept])
-
-
-def _candidate(state: str, support: ScoredSupport, library: Library) -> Candidate:
-    """A candidate without rows and bootstraps behind it."""
-    terms = tuple(name for name in library.names if name in support.coef)
-    return Candidate(
-        equation=state,
-        terms=terms,
-        coef=np.array([support.coef[name] for name in terms]),
-        r2_train=float("nan"),
-        r2_test=float("nan"),
-        share=float("nan"),
-        inclusion=np.full(len(terms), np.nan),
-        deviance=support.deviance,
-    )
+    ordered = [{name: s.coef[name] for name in library.names if name in s.coef} for s in kept]
+    pairs = zip(ordered, kept, strict=True)
+    return ParetoFront(state, [Candidate.of(state, coef, s.deviance) for coef, s in pairs])
 
 
 def _ambiguities_of_samples(task: Task) -> tuple[Ambiguity, ...]:
@@ -295,20 +272,22 @@ class Regression:
             )
         if any(run.missing is not None for run in task.runs):
             task = replace(task, runs=[run.complete() for run in task.runs])
-        if task.roles is not None:
-            return self._identify_under(task.roles, task, rng=rng, progress=progress)
-        equations = self.search_equations(task, rng=rng, progress=progress)
-        fronts = [equation.front for equation in equations]
-        choice = self.choose(fronts, task, progress=progress)
+        if task.roles is None:
+            equations = self.search_equations(task, rng=rng, progress=progress)
+            fronts = [equation.front for equation in equations]
+            choice = self.choose(fronts, task, progress=progress)
+        else:
+            choice = self._choose_under(task.roles, task, rng=rng, progress=progress)
         found: list[Ambiguity] = []
-        for rows in dict.fromkeys(front.rows for front in fronts):
+        for rows in dict.fromkeys(front.rows for front in choice.fronts):
             # Known equations are not searched, so too few rows do no harm to them.
             if not set(rows.equations) <= set(task.terms):
                 found += few_rows(rows)
             found += ambiguities(rows)
-        return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(task.runs))
+        remarks = _limits(task.runs)
+        return replace(choice, ambiguities=tuple(dict.fromkeys(found)), remarks=remarks)
 
-    def _identify_under(
+    def _choose_under(
         self, roles: Roles, task: Task, *, rng: np.random.Generator, progress: Progress
     ) -> IdentifiedEquations:
         """Search all equations at once for systems that keep the roles, and let the rule decide.
@@ -331,9 +310,7 @@ class Regression:
         systems = search_conserving_systems(problems, task, roles, self.search, depth=self.depth)
         decision = self.selection.judge(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)
-        choice = choose_system(systems.fronts, decision, task.runs, provenance=provenance)
-        found = [each for rows in problems for each in (*few_rows(rows), *ambiguities(rows))]
-        return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(task.runs))
+        return choose_system(systems.fronts, decision, task.runs, provenance=provenance)
 
     def search_equations(
         self, task: Task, *, rng: np.random.Generator | int, progress: Progress = SILENT
@@ -357,7 +334,7 @@ class Regression:
 
     def choose(
         self, fronts: Sequence[ParetoFront], task: Task, *, progress: Progress = SILENT
-    ) -> Choice:
+    ) -> IdentifiedEquations:
         """Select a candidate from every front, and fit it."""
         provenance = self.provenance | _labels(task)
         return choose(fronts, self.selection, task, provenance=provenance, progress=progress)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 
@@ -21,19 +21,35 @@ from ep2sindy.runtime.values import check_count
 ROWS_AT_ONCE = 4096  # rows whose residuals, of all fits, are held at once
 
 
+@dataclass(frozen=True)
+class LeftOver:
+    """Residuals of one equation on its rows, whitened by the noise that propagates into them.
+
+    chi_squared: per row, 1 if the residuals are nothing but noise. autocorrelation: of the
+    residuals of neighbouring rows, then 0. leaves_noise: True if chi_squared is consistent with
+    noise alone.
+    """
+
+    chi_squared: float
+    autocorrelation: float
+    leaves_noise: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """One support of one equation, with its fit.
 
-    coef: (terms of the support,), in SI. From a regression: least squares on the training rows;
-    from a search of trajectories: the most likely values given the other equations.
+    coef: (terms of the support,), in SI. From a regression: least squares on the training rows, or
+    weighted by their noise; from a search of trajectories: the most likely values given the other
+    equations.
     r2_train, r2_test: 1 - SS_res/SS_tot with the data as truth; NaN if there are no such rows.
     share: share of bootstraps that found this support. inclusion: for each of its terms, the share
     of bootstraps in which the term was in a support of this size. Both are NaN without bootstraps.
     deviance: -2 log likelihood of whole trajectories plus the penalty for the terms, relative to
     the best system; None if only rows were fitted.
     score: value of the selection rule, the lowest of the front being selected; NaN before
-    selection.
+    selection. covariance: (terms, terms) of coef after a weighted fit, in SI; None if the noise of
+    the rows is not known, or if the residuals exceed it. left: residuals of that fit.
     """
 
     equation: str
@@ -45,6 +61,15 @@ class Candidate:
     inclusion: Float[np.ndarray, " support"]
     deviance: float | None = None
     score: float = float("nan")
+    covariance: Float[np.ndarray, "support support"] | None = None
+    left: LeftOver | None = None
+
+    @staticmethod
+    def of(equation: str, coef: Mapping[str, float], deviance: float | None = None) -> Candidate:
+        """A candidate of these terms, without rows and bootstraps behind it."""
+        nan, terms = float("nan"), tuple(coef)
+        values, unknown = np.array([coef[term] for term in terms]), np.full(len(terms), np.nan)
+        return Candidate(equation, terms, values, nan, nan, nan, unknown, deviance)
 
     @property
     def n_terms(self) -> int:

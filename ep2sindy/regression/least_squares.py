@@ -32,17 +32,16 @@ Residuals = Callable[
 class LeastSquares:
     """The coefficients b of one support that fit its rows X to the target y.
 
-        minimise |y - X b|^2, with lower <= b <= upper where bounds are given
+        minimise |y - X b|^2
 
     Assumes residuals of equal variance, independent from row to row; then the covariance of b is
-    variance * root @ root.T. A coefficient at its bound is held there, without covariance.
+    variance * root @ root.T.
     A column depends on those before it if they leave DEPENDENT of its square or less. Then the rows
     do not determine b, and of all minimisers it is the least in columns of unit norm: directions
     whose square is DEPENDENT of the largest or less stay out. Units of columns do not matter.
-    squares: |y - X b|^2. rank: number of directions that the rows determine. held: mask of the
-    coefficients at a bound. upper: triangle R of the QR factors of the columns of unit norm.
-    Source: Bjorck 1996, Numerical Methods for Least Squares Problems, 1.3 and 2.7; for bounds
-    Stark & Parker 1995, Computational Statistics 10, 129.
+    squares: |y - X b|^2. rank: number of directions that the rows determine. upper:
+    triangle R of the QR factors of the columns of unit norm.
+    Source: Bjorck 1996, Numerical Methods for Least Squares Problems, 1.3 and 2.7.
 
     >>> t = np.linspace(0.0, 1.0, 9)
     >>> fit = ep.regression.LeastSquares.of_rows(np.column_stack([t, t**2]), 3.0 * t - t**2)
@@ -53,15 +52,12 @@ class LeastSquares:
     coef: Float[np.ndarray, " terms"]
     squares: float
     rank: int
-    held: Bool[np.ndarray, " terms"]
     norms: Float[np.ndarray, " terms"]
     upper: Float[np.ndarray, "terms terms"]
 
     @staticmethod
     def of_rows(
-        theta: Float[np.ndarray, "rows terms"],
-        target: Float[np.ndarray, " rows"],
-        bounds: Float[np.ndarray, "2 terms"] | None = None,
+        theta: Float[np.ndarray, "rows terms"], target: Float[np.ndarray, " rows"]
     ) -> LeastSquares:
         n, norms, size = theta.shape[1], column_norms(theta), np.linalg.norm(target) or 1.0
         columns = np.column_stack([theta / norms, target / size])
@@ -70,15 +66,11 @@ class LeastSquares:
         upper, right, beyond = triangle[:n, :n], triangle[:n, n], triangle[n:, n]
         is_whole = bool((np.square(np.diag(upper)) > DEPENDENT).all())
         coef, _, rank, _ = np.linalg.lstsq(upper, right, rcond=None if is_whole else CUTOFF)
-        held = np.zeros(n, dtype=np.bool_)
-        if bounds is not None and is_whole:
-            coef, held = _within(upper, right, coef, bounds * norms / size)
         squares = np.square(beyond).sum() + np.square(right - upper @ coef).sum()
         return LeastSquares(
             coef=coef * size / norms,
             squares=float(squares * size**2),
             rank=n if is_whole else int(rank),
-            held=held,
             norms=norms,
             upper=upper,
         )
@@ -91,31 +83,14 @@ class LeastSquares:
     @cached_property
     def root(self) -> Float[np.ndarray, "terms terms"]:
         """A root of the covariance of the coefficients, for rows of variance 1."""
-        root, cutoff = np.zeros_like(self.upper), 1e-15 if self.is_determined else CUTOFF
-        root[~self.held] = np.linalg.pinv(self.upper[:, ~self.held], rcond=cutoff)
-        return root / self.norms[:, None]
+        cutoff = 1e-15 if self.is_determined else CUTOFF
+        return np.linalg.pinv(self.upper, rcond=cutoff) / self.norms[:, None]
 
     @property
     def dependent(self) -> Bool[np.ndarray, " terms"]:
         """Mask of the terms that take part in a direction which the rows do not determine."""
         directions = np.linalg.svd(self.upper)[2][self.rank :]
         return (np.abs(directions) > 1e-3).any(axis=0)
-
-
-def _within(
-    upper: Float[np.ndarray, "n n"],
-    right: Float[np.ndarray, " n"],
-    free: Float[np.ndarray, " n"],
-    bounds: Float[np.ndarray, "2 n"],
-) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Coefficients within bounds, and which are at one; `free` are those without bounds."""
-    if ((bounds[0] < free) & (free < bounds[1])).all():
-        return free, np.zeros(len(free), dtype=np.bool_)
-    from scipy.optimize import lsq_linear  # import takes 0.5 s; most searches do not need it
-
-    solution = lsq_linear(upper, right, bounds=bounds, method="bvls", max_iter=10 * len(free) + 10)
-    assert solution.success
-    return solution.x, solution.active_mask != 0
 
 
 def fit_masks_to_rows(
