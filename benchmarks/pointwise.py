@@ -115,7 +115,7 @@ def plain_way(problem: RegressionRows, *, once: bool = False) -> None:
     """
     rng = np.random.default_rng(0)
     theta = problem.train_theta
-    for target in map(problem.train_target, range(len(problem.equations))):
+    for target in map(problem.scaled_target, range(len(problem.equations))):
         supports = []
         for _ in range(SEARCH.method.bootstraps.n):
             size = int(rng.uniform(0.2, 0.8) * len(theta))
@@ -131,7 +131,7 @@ def plain_way(problem: RegressionRows, *, once: bool = False) -> None:
 def ensemble_way(problem: RegressionRows) -> None:
     """PySINDy's bagging at ten thresholds, on columns that are scaled."""
     n_terms = len(problem.library)
-    theta, targets = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms:]
+    theta, targets = problem.train_columns.T[:, :n_terms], problem.train_columns.T[:, n_terms:]
     for threshold in np.geomspace(1e-3, 1.0, 10):
         optimizer = pysindy.EnsembleOptimizer(
             pysindy.STLSQ(threshold=threshold, alpha=0.0),

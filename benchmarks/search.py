@@ -54,7 +54,7 @@ def ours(problem: RegressionRows, rng: np.random.Generator) -> list[ParetoFront]
 def plain(
     problem: RegressionRows, rng: np.random.Generator, *, distinct: bool
 ) -> list[dict[int, tuple]]:
-    rows = problem.train_rows
+    rows = problem.train_columns.T
     n_terms = len(problem.library)
     theta, targets = rows[:, :n_terms], rows[:, n_terms:]
     supports: list[list[tuple[int, ...]]] = [[] for _ in problem.equations]
@@ -78,7 +78,7 @@ def plain_front(
     problem: RegressionRows, equation: int, supports: list[tuple[int, ...]]
 ) -> dict[int, tuple]:
     """Best support of every size by its error on the held-out rows."""
-    train, test = problem.train_rows, problem.test_columns.T
+    train, test = problem.train_columns.T, problem.test_columns.T
     target = len(problem.library) + equation
     best: dict[int, tuple] = {}
     for columns in map(list, supports):

@@ -82,8 +82,8 @@ def test_residuals_of_the_truth_are_white_where_samples_are_missing() -> None:
     runs = [thinned(system.trajectory(noise=0.02, rng=rng), rng) for _ in range(6)]
     for problem in assembled(system, runs):
         truth = system.model.terms(problem.equations[0])
-        mask = np.isin(problem.term_names, list(truth))
-        coef = np.array([truth.get(name, 0.0) for name in problem.term_names])
+        mask = np.isin(problem.library.names, list(truth))
+        coef = np.array([truth.get(name, 0.0) for name in problem.library.names])
         coef /= problem.coef_scale(0)
         rows = whiten_rows(problem, mask, coef, n_steps=0)
         residual = rows.target - rows.theta @ coef

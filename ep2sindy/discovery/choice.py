@@ -289,10 +289,10 @@ def whiten_terms(
     names = candidate.terms if terms is None else tuple(terms)
     order = [problem.library.index(name) for name in names]
     scale = problem.coef_scale(0)
-    own, coef = np.isin(problem.term_names, candidate.terms), np.zeros(len(scale))
+    own, coef = np.isin(problem.library.names, candidate.terms), np.zeros(len(scale))
     places = [problem.library.index(name) for name in candidate.terms]
     coef[places] = candidate.coef / scale[places]
-    kept = np.isin(problem.term_names, names)
+    kept = np.isin(problem.library.names, names)
     rows = whiten_rows(problem, own, coef, n_steps=N_STEPS, negligible=negligible, kept=kept)
     return rows.theta[:, order], rows.target, scale[order]
 

@@ -99,7 +99,7 @@ class TrajectorySearch:
     courses: Mapping[str, str] | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
-        set_counts(self, {"depth": 1} | ({} if self.max_terms is None else {"max_terms": 1}))
+        set_counts(self, {"depth": 1, "max_terms": 1})
         check_limit_s(self.limit_s)
         check_kind("selection", self.selection, Selection, "ep.Evidence()")
         if self.selection.basis == "rows":
@@ -389,24 +389,14 @@ def method_of(
             f"a search of trajectories draws no bootstraps: {bootstraps!r} came; take "
             "Bootstraps(n=0) (bootstraps=none), or a regression"
         )
-    plain = TrajectorySearch()
-    return replace(
-        search,
-        selection=_once("selection", search.selection, selection, plain.selection),
-        depth=_once("depth", search.depth, depth, plain.depth),
-    )
-
-
-def _once(name: str, own: Any, given: Any, default: Any) -> Any:
-    """A setting of the search, or what was given beside it: a config always has a value there.
-
-    Raises ValueError for a setting that the search has already, with another value.
-    """
-    if given == default:
-        return own
-    if own not in (default, given):
-        raise ValueError(
-            f"{name} must be set once: {own!r} came in the search (search.{name}), and "
-            f"{given!r} beside it; leave one of them out"
-        )
-    return given
+    set_here: dict[str, Any] = {}
+    for name, given in (("selection", selection), ("depth", depth)):
+        own, default = getattr(search, name), getattr(TrajectorySearch(), name)
+        if given != default:  # a config always has a value there
+            if own not in (default, given):
+                raise ValueError(
+                    f"{name} must be set once: {own!r} came in the search (search.{name}), and "
+                    f"{given!r} beside it; leave one of them out"
+                )
+            set_here[name] = given
+    return replace(search, **set_here)

@@ -87,9 +87,15 @@ class Function:
         with np.errstate(all="ignore"):
             return float(self.value(np.array([x]))[0])
 
-    def derivative(self) -> tuple[float, Function]:
+    @property
+    def is_variable(self) -> bool:
+        """True for the variable itself."""
+        return not self.kind.name
+
+    def derivative(self) -> tuple[float, Function | None]:
+        """Factor and function whose product is the derivative; None for the function one."""
         assert not self.is_slope, "second derivatives are never needed"
-        return self.scale, replace(self, is_slope=True)
+        return self.scale, None if self.is_variable else replace(self, is_slope=True)
 
     def scaled(self, scale: float) -> tuple[float, Function]:
         if self.kind.degree is None or not scale > 0.0:
@@ -173,6 +179,7 @@ def _of(name: str) -> Values:
 _POSITIVE: tuple[Interval, ...] = ((0.0, np.inf),)
 _POLE: tuple[Interval, ...] = ((-np.inf, 0.0), (0.0, np.inf))
 _BUILT_IN = (
+    Kind("", lambda x: x, lambda x: array_namespace(x).ones_like(x), degree=1.0),  # the identity
     Kind("sin", _of("sin"), _of("cos")),
     Kind("cos", _of("cos"), lambda x: -array_namespace(x).sin(x)),
     Kind("exp", _of("exp"), _of("exp"), ((-np.inf, LARGEST_EXPONENT),)),
@@ -189,11 +196,11 @@ INVERSE = "inverse"  # name that asks for the reciprocal of every variable
 
 def function_names() -> list[str]:
     """Names of all functions that terms may use, in the order of registration."""
-    return [INVERSE if name == RECIPROCAL else name for name in _kinds]
+    return [INVERSE if name == RECIPROCAL else name for name in _kinds if name]
 
 
 def function_of(part: Part) -> Function:
-    """Function that a part of a term's name stands for.
+    """Function that a part of a term's name stands for; of a variable alone the identity.
 
     Raises UnknownFunctionError, listing the known functions; ValueError if the variable is
     multiplied by zero, or a number is not finite.
@@ -209,6 +216,11 @@ def function_of(part: Part) -> Function:
     if not part.scale:
         raise ValueError(f"a function must be of its variable: {part.text!r} multiplies it by 0")
     return Function(_kinds[name], part.variable, part.scale, part.shift)
+
+
+def variable_factor(name: str) -> Function:
+    """The factor that is a variable itself."""
+    return Function(_kinds[""], name)
 
 
 def register_function(

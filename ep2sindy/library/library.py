@@ -14,12 +14,10 @@ from array_api_compat import array_namespace
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from ep2sindy.library.functions import Function
+from ep2sindy.library.functions import Function, variable_factor
 from ep2sindy.library.names import check_state
 from ep2sindy.library.terms import (
-    Factor,
     Term,
-    VariableFactor,
     check_degrees,
     check_exponents,
     check_values,
@@ -75,7 +73,7 @@ class Library:
 
     @cached_property
     def terms(self) -> tuple[Term, ...]:
-        factors: list[Factor] = [*map(VariableFactor, self.variables), *self.functions]
+        factors = [*map(variable_factor, self.variables), *self.functions]
         return tuple(
             product({f: p for f, p in zip(factors, row, strict=True) if p}, self.variables)
             for row in self.exponents.tolist()
@@ -262,14 +260,14 @@ def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:
     """Library of these terms in this order, without repetitions."""
     distinct = list(dict.fromkeys(terms))
     used = (factor for term in distinct for factor, _ in term.factors)
-    factors: list[Factor] = list(dict.fromkeys([*map(VariableFactor, variables), *used]))
+    factors = list(dict.fromkeys([*map(variable_factor, variables), *used]))
     check_exponents(len(distinct), len(factors))
     places = {factor: k for k, factor in enumerate(factors)}
     exponents = np.zeros((len(distinct), len(factors)), dtype=np.int64)
     for row, term in zip(exponents, distinct, strict=True):
         for factor, power in term.factors:
             row[places[factor]] = power
-    functions = [factor for factor in factors if isinstance(factor, Function)]
+    functions = [factor for factor in factors if not factor.is_variable]
     return Library(variables, exponents, functions)
 
 

@@ -115,7 +115,7 @@ class WeightedEquation:
             white = _whiten(self.problem, self.terms, coef / scale, n_steps=0)
             return white.theta[:, self.terms] / scale, white.target
         theta = self.problem.train_theta[:, self.terms] / self.std
-        return theta / scale, self.problem.train_target(self.number) / self.std
+        return theta / scale, self.problem.scaled_target(self.number) / self.std
 
 
 def _whiten(
@@ -147,7 +147,7 @@ def weigh_equations(
 def _fit_alone(
     problem: RegressionRows, number: int, at: np.ndarray, terms: np.ndarray
 ) -> WeightedEquation:
-    theta, target = problem.train_theta[:, terms], problem.train_target(number)
+    theta, target = problem.train_theta[:, terms], problem.scaled_target(number)
     fit = LeastSquares.of_rows(theta, target)
     variance = fit.squares / max(len(target) - len(terms), 1)
     least = MIN_RESIDUAL**2 * np.square(target).mean()

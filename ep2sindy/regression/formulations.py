@@ -373,7 +373,7 @@ class WeightedWeak:
             )
         everything = usable_terms(problem)
         coef = np.zeros(len(problem.library))
-        theta, target = problem.train_theta[:, everything], problem.train_target(0)
+        theta, target = problem.train_theta[:, everything], problem.scaled_target(0)
         coef[everything] = LeastSquares.of_rows(theta, target).coef
         white = whiten_rows(problem, everything, coef, n_steps=self.n_steps)
         # Whitened rows are in standard deviations; rescale to about the unit of the derivative.

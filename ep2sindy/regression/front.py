@@ -313,7 +313,7 @@ def _fit(problem: RegressionRows, supports: Supports) -> list[Candidate]:
     if problem.test.any():
         squares = _residual_squares(problem, equation, coef, test=True)
         r2_test = r2_of(squares, spread=_squares_about_mean(problem, equation, test=True))
-    names, coef_SI = np.array(problem.term_names), problem.coef_SI(coef, equation)
+    names, coef_SI = np.array(problem.library.names), coef * problem.coef_scale(equation)
     return [
         Candidate(
             equation=supports.equation,
@@ -330,8 +330,8 @@ def _fit(problem: RegressionRows, supports: Supports) -> list[Candidate]:
 
 def _squares_about_mean(problem: RegressionRows, equation: int, *, test: bool) -> float:
     """Sum of squares of a scaled target about its mean, exactly zero for a constant."""
-    values = problem.test_target(equation) if test else problem.train_target(equation)
-    values = values - values[0]
+    values = problem.scaled_target(equation, test=test)
+    values -= values[0]
     values -= values.mean()
     return float(values @ values)
 

@@ -77,7 +77,7 @@ def independent_terms(xx):
 
 
 @compiled(**WITHIN)
-def _extend(xx, mask, active, n_active, lower):
+def extend(xx, mask, active, n_active, lower):
     """Write the terms of a mask and their factor; returns how many, and whether they are so.
 
     active: n_active terms that have a row of the factor already. Masks in the order of
@@ -118,7 +118,7 @@ def fill_solutions(xx, rhs, masks, coef, lower, solution, active):
     n_active = np.int64(0)
     for m in range(len(masks)):
         # L L^T = G_S for the support S, then G_S b_S = rhs_S; b = 0 elsewhere.
-        n_active, solved = _extend(xx, masks[m], active, n_active, lower)
+        n_active, solved = extend(xx, masks[m], active, n_active, lower)
         for j in range(coef.shape[1]):
             coef[m, j] = 0.0 if solved else np.nan
         if solved:

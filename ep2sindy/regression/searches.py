@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, independent_terms, invert_gram
-from ep2sindy.regression.search_kernels import best_subsets, lasso_path
+from ep2sindy.regression.search_kernels import lasso_path, search_subsets, threshold_terms
 from ep2sindy.runtime.values import set_counts
 from ep2sindy.trust.memory import check_memory
 
@@ -61,7 +61,7 @@ class AdaptiveLasso:
     def __post_init__(self) -> None:
         if self.gamma <= 0.0:
             raise ValueError(f"gamma must be positive: {self.gamma} came")
-        set_counts(self, _where_set(self.max_terms))
+        set_counts(self, {"max_terms": 1})
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
         # Scaling each column by |b_ols|^gamma makes this a plain lasso. A term that depends on
@@ -81,13 +81,13 @@ class STLSQ:
     nearly orthogonal, so that a false one has a small coefficient from the first fit on: what is
     once dropped does not come back.
     Thresholds are fractions of the norm of the target, for columns of unit norm, spaced evenly in
-    the logarithm.
+    the logarithm. Where neighbours end at one support, it is given once.
     Source: Brunton, Proctor & Kutz 2016, doi:10.1073/pnas.1517384113; Zhang & Schaeffer 2019,
     doi:10.1137/18M1189828, for the objective.
 
     >>> xx, xy = np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([0.9, 0.3])
     >>> ep.STLSQ(lowest=0.1, highest=0.5, n_thresholds=3).supports(xx, xy, 1.0).tolist()
-    [[True, True], [True, True], [True, False]]
+    [[True, True], [True, False]]
     """
 
     lowest: float = 1e-4
@@ -101,18 +101,14 @@ class STLSQ:
                 "a threshold sweep needs 0 < lowest < highest: "
                 f"lowest={self.lowest}, highest={self.highest} came"
             )
-        set_counts(self, {"n_thresholds": 2} | _where_set(self.max_terms))
+        set_counts(self, {"n_thresholds": 2, "max_terms": 1})
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
-        thresholds, start = np.sqrt(yy) * self._shares[:, None], independent_terms(xx)
+        start, thresholds = independent_terms(xx), np.sqrt(yy) * self._shares
         # The first fit, of all terms, is the same at every threshold.
-        masks = start & (np.abs(fit_masks(xx, xy, start[None])) > thresholds)
-        changed = (masks != start).any(axis=1)
-        while changed.any():
-            before = masks[changed]
-            kept = before & (np.abs(fit_masks(xx, xy, before)) > thresholds[changed])
-            masks[changed] = kept
-            changed[changed] = (kept != before).any(axis=1)
+        masks = start & (np.abs(fit_masks(xx, xy, start[None])) > thresholds[:, None])
+        threshold_terms(xx, xy, thresholds, masks)
+        masks = masks[np.append(True, (masks[1:] != masks[:-1]).any(axis=1))]
         return masks[masks.sum(axis=1) <= (self.max_terms or len(xy))]
 
     @cached_property
@@ -165,7 +161,7 @@ class BestSubset:
         of its own variance and the same number of rows, this maximises the likelihood. No
         weights are needed, since the scale of one problem multiplies all products alike.
         """
-        found, proven = search_subsets(
+        found, proven = find_best_subsets(
             xx, xy, yy, max_terms=self.max_terms, n_best=self.n_best, most_work=MOST_WORK
         )
         if proven:
@@ -180,7 +176,7 @@ class BestSubset:
         return exchange_terms(xx, xy, yy, max_terms=self.max_terms, n_best=self.n_best, known=found)
 
 
-def search_subsets(
+def find_best_subsets(
     xx: Float[np.ndarray, "problems terms terms"],
     xy: Float[np.ndarray, "problems terms"],
     yy: Float[np.ndarray, " problems"],
@@ -202,15 +198,16 @@ def search_subsets(
     # Branches are cut sooner if the columns closest to the targets come first.
     order = np.argsort(-np.square(xy).sum(axis=0), kind="stable")
     ordered = xx.take(order, axis=1).take(order, axis=2), xy.take(order, axis=1), yy
-    found, proven = best_subsets(*ordered, max_terms, n_best, most_work)
+    size, best = n_terms + 1, np.empty((depth + 1, n_best))
+    best_masks = np.empty((depth + 1, n_best, n_terms), dtype=np.bool_)
+    chosen, following = np.empty((2, depth + 1), dtype=np.int64)
+    levels, smallest = np.empty((depth + 1, len(xy), size, size)), np.empty((len(xy), size))
+    scratch = levels, smallest, np.empty((size, size)), chosen, following
+    proven = search_subsets(*ordered, most_work, *scratch, best, best_masks)
+    found = best_masks[best < np.inf]
     masks = np.zeros_like(found)
     masks[:, order] = found
     return masks, proven
-
-
-def _where_set(max_terms: int | None) -> dict[str, int]:
-    """The least value of max_terms; nothing for None, which means all terms."""
-    return {} if max_terms is None else {"max_terms": 1}
 
 
 ROUNDING = 1e-14  # of the target's square: a smaller residual is rounding

@@ -91,7 +91,7 @@ def _join_rows(
             if not shares.any():
                 continue  # the whole equation is known
             fixed = np.array([known.get((state, term), 0.0) for term in library.names])
-            target = problem.train_target(k)
+            target = problem.scaled_target(k)
             theta = problem.train_theta
             left = target - theta @ LeastSquares.of_rows(theta, target).coef
             std = max(float(left.std()), MIN_RESIDUAL * float(np.sqrt(np.square(target).mean())))

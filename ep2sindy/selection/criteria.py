@@ -140,9 +140,9 @@ class EBIC:
         until the leader stays the same.
         """
         problem = front.rows
-        masks = np.array([np.isin(problem.term_names, c.terms) for c in front.candidates])
+        masks = np.array([np.isin(problem.library.names, c.terms) for c in front.candidates])
         equation = problem.equations.index(front.equation)
-        theta, target = problem.train_theta, problem.train_target(equation)
+        theta, target = problem.train_theta, problem.scaled_target(equation)
         n_rows, leader = float(len(target)), -1
         n_effective = (
             n_rows if self.coarsening is None else n_rows / (1.0 + n_rows / self.coarsening)
@@ -356,41 +356,6 @@ def describe_left_out(fronts: Fronts, n_tried: int, most: int) -> str:
     if n_tried < most or n_all <= most:
         return ""
     return f"; the {n_tried} most promising of {n_all} combinations were tried"
-
-
-def score_combinations(
-    fronts: Fronts,
-    places: Int[np.ndarray, "combinations fronts"],
-    errors: Float[np.ndarray, " combinations"],
-    *,
-    limit: float,
-    winner: int,
-) -> list[Float[np.ndarray, " _candidates"]]:
-    """Scores of candidates from the errors of their combinations.
-
-    limit: errors up to this value cannot be told from the least. winner: index of the combination
-    that is selected among them. A candidate's score is the least error of all
-    combinations with it, no less than the limit, or MAX_ERROR if there are none. The winner's
-    candidates score marginally below the limit.
-    """
-    scores = np.maximum(errors, limit)
-    scores[winner] = np.nextafter(limit, 0.0)
-    return [
-        np.array([scores[column == k].min(initial=MAX_ERROR) for k in range(len(front.candidates))])
-        for front, column in zip(fronts, places.T, strict=True)
-    ]
-
-
-def find_smallest(
-    fronts: Fronts,
-    places: Int[np.ndarray, "combinations fronts"],
-    errors: Float[np.ndarray, " combinations"],
-    *,
-    limit: float,
-) -> int:
-    """Index of the combination of fewest terms, then least error, among errors up to the limit."""
-    n_terms = sum(f.sizes[k] for f, k in zip(fronts, places.T, strict=True))
-    return int(np.lexsort((errors, n_terms, errors > limit))[0])
 
 
 def support_of(fronts: Fronts, choice: Int[np.ndarray, " fronts"]) -> dict[str, tuple[str, ...]]:

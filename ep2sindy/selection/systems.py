@@ -21,11 +21,13 @@ from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.regression.front import Fronts
 from ep2sindy.selection.criteria import (
     FLOOR,
+    MAX_ERROR,
     OtherSystem,
     combinations,
     describe_left_out,
     support_of,
 )
+from ep2sindy.signals.attractor import Cycle
 from ep2sindy.signals.kalman import KalmanSmoother
 
 # Most time steps, over windows and systems, of one refinement batch: more would not fit the cache.
@@ -139,6 +141,28 @@ class Systems:
     systems: Sequence[TrialSystem]
     left_out: str = ""
 
+    def score(
+        self, errors: Float[np.ndarray, " systems"], *, limit: float, winner: int
+    ) -> list[Float[np.ndarray, " _candidates"]]:
+        """Scores of candidates from the errors of their systems.
+
+        limit: errors up to this value cannot be told from the least. winner: index of the system
+        that is selected among them. A candidate's score is the least error of all systems with it,
+        no less than the limit, or MAX_ERROR if there are none. The winner's candidates score
+        marginally below the limit.
+        """
+        scores = np.maximum(errors, limit)
+        scores[winner] = np.nextafter(limit, 0.0)
+        return [
+            np.array([scores[at == k].min(initial=MAX_ERROR) for k in range(len(front.candidates))])
+            for front, at in zip(self.fronts, self.places.T, strict=True)
+        ]
+
+    def find_smallest(self, errors: Float[np.ndarray, " systems"], *, limit: float) -> int:
+        """Index of the system of fewest terms, then least error, among errors up to the limit."""
+        n_terms = sum(f.sizes[k] for f, k in zip(self.fronts, self.places.T, strict=True))
+        return int(np.lexsort((errors, n_terms, errors > limit))[0])
+
 
 def combine(fronts: Fronts, task: Task, *, most: int) -> Systems:
     """The combinations of candidates as systems, the most promising if there are more than `most`.
@@ -199,10 +223,11 @@ def plan_refinement(batch: WindowBatch, library: Library) -> tuple[MultipleShoot
 
 @dataclass(frozen=True, eq=False)
 class Records:
-    """The trajectories to judge equations on, with smoothed states."""
+    """The trajectories to judge equations on, with smoothed states, and the cycles of each."""
 
     runs: Sequence[Trajectory]
     smoothed: Sequence[Float[np.ndarray, "_ n_states"]]
+    cycles: Sequence[Cycle] = ()
 
 
 def smooth_records(fronts: Fronts, runs: Sequence[Trajectory]) -> Records:

@@ -223,7 +223,7 @@ def refit(
     for state, terms in published.items():
         if state in found.fronts:
             problem = problems[state]
-            at_hand = set(compress(problem.term_names, usable_terms(problem)))
+            at_hand = set(compress(problem.library.names, usable_terms(problem)))
             if set(terms) <= at_hand:
                 fits[state] = fit_support(problem, state, list(terms))
     return fits
