@@ -91,11 +91,7 @@ class Differential:
         check_kind("split", self.split, Split, "ep.RandomSplit()")
 
     def assemble(
-        self,
-        trajectories: Sequence[Trajectory],
-        library: Library,
-        *,
-        rng: np.random.Generator,
+        self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> tuple[RegressionRows, ...]:
         """Stack the rows of all trajectories; every row uses samples of one stretch without a gap.
 
@@ -187,11 +183,7 @@ class Weak:
             )
 
     def assemble(
-        self,
-        trajectories: Sequence[Trajectory],
-        library: Library,
-        *,
-        rng: np.random.Generator,
+        self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> tuple[RegressionRows, ...]:
         """Assemble one regression per state, since every state has its own windows.
 

@@ -13,12 +13,10 @@ from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
-from ep2sindy.regression.least_squares import fit_masks_to_rows
+from ep2sindy.regression.least_squares import Blocks, fit_masks_to_rows, sum_residuals
 from ep2sindy.regression.rows import Grams, RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
-
-ROWS_AT_ONCE = 4096  # rows whose residuals, of all fits, are held at once
 
 
 @dataclass(frozen=True)
@@ -303,15 +301,15 @@ def _fit(problem: RegressionRows, supports: Supports) -> list[Candidate]:
     equation, masks = problem.equations.index(supports.equation), supports.masks
     gram = problem.train_gram
 
-    def residuals(coef: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        left = np.zeros_like(coef)
-        return _residual_squares(problem, equation, coef, test=False, products=left), left
+    def blocks(*, test: bool = False) -> Blocks:
+        n_terms = len(problem.library)
+        return ((c[:n_terms], c[n_terms + equation]) for c in problem.blocks(test=test))
 
-    coef, squares = fit_masks_to_rows(gram.xx, gram.xy[equation], masks, residuals)
+    coef, squares = fit_masks_to_rows(gram.xx, gram.xy[equation], masks, blocks)
     r2_train = r2_of(squares, spread=_squares_about_mean(problem, equation, test=False))
     r2_test = np.full(len(coef), np.nan)
     if problem.test.any():
-        squares = _residual_squares(problem, equation, coef, test=True)
+        squares, _ = sum_residuals(coef, blocks(test=True))
         r2_test = r2_of(squares, spread=_squares_about_mean(problem, equation, test=True))
     names, coef_SI = np.array(problem.library.names), coef * problem.coef_scale(equation)
     return [
@@ -334,26 +332,3 @@ def _squares_about_mean(problem: RegressionRows, equation: int, *, test: bool) -
     values -= values[0]
     values -= values.mean()
     return float(values @ values)
-
-
-def _residual_squares(
-    problem: RegressionRows,
-    equation: int,
-    coef: Float[np.ndarray, "supports terms"],
-    *,
-    test: bool,
-    products: Float[np.ndarray, "_ terms"] | None = None,
-) -> Float[np.ndarray, " supports"]:
-    """Squares of every support's residual, on training or held-out rows.
-
-    products: if given, the products of the residuals and the terms are added.
-    """
-    squares, n_terms = np.zeros(len(coef)), len(problem.library)
-    for columns in problem.blocks(test=test):
-        for start in range(0, columns.shape[1], ROWS_AT_ONCE):
-            some = columns[:, start : start + ROWS_AT_ONCE]
-            left = some[n_terms + equation] - coef @ some[:n_terms]
-            squares += np.einsum("sr,sr->s", left, left)
-            if products is not None:
-                products += left @ some[:n_terms].T
-    return squares

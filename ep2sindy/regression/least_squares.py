@@ -6,7 +6,7 @@ rule, from Gram matrices (`gram_kernels`), and refined on the rows (`fit_masks_t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,10 +22,10 @@ REFINED = 1e-9
 # Share of the largest singular value of dependent columns below which a direction stays out.
 CUTOFF = float(np.sqrt(DEPENDENT))
 
-Residuals = Callable[
-    [Float[np.ndarray, "supports terms"]],
-    tuple[Float[np.ndarray, " supports"], Float[np.ndarray, "supports terms"]],
-]
+ROWS_AT_ONCE = 4096  # rows whose residuals, of all fits, are held at once
+
+# Columns of terms and targets of one equation, block by block.
+Blocks = Iterable[tuple[Float[np.ndarray, "terms _"], Float[np.ndarray, " _"]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,20 +97,34 @@ def fit_masks_to_rows(
     xx: Float[np.ndarray, "terms terms"],
     xy: Float[np.ndarray, " terms"],
     masks: Bool[np.ndarray, "supports terms"],
-    residuals: Residuals,
+    blocks: Callable[[], Blocks],
 ) -> tuple[Float[np.ndarray, "supports terms"], Float[np.ndarray, " supports"]]:
     """Coefficients of every support and the squares that they leave; NaN for dependent terms.
 
     The Gram matrix squares the condition number of the rows, so its solution is refined with the
     residuals of the rows themselves (Bjorck 1996, Numerical Methods for Least Squares, 2.9.3).
-    residuals: of coefficients, the squares of what they leave, and its products with the terms.
+    blocks: returns the rows, which are gone through once per step.
     """
     coef = fit_masks(xx, xy, masks)
     for _ in range(2):
-        squares, left = residuals(coef)
+        squares, left = sum_residuals(coef, blocks())
         step = solve_masks(xx, left, masks)
         coef += step
         squares = squares - (step * (2.0 * left - step @ xx)).sum(axis=1)  # what the step explains
         if not (np.abs(step) > REFINED * np.abs(coef).max(axis=1, keepdims=True)).any():
             break  # the next step would be as much smaller again
     return coef, squares
+
+
+def sum_residuals(
+    coef: Float[np.ndarray, "supports terms"], blocks: Blocks
+) -> tuple[Float[np.ndarray, " supports"], Float[np.ndarray, "supports terms"]]:
+    """Squares of every support's residual, and the products of the residuals and the terms."""
+    squares, products = np.zeros(len(coef)), np.zeros_like(coef)
+    for columns, target in blocks:
+        for start in range(0, len(target), ROWS_AT_ONCE):
+            rows = slice(start, start + ROWS_AT_ONCE)
+            left = target[rows] - coef @ columns[:, rows]
+            squares += np.einsum("sr,sr->s", left, left)
+            products += left @ columns[:, rows].T
+    return squares, products

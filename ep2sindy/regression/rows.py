@@ -262,9 +262,5 @@ class Formulation(Protocol):
     def smoother(self) -> Smoother | None: ...
 
     def assemble(
-        self,
-        trajectories: Sequence[Trajectory],
-        library: Library,
-        *,
-        rng: np.random.Generator,
+        self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> tuple[RegressionRows, ...]: ...

@@ -24,6 +24,11 @@ Gram = Float[np.ndarray, "terms terms"]
 Products = Float[np.ndarray, " terms"]
 Masks = Bool[np.ndarray, "supports terms"]
 
+# The same of several problems at once.
+Grams = Float[np.ndarray, "problems terms terms"]
+Moments = Float[np.ndarray, "problems terms"]
+Squares = Float[np.ndarray, " problems"]
+
 
 @runtime_checkable
 class Search(Protocol):
@@ -149,12 +154,7 @@ class BestSubset:
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
         return self.shared_supports(xx[None], xy[None], np.array([yy]))
 
-    def shared_supports(
-        self,
-        xx: Float[np.ndarray, "problems terms terms"],
-        xy: Float[np.ndarray, "problems terms"],
-        yy: Float[np.ndarray, " problems"],
-    ) -> Masks:
+    def shared_supports(self, xx: Grams, xy: Moments, yy: Squares) -> Masks:
         """Supports common to several problems, with separate coefficients in each.
 
         The best supports minimise the product of residuals. If every problem has Gaussian errors
@@ -177,13 +177,7 @@ class BestSubset:
 
 
 def find_best_subsets(
-    xx: Float[np.ndarray, "problems terms terms"],
-    xy: Float[np.ndarray, "problems terms"],
-    yy: Float[np.ndarray, " problems"],
-    *,
-    max_terms: int,
-    n_best: int,
-    most_work: float,
+    xx: Grams, xy: Moments, yy: Squares, *, max_terms: int, n_best: int, most_work: float
 ) -> tuple[Masks, bool]:
     """The best supports of every size, as for `BestSubset`, and whether they are proven best.
 
@@ -214,15 +208,12 @@ ROUNDING = 1e-14  # of the target's square: a smaller residual is rounding
 MAX_EXCHANGES = 50  # at one size; a handful is usual
 
 
+Scored = tuple[frozenset[int], float]  # a support, and the residual that it leaves
+
+
 def exchange_terms(
-    xx: Float[np.ndarray, "problems terms terms"],
-    xy: Float[np.ndarray, "problems terms"],
-    yy: Float[np.ndarray, " problems"],
-    *,
-    max_terms: int,
-    n_best: int,
-    known: Bool[np.ndarray, "supports terms"] | None = None,
-) -> Bool[np.ndarray, "supports terms"]:
+    xx: Grams, xy: Moments, yy: Squares, *, max_terms: int, n_best: int, known: Masks | None = None
+) -> Masks:
     """The best `n_best` supports found of every size up to max_terms, the empty one first.
 
     For libraries too large for a proof. Each size starts from the best support of the size below
@@ -232,24 +223,24 @@ def exchange_terms(
     One support serves all problems, each with coefficients of its own; the product of their
     residuals is minimised. known: supports to start from as well.
     """
-    n_terms = xy.shape[1]
+    problems, n_terms = _Problems(xx, xy, yy), xy.shape[1]
     starts: dict[int, list[frozenset[int]]] = {}
     for mask in () if known is None else known:
         starts.setdefault(int(mask.sum()), []).append(frozenset(np.flatnonzero(mask).tolist()))
     by_size: list[dict[frozenset[int], float]] = []
     best = frozenset[int]()
     for size in range(1, min(max_terms, n_terms) + 1):
-        grown = _add_best(xx, xy, yy, best)
+        grown = problems.add_best(best)
         if grown is None:
             break
-        seen = {support: _measure(xx, xy, yy, support) for support in starts.get(size, [])}
-        seen |= _descend(xx, xy, yy, min([*seen.items(), grown], key=lambda each: each[1]))
+        seen = {support: problems.measure(support) for support in starts.get(size, [])}
+        seen |= problems.descend(min([*seen.items(), grown], key=lambda each: each[1]))
         best = min(seen, key=lambda support: seen[support])
         by_size.append(seen)
     for fewer, more in reversed([*pairwise(by_size)]):
-        shrunk = _drop_least(xx, xy, yy, min(more, key=lambda support: more[support]))
+        shrunk = problems.drop_least(min(more, key=lambda support: more[support]))
         if shrunk[1] < min(fewer.values()):
-            fewer |= _descend(xx, xy, yy, shrunk)
+            fewer |= problems.descend(shrunk)
     found = [frozenset[int]()]
     for seen in by_size:
         found += sorted(seen, key=lambda support: seen[support])[:n_best]
@@ -259,74 +250,70 @@ def exchange_terms(
     return masks
 
 
-def _descend(
-    xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, start: tuple[frozenset[int], float]
-) -> dict[frozenset[int], float]:
-    """Exchange terms while the residual falls; residuals of the last support and its neighbours."""
-    best, least = start
-    for _ in range(MAX_EXCHANGES):
-        near = {best: least}
-        for term in best:
-            kept = best - {term}
-            residuals = _try_each(xx, xy, yy, sorted(kept))
-            for other in np.argsort(residuals)[: len(best) + 1].tolist():
-                if np.isfinite(residuals[other]):
-                    near.setdefault(kept | {other}, float(residuals[other]))
-        support = min(near, key=lambda each: near[each])
-        if not near[support] < least:
-            return near
-        best, least = support, near[support]
-    return near
+@dataclass(frozen=True, eq=False)
+class _Problems:
+    """Gram matrices of several problems, and the residuals that supports leave.
 
-
-def _add_best(
-    xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, support: frozenset[int]
-) -> tuple[frozenset[int], float] | None:
-    """The support with its best further term, and the residual; None if no term adds anything."""
-    residuals = _try_each(xx, xy, yy, sorted(support))
-    term = int(np.argmin(residuals))
-    return (support | {term}, float(residuals[term])) if np.isfinite(residuals[term]) else None
-
-
-def _drop_least(
-    xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, support: frozenset[int]
-) -> tuple[frozenset[int], float]:
-    """The support without the term whose loss costs least, and the residual."""
-    terms = sorted(support)
-    inverse = invert_gram(xx[:, terms][:, :, terms])
-    coef = np.einsum("pst,pt->ps", inverse, xy[:, terms])
-    losses = np.square(coef) / zero_to_one(np.einsum("pss->ps", inverse))
-    left = yy - np.einsum("ps,ps->p", coef, xy[:, terms])
-    residuals = np.log(np.maximum(left[:, None] + losses, ROUNDING * yy[:, None])).sum(axis=0)
-    smaller = support - {terms[int(np.argmin(residuals))]}
-    return smaller, _measure(xx, xy, yy, smaller)
-
-
-def _measure(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, support: frozenset[int]) -> float:
-    first, *others = sorted(support)
-    return float(_try_each(xx, xy, yy, others)[first])
-
-
-def _try_each(
-    xx: Float[np.ndarray, "problems terms terms"],
-    xy: Float[np.ndarray, "problems terms"],
-    yy: Float[np.ndarray, " problems"],
-    chosen: Sequence[int],
-) -> Float[np.ndarray, " terms"]:
-    """Residual if each term joins the chosen ones; infinite for one that depends on them.
-
-    Of several problems it is the sum of the residuals' logarithms.
+    Of several problems a residual is the sum of the residuals' logarithms.
     """
-    columns, target = xx[:, :, chosen], xy[:, chosen]
-    inverse = invert_gram(columns[:, chosen])
-    share = columns @ inverse
-    square = np.einsum("pjj->pj", xx)
-    own = square - np.einsum("pjs,pjs->pj", share, columns)
-    adds = own > DEPENDENT * square
-    gain = np.square(xy - np.einsum("pjs,ps->pj", share, target)) / np.where(adds, own, 1.0)
-    left = yy - np.einsum("ps,pst,pt->p", target, inverse, target)
-    residuals = np.maximum(left[:, None] - np.where(adds, gain, 0.0), ROUNDING * yy[:, None])
-    total = residuals[0] if len(yy) == 1 else np.log(residuals).sum(axis=0)
-    total = np.where(adds.any(axis=0), total, np.inf)
-    total[list(chosen)] = np.inf
-    return total
+
+    xx: Grams
+    xy: Moments
+    yy: Squares
+
+    def descend(self, start: Scored) -> dict[frozenset[int], float]:
+        """Exchange terms while the residual falls; the last support and its neighbours."""
+        best, least = start
+        for _ in range(MAX_EXCHANGES):
+            near = {best: least}
+            for term in best:
+                kept = best - {term}
+                residuals = self.try_each(sorted(kept))
+                for other in np.argsort(residuals)[: len(best) + 1].tolist():
+                    if np.isfinite(residuals[other]):
+                        near.setdefault(kept | {other}, float(residuals[other]))
+            support = min(near, key=lambda each: near[each])
+            if not near[support] < least:
+                return near
+            best, least = support, near[support]
+        return near
+
+    def add_best(self, support: frozenset[int]) -> Scored | None:
+        """The support with its best further term; None if no term adds anything."""
+        residuals = self.try_each(sorted(support))
+        term = int(np.argmin(residuals))
+        is_one = np.isfinite(residuals[term])
+        return (support | {term}, float(residuals[term])) if is_one else None
+
+    def drop_least(self, support: frozenset[int]) -> Scored:
+        """The support without the term whose loss costs least."""
+        terms = sorted(support)
+        inverse = invert_gram(self.xx[:, terms][:, :, terms])
+        coef = np.einsum("pst,pt->ps", inverse, self.xy[:, terms])
+        losses = np.square(coef) / zero_to_one(np.einsum("pss->ps", inverse))
+        left = self.yy - np.einsum("ps,ps->p", coef, self.xy[:, terms])
+        least = ROUNDING * self.yy[:, None]
+        residuals = np.log(np.maximum(left[:, None] + losses, least)).sum(axis=0)
+        smaller = support - {terms[int(np.argmin(residuals))]}
+        return smaller, self.measure(smaller)
+
+    def measure(self, support: frozenset[int]) -> float:
+        first, *others = sorted(support)
+        return float(self.try_each(others)[first])
+
+    def try_each(self, chosen: Sequence[int]) -> Float[np.ndarray, " terms"]:
+        """Residual if each term joins the chosen ones; infinite for one that depends on them."""
+        columns, target = self.xx[:, :, chosen], self.xy[:, chosen]
+        inverse = invert_gram(columns[:, chosen])
+        share = columns @ inverse
+        square = np.einsum("pjj->pj", self.xx)
+        own = square - np.einsum("pjs,pjs->pj", share, columns)
+        adds = own > DEPENDENT * square
+        gain = np.square(self.xy - np.einsum("pjs,ps->pj", share, target))
+        left = self.yy - np.einsum("ps,pst,pt->p", target, inverse, target)
+        residuals = left[:, None] - np.where(adds, gain / np.where(adds, own, 1.0), 0.0)
+        residuals = np.maximum(residuals, ROUNDING * self.yy[:, None])
+        total = residuals[0] if len(self.yy) == 1 else np.log(residuals).sum(axis=0)
+        total = np.where(adds.any(axis=0), total, np.inf)
+        total[list(chosen)] = np.inf
+        return total

@@ -17,6 +17,8 @@ from scipy.sparse import block_diag, csr_array
 from ep2sindy.data.numbers import rounding_s
 from ep2sindy.runtime.values import set_counts
 
+Signal = Float[np.ndarray, " samples"]
+
 
 @dataclass(frozen=True, eq=False)
 class Windows:
@@ -118,13 +120,7 @@ ROUNDED = 0.05
 class WindowFunctions(Protocol):
     """Interface of the test functions: windows for one sampled signal."""
 
-    def windows(
-        self,
-        t: Float[np.ndarray, " samples"],
-        x: Float[np.ndarray, " samples"],
-        *,
-        rng: np.random.Generator,
-    ) -> Windows: ...
+    def windows(self, t: Signal, x: Signal, *, rng: np.random.Generator) -> Windows: ...
 
 
 @dataclass(frozen=True)
@@ -143,13 +139,7 @@ class Boxes:
     def __post_init__(self) -> None:
         set_counts(self, {"n_windows": 1, "n_points": 2})
 
-    def windows(
-        self,
-        t: Float[np.ndarray, " samples"],
-        x: Float[np.ndarray, " samples"],
-        *,
-        rng: np.random.Generator,
-    ) -> Windows:
+    def windows(self, t: Signal, x: Signal, *, rng: np.random.Generator) -> Windows:
         """Raises ValueError for windows longer than the trajectory."""
         _check_width(self.n_points, len(t), "n_points")
         first = np.sort(rng.integers(len(t) - self.n_points + 1, size=self.n_windows))
@@ -196,13 +186,7 @@ class Bumps:
                 f"tau_hat={self.tau_hat}, overlap={self.overlap} came"
             )
 
-    def windows(
-        self,
-        t: Float[np.ndarray, " samples"],
-        x: Float[np.ndarray, " samples"],
-        *,
-        rng: np.random.Generator,
-    ) -> Windows:
+    def windows(self, t: Signal, x: Signal, *, rng: np.random.Generator) -> Windows:
         """Weights of all windows over one signal.
 
         Samples at unequal steps are interpolated onto an even grid; the interpolation weights
@@ -251,7 +235,7 @@ def bump_power(half_width: Any) -> Any:
     return np.maximum(2.0, np.ceil(np.log(EDGE) / np.log(edge)))
 
 
-def spectral_half_width(x: Float[np.ndarray, " samples"], *, tau_hat: float) -> int:
+def spectral_half_width(x: Signal, *, tau_hat: float) -> int:
     """Half-width in samples of the narrowest bump whose spectrum lies below the change point.
 
     The spectrum of (1 - s^2)^p is close to a Gaussian of standard deviation
@@ -276,7 +260,7 @@ def _corners(last: int) -> np.ndarray:
     return np.unique(np.geomspace(1, last - 1, 200).astype(int))
 
 
-def spectral_change_point(x: Float[np.ndarray, " samples"]) -> int:
+def spectral_change_point(x: Signal) -> int:
     """Frequency bin that separates signal from noise, where the cumulated spectrum bends most.
 
     The cumulated amplitude spectrum is approximated by two chords that meet at the bend; the bend
@@ -313,7 +297,7 @@ def _check_width(n_points: int, n_samples: int, name: str) -> None:
         )
 
 
-def is_even(t: Float[np.ndarray, " samples"]) -> bool:
+def is_even(t: Signal) -> bool:
     """Return true if the times lie on an even grid, apart from rounding."""
     step = (t[-1] - t[0]) / (len(t) - 1)
     off = np.abs(t - t[0] - step * np.arange(len(t))).max()
@@ -321,7 +305,7 @@ def is_even(t: Float[np.ndarray, " samples"]) -> bool:
 
 
 def even_grid(
-    t: Float[np.ndarray, " samples"],
+    t: Signal,
 ) -> tuple[Float[np.ndarray, " points"], csr_array]:
     """Even grid with about the median step, and the matrix (points, samples) that interpolates.
 
@@ -340,7 +324,7 @@ def even_grid(
 
 
 def keep_one_per_sample(
-    t: Float[np.ndarray, " samples"], middle: Float[np.ndarray, " windows"]
+    t: Signal, middle: Float[np.ndarray, " windows"]
 ) -> Int[np.ndarray, " kept"]:
     """Indices of windows to keep: the first of all windows nearest to the same sample.
 

@@ -181,12 +181,9 @@ def _fit_all(
     # R of the QR factors holds all that least squares needs, without squaring the condition number.
     triangle = np.asarray(np.linalg.qr(np.column_stack([theta, target]), mode="r"))
     columns, right = triangle[:, :-1], triangle[:, -1]
-
-    def residuals(coef: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        left = right - coef @ columns.T
-        return np.square(left).sum(axis=1), left @ columns
-
-    coef, squares = fit_masks_to_rows(columns.T @ columns, columns.T @ right, masks, residuals)
+    coef, squares = fit_masks_to_rows(
+        columns.T @ columns, columns.T @ right, masks, lambda: [(columns.T, right)]
+    )
     for k in np.flatnonzero(np.isnan(squares)):  # weights have made its terms dependent
         fit = LeastSquares.of_rows(columns[:, masks[k]], right)
         coef[k], squares[k] = 0.0, fit.squares

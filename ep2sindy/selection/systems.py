@@ -13,7 +13,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Process, binding, constraint
 from ep2sindy.library.roles import process_amounts
-from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
 from ep2sindy.refinement.steps import fastest_step
@@ -47,6 +47,18 @@ class TrialSystem:
     model: SparseModel
     constraint: Constraint
     means: Float[np.ndarray, " processes"] | None = None
+
+    @staticmethod
+    def of(
+        task: Task,
+        held: Constraint,
+        free: Float[np.ndarray, " free"],
+        means: Float[np.ndarray, " processes"] | None = None,
+    ) -> TrialSystem:
+        """The system with these values of the free coefficients."""
+        empty = np.zeros((len(task.library), len(held.states)))
+        model = SparseModel(task.library, held.states, empty, task.runs[0].units)
+        return TrialSystem(with_coef(model, held, held.coef(free))[0], held, means)
 
     @property
     def n_free(self) -> int:
@@ -176,15 +188,12 @@ def combine(fronts: Fronts, task: Task, *, most: int) -> Systems:
 
 def _combine_one(fronts: Fronts, choice: Int[np.ndarray, " fronts"], task: Task) -> TrialSystem:
     """System of one combination: free coefficients as found, the others by the relations."""
-    library, states = task.library, [front.equation for front in fronts]
-    chosen = [front.candidates[k] for front, k in zip(fronts, choice, strict=True)]
-    coef = coef_matrix(library, [candidate.coef_by_term for candidate in chosen])
-    model = SparseModel(library, states, coef, task.runs[0].units)
     support = support_of(fronts, choice)
-    held = constraint(library, support, binding(task.relations, support) or ())
-    places = [(library.index(term), states.index(state)) for state, term in held.coefficients]
-    free = np.array([coef[places[k]] for k in held.free])
-    return TrialSystem(with_coef(model, held, held.coef(free))[0], held)
+    held = constraint(task.library, support, binding(task.relations, support) or ())
+    pairs = zip(fronts, choice, strict=True)
+    coef = {front.equation: front.candidates[k].coef_by_term for front, k in pairs}
+    places = [held.coefficients[k] for k in held.free]
+    return TrialSystem.of(task, held, np.array([coef[state][term] for state, term in places]))
 
 
 def find_broken_demands(
