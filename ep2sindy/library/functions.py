@@ -140,15 +140,10 @@ class Function:
             return wrong | ~np.isfinite(self.value(x)) | ~np.isfinite(slope.value(x))
 
     @property
-    def has_poles(self) -> bool:
-        """True if the domain consists of several intervals."""
-        return len(self.kind.domain) > 1
-
-    @property
     def need(self) -> str:
         """Condition on the variable, in words: `x > 0`."""
         argument = Part("", self.variable, self.scale, self.shift).argument
-        if self.has_poles:
+        if len(self.kind.domain) > 1:  # at poles
             ends = ", ".join(number_text(high) for _, high in self.kind.domain[:-1])
             return f"{argument} to stay on one side of {ends}"
         ((low, high),) = self.kind.domain

@@ -187,7 +187,12 @@ class Library:
         that evaluates the terms (only `rows`, if given) at the current content of that array.
         """
         n = len(known)
-        columns, table = np.ones(n + 1 + len(self.functions)), self.columns_of(known, rows)
+        columns, others = (
+            np.ones(n + 1 + len(self.functions)),
+            range(n, n + 1 + len(self.functions)),
+        )
+        places = np.array([*map(list(known).index, self.variables), *others])
+        table = places[self.table if rows is None else self.table[rows]]
         functions = [
             (n + 1 + k, f, list(known).index(f.variable))
             for k, f in enumerate(self.functions)
@@ -200,18 +205,6 @@ class Library:
             return columns[table].prod(axis=1)
 
         return columns[:n], terms
-
-    def columns_of(
-        self, known: Sequence[str], rows: np.ndarray | None = None
-    ) -> Int[np.ndarray, "rows degree"]:
-        """Rows of `table` for columns in the order: variables in `known`, a one, functions.
-
-        known: must hold all variables of the library.
-        """
-        n = len(known)
-        others = range(n, n + 1 + len(self.functions))
-        places = np.array([*map(list(known).index, self.variables), *others])
-        return places[self.table if rows is None else self.table[rows]]
 
     def with_derivatives(
         self, n: int

@@ -252,6 +252,18 @@ class Weak:
         windows, test = Windows.joined(parts), np.concatenate(tests)
         n_before = np.cumsum([0, *(run.segment[-1] + 1 for run in runs[:-1])])
         target = windows.slope @ np.concatenate([run.run.states[:, state] for run in runs])
+        noisy, names = None, runs[0].names
+        if self.errors_in_variables:
+            estimates = [run.estimate for run in runs if run.estimate is not None]
+            stds = [np.broadcast_to(e.noise_std, e.smoothed.shape) for e in estimates]
+            noisy = NoisyRows(
+                windows=windows.taken(~test),
+                target=target[~test],
+                state=names.index(name),
+                values=np.concatenate([run.run.columns(names) for run in runs]),
+                smoothed=np.concatenate([estimate.smoothed for estimate in estimates]),
+                noise_std=np.concatenate(stds),
+            )
         return RegressionRows(
             theta=windows.mean @ np.concatenate([run.terms for run in runs]),
             target=target[:, None],
@@ -260,9 +272,7 @@ class Weak:
             groups=np.concatenate([s + n for s, n in zip(segments, n_before, strict=True)]),
             test=test,
             trajectories=tuple(trajectories),
-            noisy=_noisy_rows(name, runs, windows.taken(~test), target[~test])
-            if self.errors_in_variables
-            else None,
+            noisy=noisy,
         )
 
 
@@ -297,23 +307,6 @@ class _Sampled:
         pure = (share == 0.0) | (share == 1.0)
         segment = self.segment[(first + last) // 2]
         return windows.taken(pure), segment[pure], share[pure] == 1.0
-
-
-def _noisy_rows(
-    name: str, runs: Sequence[_Sampled], windows: Windows, target: Float[np.ndarray, " rows"]
-) -> NoisyRows:
-    names = runs[0].names
-    estimates = [run.estimate for run in runs if run.estimate is not None]
-    return NoisyRows(
-        windows=windows,
-        target=target,
-        state=names.index(name),
-        values=np.concatenate([run.run.columns(names) for run in runs]),
-        smoothed=np.concatenate([estimate.smoothed for estimate in estimates]),
-        noise_std=np.concatenate(
-            [np.broadcast_to(e.noise_std, e.smoothed.shape) for e in estimates]
-        ),
-    )
 
 
 @dataclass(frozen=True)
@@ -404,12 +397,13 @@ def exact_columns(
         )
     if declared is not None:
         return np.isin(names, list(declared))
-    exact = np.zeros(len(names), dtype=np.bool_)
-    for k, (name, column) in enumerate(zip(names, run.columns(names).T, strict=True)):
-        if name in run.input_names:
-            noise = np.inf if noise_std is None else noise_std[k]
-            exact[k] = is_switched(column) or bool(noise <= NEGLIGIBLE * column.std())
-    return exact
+    noise = np.broadcast_to(np.inf if noise_std is None else noise_std, len(names))
+    columns = run.columns(names).T
+    is_exact = [
+        name in run.input_names and (is_switched(x) or bool(std <= NEGLIGIBLE * x.std()))
+        for name, x, std in zip(names, columns, noise, strict=True)
+    ]
+    return np.array(is_exact, dtype=np.bool_)
 
 
 def is_switched(samples: Float[np.ndarray, " samples"]) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -242,22 +242,10 @@ def spectral_half_width(x: Signal, *, tau_hat: float) -> int:
     n sqrt(2p + 3) / (2 pi half_width) bins; `tau_hat` standard deviations must lie below the
     change point between signal and noise.
     """
-    widths, deviation = _spectral_deviations(len(x))
+    n, widths = len(x), np.arange(2, max(3, (len(x) - 1) // 4))
+    deviation = n * np.sqrt(2.0 * bump_power(widths) + 3.0) / (2.0 * np.pi * widths)
     fits = tau_hat * deviation <= spectral_change_point(x)
     return int(widths[np.argmax(fits)] if fits.any() else widths[-1])
-
-
-@lru_cache(maxsize=8)
-def _spectral_deviations(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Half-widths of bumps in a record of n samples, and deviations of their spectra in bins."""
-    widths = np.arange(2, max(3, (n - 1) // 4))
-    return widths, n * np.sqrt(2.0 * bump_power(widths) + 3.0) / (2.0 * np.pi * widths)
-
-
-@lru_cache(maxsize=8)
-def _corners(last: int) -> np.ndarray:
-    """Two hundred trial corners up to a bin, denser at low ones, locate a bend well enough."""
-    return np.unique(np.geomspace(1, last - 1, 200).astype(int))
 
 
 def spectral_change_point(x: Signal) -> int:
@@ -270,7 +258,9 @@ def spectral_change_point(x: Signal) -> int:
     last = len(total) - 1
     if last < 2:
         return 1
-    corners, bins = _corners(last), np.arange(last + 1.0)
+    # Two hundred trial corners, denser at low bins, locate a bend well enough.
+    corners = np.unique(np.geomspace(1, last - 1, 200).astype(int))
+    bins = np.arange(last + 1.0)
     until = np.concatenate([[0], corners, [last]])
     at = until.astype(float)
     sums = np.array([

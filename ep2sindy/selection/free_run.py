@@ -316,8 +316,12 @@ class FreeRunScore:
         self, records: Records, trials: Sequence[Trial], living: Sequence[int], progress: Progress
     ) -> tuple[int, SparseModel, str]:
         """Index of the winning system, the system refined on all data, and how it won."""
-        ranked = sorted(living, key=lambda k: self._rank(trials[k]))
-        ranked = order_equals(ranked, trials)
+
+        def rank(k: int) -> tuple[bool, int, float]:
+            """The smallest system first, and of one size the one with the best waveform."""
+            return trials[k].error > self.margin, trials[k].system.n_free, trials[k].waveform
+
+        ranked = order_equals(sorted(living, key=rank), trials)
         by_error = sorted(range(len(trials)), key=lambda k: (trials[k].error, trials[k].loss))
         window = self._window(records)
         found: list[Confirmed] = []
@@ -343,10 +347,6 @@ class FreeRunScore:
                 break
         won = min(found, key=Confirmed.rank)
         return won.number, won.run.model, won.text(len(living), len(trials))
-
-    def _rank(self, trial: Trial) -> tuple[bool, int, float]:
-        """Sorts the smallest system first, and of one size the one with the best waveform."""
-        return trial.error > self.margin, trial.system.n_free, trial.waveform
 
     def _confirm(
         self, number: int, trial: Trial, model: SparseModel, records: Records

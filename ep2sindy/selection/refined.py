@@ -18,12 +18,7 @@ from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, dominant_windo
 from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.runtime.values import set_counts
-from ep2sindy.selection.criteria import (
-    FLOOR,
-    MAX_ERROR,
-    Basis,
-    Decision,
-)
+from ep2sindy.selection.criteria import FLOOR, MAX_ERROR, Basis, Decision
 from ep2sindy.selection.systems import (
     Records,
     Stretch,
