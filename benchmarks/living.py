@@ -27,7 +27,7 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
-from ep2sindy.library.roles import shares_of, summed
+from ep2sindy.library.roles import shares_of, sum_known
 from ep2sindy.model.free_run import cycle_of
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.studies.balance import ComparedProcess, compared_processes, ends_of
@@ -371,7 +371,7 @@ def by_the_record(
     assert held is not None
     recorded = {(p.ends, term): value for p in compared for term, value in p.counterpart.items()}
     values = [recorded[ends_of(process), process.term] for process in held.processes]
-    known = summed(held.known)
+    known = sum_known(held.known)
     told = [known.get(held.coefficients[k], 0.0) for k in held.free]
     coef = held.coef(shares_of(held) @ np.array(values) + told)
     changed = with_coef(model, held, coef)[0]

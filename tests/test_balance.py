@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.library.roles import constraint_of, summed
+from ep2sindy.library.roles import constraint_of, sum_known
 from ep2sindy.studies.balance import compared_processes, model_balance
 from ep2sindy.studies.fits import split_in_time
 from ep2sindy.studies.source import Zones, told_roles
@@ -110,7 +110,7 @@ def under(roles: ep.Roles, values: dict[tuple[str, str], float]):
     chosen = [p for p in roles.processes(library, STATES) if (p.role, p.term) in values]
     held_to = constraint_of(library, STATES, chosen, roles.told)
     assert held_to is not None
-    known = summed(roles.told)
+    known = sum_known(roles.told)
     coef = np.array([known.get(at, 0.0) for at in held_to.coefficients])
     for process in chosen:
         shares = [process.factors.get(at, 0.0) for at in held_to.coefficients]

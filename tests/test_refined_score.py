@@ -261,7 +261,8 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
 
     monkeypatch.setattr("ep2sindy.selection.refined.refine_batch", unfinished)
     batch = batch_of(PREY.trajectory())
-    first, second = _refine([off, off], batch, [unconstrained(off)] * 2, lambda n_more: None)
+    trial = systems.TrialSystem(off, unconstrained(off))
+    first, second = _refine([trial, trial], batch, lambda n_more: None)
     np.testing.assert_array_equal(first.coef, PREY.model.coef)
     np.testing.assert_array_equal(second.coef, off.coef)
 

@@ -206,11 +206,6 @@ class Evidence:
         self, fronts: Fronts, task: Task | None = None, *, progress: Progress = SILENT
     ) -> Decision:
         deviances = [[candidate.deviance for candidate in front.candidates] for front in fronts]
-        if any(None in values for values in deviances):
-            raise ValueError(
-                "Evidence weighs what a search of trajectories found: these fronts come from "
-                "rows; take TrajectorySearch() (search=trajectory), or select by EBIC"
-            )
         return Decision([np.array(values, dtype=np.float64) for values in deviances])
 
 
