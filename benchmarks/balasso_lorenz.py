@@ -21,7 +21,7 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.front import Candidate, fit_support, fit_supports, order_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, Search

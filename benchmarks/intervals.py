@@ -9,9 +9,8 @@ from functools import partial
 import numpy as np
 
 from ep2sindy.discovery.choice import reweight
+from ep2sindy.regression.formulations import RandomSplit, Weak
 from ep2sindy.regression.front import fit_support
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.weak import Weak
 from ep2sindy.runtime.parallel import Loky
 from ep2sindy.systems.draws import DRAWS, realization
 

@@ -20,10 +20,9 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.operating.fit_rows import fit_law
 from ep2sindy.operating.shared_support import SharedDiscovery, discover_shared
+from ep2sindy.regression.formulations import RandomSplit, Weak, WeightedWeak
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.test_functions import Bumps
-from ep2sindy.regression.weak import Weak, WeightedWeak
+from ep2sindy.regression.windows import Bumps
 from ep2sindy.runtime.parallel import Loky, Workers
 from ep2sindy.selection.criteria import EBIC
 

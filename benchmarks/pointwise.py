@@ -33,7 +33,7 @@ from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, blocks_of, pointwise
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import ONE_BY_ONE, Dask, Workers
@@ -115,7 +115,7 @@ def plain_way(problem: RegressionRows, *, once: bool = False) -> None:
     """
     rng = np.random.default_rng(0)
     theta = problem.train_theta
-    for target in map(problem.train_target, range(len(problem.equations))):
+    for target in map(problem.scaled_target, range(len(problem.equations))):
         supports = []
         for _ in range(SEARCH.method.bootstraps.n):
             size = int(rng.uniform(0.2, 0.8) * len(theta))
@@ -131,7 +131,7 @@ def plain_way(problem: RegressionRows, *, once: bool = False) -> None:
 def ensemble_way(problem: RegressionRows) -> None:
     """PySINDy's bagging at ten thresholds, on columns that are scaled."""
     n_terms = len(problem.library)
-    theta, targets = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms:]
+    theta, targets = problem.train_columns.T[:, :n_terms], problem.train_columns.T[:, n_terms:]
     for threshold in np.geomspace(1e-3, 1.0, 10):
         optimizer = pysindy.EnsembleOptimizer(
             pysindy.STLSQ(threshold=threshold, alpha=0.0),

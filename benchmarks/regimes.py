@@ -16,11 +16,10 @@ from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Loky
-from ep2sindy.selection.criteria import EBIC, Knee
-from ep2sindy.selection.rule import Selection
+from ep2sindy.selection.criteria import EBIC, Knee, Selection
 
 NOISES = (0.0, 0.02, 0.05, 0.1)
 RULES: dict[str, Selection] = {

@@ -33,7 +33,7 @@ import ep2sindy as ep
 from benchmarks.timing import cpu_s
 from ep2sindy.model.runge_kutta import step
 from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.front import ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso
@@ -54,7 +54,7 @@ def ours(problem: RegressionRows, rng: np.random.Generator) -> list[ParetoFront]
 def plain(
     problem: RegressionRows, rng: np.random.Generator, *, distinct: bool
 ) -> list[dict[int, tuple]]:
-    rows = problem.train_rows
+    rows = problem.train_columns.T
     n_terms = len(problem.library)
     theta, targets = rows[:, :n_terms], rows[:, n_terms:]
     supports: list[list[tuple[int, ...]]] = [[] for _ in problem.equations]
@@ -78,7 +78,7 @@ def plain_front(
     problem: RegressionRows, equation: int, supports: list[tuple[int, ...]]
 ) -> dict[int, tuple]:
     """Best support of every size by its error on the held-out rows."""
-    train, test = problem.train_rows, problem.test_columns.T
+    train, test = problem.train_columns.T, problem.test_columns.T
     target = len(problem.library) + equation
     best: dict[int, tuple] = {}
     for columns in map(list, supports):

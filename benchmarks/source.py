@@ -17,8 +17,8 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.library.library import named_terms
+from ep2sindy.regression.formulations import RandomSplit
 from ep2sindy.regression.front import fit_support
-from ep2sindy.regression.splits import RandomSplit
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 DOWNSTREAM = (1.5e-2, 2.5e-2)  # m

@@ -16,14 +16,13 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
+from ep2sindy.regression.formulations import WeightedWeak
 from ep2sindy.regression.front import ParetoFront, pareto_front
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.parallel import Loky
-from ep2sindy.selection.criteria import EBIC
+from ep2sindy.selection.criteria import EBIC, Selection
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.selection.refined import RefinedScore
-from ep2sindy.selection.rule import Selection
 from ep2sindy.systems.draws import realization
 
 SYSTEMS = ("lotka_volterra", "van_der_pol", "oscillator", "lorenz")

@@ -39,13 +39,13 @@ from ep2sindy.regression.searches import STLSQ as STLSQ  # for configs
 from ep2sindy.regression.bootstraps import Bootstraps as Bootstraps  # for configs
 
 # Regressions
-from ep2sindy.regression.differential import Differential as Differential  # for configs
-from ep2sindy.regression.weak import Weak as Weak  # for configs
-from ep2sindy.regression.weak import WeightedWeak as WeightedWeak  # for configs
-from ep2sindy.regression.test_functions import Bumps as Bumps  # for configs
-from ep2sindy.regression.test_functions import Boxes as Boxes  # for configs
-from ep2sindy.regression.splits import RandomSplit as RandomSplit  # for configs
-from ep2sindy.regression.splits import BlockSplit as BlockSplit  # for configs
+from ep2sindy.regression.formulations import Differential as Differential  # for configs
+from ep2sindy.regression.formulations import Weak as Weak  # for configs
+from ep2sindy.regression.formulations import WeightedWeak as WeightedWeak  # for configs
+from ep2sindy.regression.windows import Bumps as Bumps  # for configs
+from ep2sindy.regression.windows import Boxes as Boxes  # for configs
+from ep2sindy.regression.formulations import RandomSplit as RandomSplit  # for configs
+from ep2sindy.regression.formulations import BlockSplit as BlockSplit  # for configs
 
 # Selection
 from ep2sindy.selection.criteria import EBIC as EBIC  # for configs

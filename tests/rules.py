@@ -8,7 +8,7 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.rule import Basis, Decision
+from ep2sindy.selection.criteria import Basis, Decision
 
 
 @dataclass(frozen=True)

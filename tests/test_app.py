@@ -15,7 +15,7 @@ from ep2sindy.app.runner import hparams_of, list_studies, run_config, study_clas
 from ep2sindy.app.schema import Configured, keys_of, study_of, value_of
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.runtime.files import read_json
-from ep2sindy.selection.rule import Selection
+from ep2sindy.selection.criteria import Selection
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
 from tests.programs import ended
 

@@ -10,7 +10,7 @@ from ep2sindy.figures.identified import attractor_figure
 from ep2sindy.figures.style import OFF_SCALE
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.weak import WeightedWeak
+from ep2sindy.regression.formulations import WeightedWeak
 from ep2sindy.studies.benchmark import FirstRealizations, Variant, first_realizations
 from ep2sindy.systems.draws import realization
 

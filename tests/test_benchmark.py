@@ -11,7 +11,7 @@ from ep2sindy.discovery.method import Finding, Regression, TrajectorySearch
 from ep2sindy.figures.identified import merit_table
 from ep2sindy.library.library import Library
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.searches import STLSQ, AdaptiveLasso
 from ep2sindy.runtime.parallel import Serial
 from ep2sindy.selection.criteria import Knee

@@ -10,10 +10,10 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import polynomial
 from ep2sindy.library.relations import relations_of
+from ep2sindy.regression.formulations import Weak, WeightedWeak
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.regression.weak import Weak, WeightedWeak
-from ep2sindy.selection.combinations import best_first, combinations, describe_left_out, support_of
+from ep2sindy.selection.criteria import best_first, combinations, describe_left_out, support_of
 from ep2sindy.systems.systems import lorenz
 
 

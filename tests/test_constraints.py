@@ -1,4 +1,4 @@
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -16,10 +16,8 @@ from ep2sindy.library.relations import (
 )
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.constrained import constrained_fit
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential, RandomSplit, Weak
 from ep2sindy.regression.rows import Formulation, RegressionRows
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.weak import Weak
 from ep2sindy.systems.systems import lotka_volterra
 from tests.models import plain_rows
 
@@ -55,14 +53,9 @@ def noisy_run(seed: int = 0) -> Trajectory:
     return replace(clean_run(), states=states + 0.05 * rms * rng.standard_normal(states.shape))
 
 
-def fitted(
-    formulation: Formulation,
-    run: Trajectory,
-    relations: Sequence[str] = (),
-    signs: Mapping[tuple[str, str], int] | None = None,
-) -> SparseModel:
+def fitted(formulation: Formulation, run: Trajectory, relations: Sequence[str] = ()) -> SparseModel:
     problems = formulation.assemble([run], LIBRARY, rng=np.random.default_rng(0))
-    return constrained_fit(problems, constraint(LIBRARY, SUPPORT, relations), signs=signs)
+    return constrained_fit(problems, constraint(LIBRARY, SUPPORT, relations))
 
 
 def covariance_of(model: SparseModel) -> np.ndarray:
@@ -336,57 +329,6 @@ def test_exact_equations_weigh_a_million_times_their_targets_and_no_more() -> No
     coef, _ = tied_by_hand(theta, target, 1e-6 * np.sqrt(np.square(target).mean(axis=0)))
     assert model.terms("x") == pytest.approx({"x": coef[0], "x*y": coef[1]}, rel=1e-12)
     assert -3.2 < coef[1] < -3.0
-
-
-@FORMULATIONS
-def test_a_sign_that_holds_anyway_changes_nothing(formulation: Formulation) -> None:
-    run = noisy_run()
-    free = fitted(formulation, run, [TIED])
-    signed = fitted(formulation, run, [TIED], {("x", "x"): 1, ("y", "y*x"): 1})
-    np.testing.assert_array_equal(signed.coef, free.coef)
-    np.testing.assert_array_equal(covariance_of(signed), covariance_of(free))
-
-
-@FORMULATIONS
-def test_a_sign_that_binds_is_a_fit_without_the_term(formulation: Formulation) -> None:
-    run = noisy_run()
-    signed = fitted(formulation, run, [TIED], {("y", "y"): 1})
-    dropped = fitted(formulation, run, [TIED, "y: y == 0"])
-    assert set(signed.terms("y")) == {"x*y"}
-    # Bounded and plain least squares differ by rounding, which the weights carry on.
-    np.testing.assert_allclose(signed.coef, dropped.coef, rtol=1e-9)
-    np.testing.assert_allclose(covariance_of(signed), covariance_of(dropped), rtol=1e-6)
-
-
-def test_a_sign_on_an_eliminated_coefficient_with_an_offset_binds_at_its_zero() -> None:
-    theta, target = random_rows()
-    (problem,) = rows_of(theta, target)
-    c = constraint(problem.library, SUPPORT, ["x: x + y: y == 0.3"])
-    assert constrained_fit([problem], c).terms("y")["y"] < 0.0
-    model = constrained_fit([problem], c, signs={("y", "y"): 1})
-    assert "y" not in model.terms("y")
-    assert model.terms("x")["x"] == pytest.approx(0.3, rel=1e-14)
-    assert covariance_of(model)[0].tolist() == [0.0, 0.0, 0.0]
-
-
-@pytest.mark.parametrize(
-    ("relations", "signs", "message"),
-    [
-        (["x: x == 1"], {("x", "x"): 1}, r"\('x', 'x'\) has a fixed value"),
-        (["3 * y: y == x: x + x: x*y"], {("y", "y"): -1}, r"\('y', 'y'\) follows from \[\('x', "),
-        ([], {("x", "x"): 2}, r"a sign is \+1 or -1: 2 came for \('x', 'x'\)"),
-        ([TIED], {("x", "x*y"): 1, ("y", "x*y"): 1}, r"\('y', 'x\*y'\) contradicts the others"),
-        ([], {("x", "x*y"): 1, ("x", "y*x"): -1}, r"\('x', 'x\*y'\) contradicts the others"),
-        ([], {("x", "y"): 1}, r"the sign of \('x', 'y'\): 'y' is not in the support of 'x'"),
-    ],
-)
-def test_signs_that_cannot_be_kept_are_refused(
-    relations: list[str], signs: dict[tuple[str, str], int], message: str
-) -> None:
-    problems = rows_of(*random_rows())
-    c = constraint(problems[0].library, SUPPORT, relations)
-    with pytest.raises(ValueError, match=message):
-        constrained_fit(problems, c, signs=signs)
 
 
 def test_rows_that_cannot_tell_coefficients_apart_are_refused_unless_a_relation_does() -> None:

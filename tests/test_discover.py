@@ -13,13 +13,11 @@ from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.library.relations import relations_of
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential, Weak, WeightedWeak
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
-from ep2sindy.regression.weak import Weak, WeightedWeak
-from ep2sindy.selection.combinations import combinations
-from ep2sindy.selection.criteria import EBIC, Knee
+from ep2sindy.selection.criteria import EBIC, Knee, combinations
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.systems.systems import lotka_volterra
 from tests.rules import BySize
@@ -177,7 +175,7 @@ def test_the_free_coefficients_of_related_equations_are_counted(
     terms = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
     task = Task([run], library, relations_of(relations), terms)
     found = Regression().identify(task, rng=np.random.default_rng(0))
-    assert found.choice.n_free == n_free
+    assert found.n_free == n_free
 
 
 def random_front(state: str, names: list[str], rng: np.random.Generator) -> ParetoFront:
@@ -226,13 +224,13 @@ def test_the_number_of_states_is_limited_only_where_relations_tie_them() -> None
 def test_a_state_whose_rows_cannot_be_whitened_leaves_the_others_tested(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def fail_for_x(problem: RegressionRows, fit: choice.EquationFit) -> choice.LeftOver:
+    def fail_for_x(problem: RegressionRows, fit: Candidate, *, negligible: float) -> Candidate:
         if fit.equation == "x":
             raise np.linalg.LinAlgError("singular")
-        return test_terms(problem, fit)
+        return reweight(problem, fit, negligible=negligible)
 
-    test_terms = choice._test_terms
-    monkeypatch.setattr(choice, "_test_terms", fail_for_x)
+    reweight = choice.reweight
+    monkeypatch.setattr(choice, "reweight", fail_for_x)
     found = discover(lotka_volterra().trajectory(noise=0.05, rng=0), None, PLAIN)
     assert list(found.noise_test.left) == ["y"]
 

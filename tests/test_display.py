@@ -15,7 +15,7 @@ from ep2sindy.refinement.judge import RefinementStatus
 from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.systems.systems import lotka_volterra

@@ -6,13 +6,12 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import reweight
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
+from ep2sindy.regression.formulations import RandomSplit, Weak, WeightedWeak
 from ep2sindy.regression.front import Candidate, fit_support, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.test_functions import Bumps
-from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.regression.whitening import whiten_rows
+from ep2sindy.regression.windows import Bumps
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, lorenz, lotka_volterra
 

@@ -8,10 +8,9 @@ from ep2sindy.discovery.choice import reweight
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import polynomial
+from ep2sindy.regression.formulations import RandomSplit, Weak, WeightedWeak, is_switched
 from ep2sindy.regression.front import fit_support
 from ep2sindy.regression.rows import NoisyRows
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.weak import Weak, WeightedWeak, is_switched
 from ep2sindy.signals.smoothers import SavitzkyGolay
 
 T = np.arange(2000) * 0.01

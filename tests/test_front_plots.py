@@ -11,7 +11,7 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.fronts import FLOOR, TOP, front_figure
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.systems.systems import lotka_volterra

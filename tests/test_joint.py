@@ -11,8 +11,7 @@ from benchmarks.joint import find, run_family
 from ep2sindy.operating.fit_rows import fit_law
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.runtime.parallel import Serial
-from ep2sindy.selection.criteria import log_supports
-from ep2sindy.selection.rule import Selection
+from ep2sindy.selection.criteria import Selection, log_supports
 from tests.models import plain_rows
 
 METHOD = ep.Regression(

@@ -10,9 +10,11 @@ from scipy.sparse import diags_array
 import ep2sindy as ep
 from ep2sindy.data.trajectory import spread_blocks
 from ep2sindy.discovery import choice
+from ep2sindy.discovery.choice import reweight
+from ep2sindy.regression.front import Candidate
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
-from ep2sindy.regression.test_functions import spectral_change_point
-from ep2sindy.regression.whitening import _covariance, _Sums
+from ep2sindy.regression.whitening import NEGLIGIBLE, _covariance, _Sums
+from ep2sindy.regression.windows import spectral_change_point
 from tests.models import slopes_of
 
 
@@ -126,8 +128,9 @@ def test_steps_that_are_left_out_hardly_change_the_residuals() -> None:
     form, rng = ep.Weak(split=ep.RandomSplit(0.0)), np.random.default_rng(0)
     for problem in form.assemble([run], library, rng=rng):
         (state,) = problem.equations
-        fit = choice.EquationFit(state, library.names, np.array([10.0, 28.0, -1.0]))
-        near, exact = choice._test_terms(problem, fit), choice.reweight(problem, fit).left
+        fit = Candidate.of(state, dict(zip(library.names, [10.0, 28.0, -1.0], strict=True)))
+        near, exact = (reweight(problem, fit, negligible=n).left for n in (NEGLIGIBLE, 0.0))
+        assert near is not None
         assert exact is not None
         assert abs(near.chi_squared / exact.chi_squared - 1.0) < 1e-5
         assert abs(near.autocorrelation - exact.autocorrelation) < 1e-5

@@ -10,7 +10,7 @@ from ep2sindy.data.gaps import MissingSamples
 from ep2sindy.data.numbers import check_magnitude, column_norms, real_numbers, rounding_s, seconds
 from ep2sindy.data.runs import trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.regression.test_functions import is_even
+from ep2sindy.regression.windows import is_even
 from ep2sindy.signals.spectrum import is_uniform
 
 T = np.arange(8.0)

@@ -11,8 +11,7 @@ from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_bat
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.selection import systems
-from ep2sindy.selection.combinations import MAX_ERROR
-from ep2sindy.selection.criteria import FLOOR
+from ep2sindy.selection.criteria import FLOOR, MAX_ERROR
 from ep2sindy.selection.refined import _refine
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, damped_oscillator
@@ -262,7 +261,8 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
 
     monkeypatch.setattr("ep2sindy.selection.refined.refine_batch", unfinished)
     batch = batch_of(PREY.trajectory())
-    first, second = _refine([off, off], batch, [unconstrained(off)] * 2, lambda n_more: None)
+    trial = systems.TrialSystem(off, unconstrained(off))
+    first, second = _refine([trial, trial], batch, lambda n_more: None)
     np.testing.assert_array_equal(first.coef, PREY.model.coef)
     np.testing.assert_array_equal(second.coef, off.coef)
 

@@ -5,7 +5,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.coerce import Task
-from ep2sindy.regression import differential, rows
+from ep2sindy.regression import formulations, rows
 from ep2sindy.regression.ambiguity import ambiguities, few_rows, row_limit, usable_terms
 from ep2sindy.regression.bootstraps import pool_supports
 from ep2sindy.regression.rows import Formulation, RegressionRows
@@ -66,7 +66,7 @@ def test_gram_matrix_is_the_weighted_product_of_unit_columns() -> None:
     counts = rng.integers(0, 3, size=30).astype(float)
     repeated = np.repeat(theta / np.linalg.norm(theta, axis=0), counts.astype(int), axis=0)
     (sums,) = problem.resampled_products(counts[None])
-    plain = np.column_stack([repeated, np.repeat(problem.train_rows[:, 3], counts.astype(int))])
+    plain = np.column_stack([repeated, np.repeat(problem.train_columns[3], counts.astype(int))])
     assert np.allclose(sums, plain.T @ plain, atol=1e-14)
 
 
@@ -173,7 +173,7 @@ def test_few_rows_hold_the_size_of_supports_down(n_rows: int, largest: int) -> N
     theta = np.random.default_rng(0).normal(size=(n_rows, 6))
     problem = plain_rows(theta, theta[:, :1], list("abcdef"))
     n_terms = int(usable_terms(problem).sum())
-    assert row_limit(n_terms, len(problem.train_rows)) == largest
+    assert row_limit(n_terms, len(problem.train_columns.T)) == largest
     (supports,) = pool_supports(
         problem, ep.BestSubset(), ep.Bootstraps(n=0), rng=np.random.default_rng(0)
     )
@@ -191,7 +191,7 @@ def test_a_long_record_in_blocks_gives_the_same_regression(monkeypatch: pytest.M
     library = ep.lorenz().model.library
     method = ep.Regression(ep.Differential(), ep.BestSubset(), bootstraps=ep.Bootstraps(n=4))
     whole = method.search_equations(Task(runs, library), rng=0)
-    for module in (rows, differential):
+    for module in (rows, formulations):
         monkeypatch.setattr(module, "MOST_ROWS", 300)
     for one, other in zip(whole, method.search_equations(Task(runs, library), rng=0), strict=True):
         assert "train_columns" not in vars(other.front.rows)  # no scaled copy of all rows was made

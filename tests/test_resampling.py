@@ -19,7 +19,7 @@ def test_bootstraps_draw_neighbours_together() -> None:
     )
     terms = np.ones(len(system.model.library), dtype=np.bool_)
     # A block of all training rows, drawn whole: every draw is the training set itself.
-    n_train = len(problem.train_rows)
+    n_train = len(problem.train_columns.T)
     whole = Bootstraps(n=2, n_culled=0, smallest=1.0, largest=1.0, block=n_train)
     sums, _ = whole.draw(problem, terms, np.random.default_rng(0))
     once = problem.train_products

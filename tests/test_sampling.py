@@ -5,8 +5,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.test_functions import even_grid, is_even, keep_one_per_sample
 from ep2sindy.regression.whitening import whiten_rows
+from ep2sindy.regression.windows import even_grid, is_even, keep_one_per_sample
 from ep2sindy.systems.systems import System, van_der_pol
 
 EVERY_ROW = ep.Weak(split=ep.RandomSplit(0.0))
@@ -82,8 +82,8 @@ def test_residuals_of_the_truth_are_white_where_samples_are_missing() -> None:
     runs = [thinned(system.trajectory(noise=0.02, rng=rng), rng) for _ in range(6)]
     for problem in assembled(system, runs):
         truth = system.model.terms(problem.equations[0])
-        mask = np.isin(problem.term_names, list(truth))
-        coef = np.array([truth.get(name, 0.0) for name in problem.term_names])
+        mask = np.isin(problem.library.names, list(truth))
+        coef = np.array([truth.get(name, 0.0) for name in problem.library.names])
         coef /= problem.coef_scale(0)
         rows = whiten_rows(problem, mask, coef, n_steps=0)
         residual = rows.target - rows.theta @ coef

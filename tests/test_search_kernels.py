@@ -1,6 +1,6 @@
 """Steps of a search, compiled ones among them, against the same step in plain NumPy."""
 
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 import pytest
@@ -96,19 +96,6 @@ def test_least_squares_on_rows_is_that_of_numpy() -> None:
     np.testing.assert_allclose(unit @ unit.T, covariance, rtol=1e-10)
 
 
-def test_a_coefficient_at_its_bound_has_no_covariance() -> None:
-    rng = np.random.default_rng(6)
-    theta = rng.normal(size=(30, 3))
-    target = theta @ [1.0, -2.0, 3.0]
-    bounds = np.array([[-np.inf, 0.0, -np.inf], [np.inf] * 3])
-    fit = LeastSquares.of_rows(theta, target, bounds)
-    others = LeastSquares.of_rows(theta[:, [0, 2]], target)
-    assert fit.held.tolist() == [False, True, False]
-    np.testing.assert_allclose(fit.coef, [others.coef[0], 0.0, others.coef[1]], atol=1e-12)
-    assert not fit.root[1].any()
-    assert fit.squares == pytest.approx(others.squares)
-
-
 def plain_thresholding(xx: np.ndarray, xy: np.ndarray, start: np.ndarray, limit: float) -> list:
     """The support at which thresholded least squares ends."""
     mask = start.copy()
@@ -128,7 +115,7 @@ def test_thresholds_are_iterated_alone() -> None:
     for k, case in enumerate(zip(xx, xy, yy, strict=True)):
         masks, start = search.supports(*case), np.array([True] * 5 + [k != 1])
         plain = [plain_thresholding(*case[:2], start, s * np.sqrt(case[2])) for s in limits]
-        assert masks.tolist() == plain
+        assert masks.tolist() == [mask for mask, _ in groupby(plain)]
         assert small.supports(*case).tolist() == masks[masks.sum(axis=1) <= 2].tolist()
 
 

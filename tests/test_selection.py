@@ -5,8 +5,7 @@ import ep2sindy as ep
 from ep2sindy.regression.bootstraps import pool_supports
 from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.selection.criteria import log_supports
-from ep2sindy.selection.rule import Selection
+from ep2sindy.selection.criteria import Selection, log_supports
 from tests.models import plain_rows
 
 BIC, LOG_KNEE = ep.EBIC(gamma=0.0, coarsening=None), ep.Knee(scale="log")

@@ -17,7 +17,7 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import Progress
 from ep2sindy.runtime.threads import NUMBERS, one_thread
-from ep2sindy.selection.rule import Basis, Decision
+from ep2sindy.selection.criteria import Basis, Decision
 
 PREY = ep.lotka_volterra()
 

@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from ep2sindy.regression.test_functions import (
+from ep2sindy.regression.windows import (
     EDGE,
     Boxes,
     Bumps,
     WindowFunctions,
+    Windows,
     bump_power,
     spectral_half_width,
 )
-from ep2sindy.regression.windows import Windows
 
 T = np.linspace(0.0, 2.0, 401)  # steps of 5 ms
 

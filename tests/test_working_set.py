@@ -19,8 +19,8 @@ from ep2sindy.estimation.solver import COMPARED_AT, Solution, from_smooth, refit
 from ep2sindy.estimation.supports import term_prices
 from ep2sindy.estimation.working_set import first_set
 from ep2sindy.regression import searches
-from ep2sindy.regression.exchanges import exchange_terms
 from ep2sindy.regression.gram_kernels import invert_gram
+from ep2sindy.regression.searches import exchange_terms
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System
 from tests.models import model_of

@@ -12,12 +12,12 @@ from ep2sindy.data.numbers import without_marks
 from ep2sindy.data.readers.table_layout import split_name
 from ep2sindy.library.units import (
     PLAIN,
+    UNIT_ERRORS,
     check_unit,
     is_count,
     netcdf_powers,
     registry,
     time_unit_in,
-    unit_errors,
     unit_product,
 )
 
@@ -290,7 +290,7 @@ def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[floa
         given = given.to("kelvin") if target and given.check("[temperature]") else given
         # A temperature in eV means k_B T.
         ruler = given.to(target, "boltzmann") if target else given.to_base_units()
-    except unit_errors() as error:
+    except UNIT_ERRORS as error:
         raise ValueError(
             f"the unit of {ours} must be one that converts to {target or 'SI'}: {unit!r} came "
             f"({error or type(error).__name__}); write for example 'cm^-3', '1e19 m^-3', 'km/s'"
@@ -326,7 +326,7 @@ def same_unit(unit: str, stated: str) -> bool:
     """True if both texts mean the same unit, or if one of them is not a unit at all."""
     try:
         a, b = _ruler(unit).to_base_units(), _ruler(counted_in(stated)).to_base_units()
-    except unit_errors():
+    except UNIT_ERRORS:
         return True
     return a.check(b.dimensionality) and np.allclose(a.magnitude, b.magnitude, rtol=1e-9, atol=0.0)
 

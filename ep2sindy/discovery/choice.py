@@ -20,16 +20,15 @@ from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.constrained import constrained_fit
-from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
+from ep2sindy.regression.formulations import RandomSplit, Weak
+from ep2sindy.regression.front import Candidate, LeftOver, ParetoFront, fit_support
 from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.whitening import NEGLIGIBLE, whiten_rows
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.combinations import cheapest_first, support_of
-from ep2sindy.selection.rule import Decision, OtherSystem, Selection
+from ep2sindy.selection.criteria import Decision, OtherSystem, Selection, cheapest_first, support_of
 
 # Most combinations, of the fronts that relations join, to look at for one with the terms.
 MAX_COMBINATIONS = 100_000
@@ -49,40 +48,6 @@ N_STEPS = 8
 SMALLEST = np.finfo(np.float64).tiny  # for exact fits, without residuals
 
 
-@dataclass(frozen=True)
-class LeftOver:
-    """Residuals of one equation on its rows, whitened by the noise that propagates into them.
-
-    chi_squared: per row, 1 if the residuals are nothing but noise. autocorrelation: of the
-    residuals of neighbouring rows, then 0. leaves_noise: True if chi_squared is consistent with
-    noise alone.
-    """
-
-    chi_squared: float
-    autocorrelation: float
-    leaves_noise: bool
-
-
-@dataclass(frozen=True, eq=False)
-class EquationFit:
-    """The fitted terms of one equation of a model.
-
-    coef: (terms,), in SI. covariance: (terms, terms) of coef, in SI; None if the noise of the rows
-    is not known, or if the residuals exceed it. left: residuals on the rows; None if their noise is
-    not known.
-    """
-
-    equation: str
-    terms: tuple[str, ...]
-    coef: Float[np.ndarray, " terms"]
-    covariance: Float[np.ndarray, "terms terms"] | None = None
-    left: LeftOver | None = None
-
-    @property
-    def coef_by_term(self) -> dict[str, float]:
-        return dict(zip(self.terms, self.coef.tolist(), strict=True))
-
-
 @dataclass(frozen=True, eq=False)
 class NoiseTest:
     """Test whether a model explains the data to within their noise.
@@ -99,26 +64,31 @@ class NoiseTest:
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
-    """Result of applying a selection rule to the Pareto fronts.
+class IdentifiedEquations:
+    """Result of applying a method to runs.
 
-    fronts: with the scores of the rule. chosen: for each front, the selected candidate. model: of
-    the chosen terms; its coefficients may differ from the candidates' by weighting, constraints or
-    refinement. note: how the rule decided; else empty. left: for each state, the residuals of the
-    final fit on rows whose noise is known; None if the model was not judged by rows. n_free: for
+    fronts: the candidates of every equation, with the scores of the selection rule. chosen: for
+    each front, the selected candidate. model: of the chosen terms; its coefficients may differ from
+    the candidates' by weighting, constraints or refinement. note: how the rule decided; else empty.
+    left: for each state, the residuals of the final fit on rows whose noise is known. n_free: for
     each state named by a relation that holds in the model, the number of free coefficients of its
     equation. constraint: that the coefficients obey; None if they are all free. others: systems of
-    the same size that would do as well.
+    the same size that would do as well. ambiguities: terms that these data cannot tell apart, and
+    warnings of too few rows for the terms. remarks: sentences on where the samples deviate from the
+    assumptions. estimate: of states and coefficients together; None after a regression.
     """
 
     fronts: Sequence[ParetoFront]
     chosen: Sequence[Candidate]
     model: SparseModel
     note: str = ""
-    left: Mapping[str, LeftOver] | None = None
+    left: Mapping[str, LeftOver] = field(default_factory=dict)
     n_free: Mapping[str, int] = field(default_factory=dict)
     constraint: Constraint | None = None
     others: Sequence[OtherSystem] = ()
+    ambiguities: Sequence[Ambiguity] = ()
+    remarks: Sequence[str] = ()
+    estimate: Estimate | None = None
 
 
 def choose(
@@ -128,7 +98,7 @@ def choose(
     *,
     provenance: Mapping[str, str],
     progress: Progress = SILENT,
-) -> Choice:
+) -> IdentifiedEquations:
     """Select from the candidates of a regression, and fit: constrained, weighted or unchanged.
 
     A rule that runs whole systems has fitted the winner. For any other, under relations, only
@@ -152,12 +122,12 @@ def choose(
         won = [f.with_scores(_won(f.scores, int(k))) for f, k in zip(scored, place, strict=True)]
         best = [front.candidates[k] for front, k in zip(won, place, strict=True)]
         n_free = _count_free(held, bound)
-        return Choice(won, best, model, left={}, n_free=n_free, constraint=held)
+        return IdentifiedEquations(won, best, model, n_free=n_free, constraint=held)
     best = [front.best for front in scored]
     fits = [fit_last(*pair) for pair in zip(scored, best, strict=True)]
     model = assemble_model(library, fits, units=units, provenance=provenance)
     left = {fit.equation: fit.left for fit in fits if fit.left is not None}
-    return Choice(scored, best, model, left=left)
+    return IdentifiedEquations(scored, best, model, left=left)
 
 
 def choose_system(
@@ -166,7 +136,7 @@ def choose_system(
     runs: Sequence[Trajectory],
     *,
     provenance: Mapping[str, str],
-) -> Choice:
+) -> IdentifiedEquations:
     """The choice that the decision of a rule that runs systems makes, with its scores."""
     assert decision.model is not None
     scored = [f.with_scores(s) for f, s in zip(fronts, decision.scores, strict=True)]
@@ -175,12 +145,12 @@ def choose_system(
     held = decision.constraint
     if held is not None and len(held.free) == len(held.coefficients):
         held = None
-    return Choice(scored, best, model, decision.note, constraint=held, others=decision.others)
+    return IdentifiedEquations(
+        scored, best, model, decision.note, constraint=held, others=decision.others
+    )
 
 
-def judge_noise(
-    choice: Choice, runs: Sequence[Trajectory], *, estimate: Estimate | None = None
-) -> NoiseTest:
+def judge_noise(choice: IdentifiedEquations, runs: Sequence[Trajectory]) -> NoiseTest:
     """Test the residuals of the chosen model against the noise of the samples.
 
     A state that the final fit has tested on its own rows keeps that result. Any other state is
@@ -189,13 +159,14 @@ def judge_noise(
     which are whitened, and that fit is tested: coefficients of a formulation that does not weigh
     its rows are not. A state without such rows, for example for a record of a few samples, is not
     tested. Of long records, blocks of 20,000 samples together are tested.
-    estimate: of states and coefficients together, which has tested whole trajectories already. It
-    counts only if the chosen model is its own.
+    An estimate of states and coefficients together has tested whole trajectories already. It counts
+    only if the chosen model is its own.
     """
+    estimate = choice.estimate
     if estimate is not None and estimate.model is choice.model:
         return NoiseTest(misfit=estimate.misfit, tested=True)
     runs = runs if estimate is None else estimate.runs  # with hidden states
-    states, tested = choice.model.states, choice.left or {}
+    states, tested = choice.model.states, choice.left
     unknown = [state for state in states if state not in tested]
     found = {**tested, **(_test_on_weak_rows(choice, runs, unknown) if unknown else {})}
     ordered = {state: found[state] for state in states if state in found}
@@ -203,10 +174,10 @@ def judge_noise(
 
 
 def _test_on_weak_rows(
-    choice: Choice, runs: Sequence[Trajectory], states: Sequence[str]
+    choice: IdentifiedEquations, runs: Sequence[Trajectory], states: Sequence[str]
 ) -> dict[str, LeftOver]:
     """Residuals of some equations on weak rows, as far as their rows can be made and whitened."""
-    model, left = choice.model, {}
+    model, left = choice.model, dict[str, LeftOver]()
     try:
         # Same result as with the whole library, at a fraction of the cost.
         used = np.isin(model.library.names, [name for s in states for name in model.terms(s)])
@@ -218,19 +189,13 @@ def _test_on_weak_rows(
         return {}
     problems = {problem.equations[0]: problem for problem in rows}
     for state in states:
-        problem, fit = problems[state], _fit_in(model, state)
+        problem, fit = problems[state], Candidate.of(state, model.terms(state))
         with suppress(ValueError, np.linalg.LinAlgError):
             if state in choice.n_free:
                 left[state] = _test_fit(problem, fit, n_free=choice.n_free[state])
-            else:
-                left[state] = _test_terms(problem, fit)
+            elif (tested := reweight(problem, fit, negligible=NEGLIGIBLE).left) is not None:
+                left[state] = tested
     return left
-
-
-def _fit_in(model: SparseModel, state: str) -> EquationFit:
-    """One equation of a model as a fit."""
-    terms = model.terms(state)
-    return EquationFit(state, tuple(terms), np.array(list(terms.values())))
 
 
 def _count_free(held: Constraint, relations: Sequence[Relation]) -> dict[str, int]:
@@ -264,16 +229,14 @@ def _describe_misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> 
     )
 
 
-def fit_last(front: ParetoFront, candidate: Candidate) -> EquationFit:
+def fit_last(front: ParetoFront, candidate: Candidate) -> Candidate:
     """Final fit of a selected candidate, weighted if the noise of its rows is known."""
-    if front.rows.noisy is None:
-        return EquationFit(candidate.equation, candidate.terms, candidate.coef)
-    return reweight(front.rows, candidate)
+    return candidate if front.rows.noisy is None else reweight(front.rows, candidate)
 
 
 def assemble_model(
     library: Library,
-    fits: Sequence[EquationFit],
+    fits: Sequence[Candidate],
     *,
     units: Mapping[str, str],
     provenance: Mapping[str, str],
@@ -290,19 +253,20 @@ def assemble_model(
     )
 
 
-def reweight(problem: RegressionRows, candidate: Candidate | EquationFit) -> EquationFit:
+def reweight(
+    problem: RegressionRows, candidate: Candidate, *, negligible: float = 0.0
+) -> Candidate:
     """Fit a candidate's terms again, with weights and corrected samples, and test the residuals.
 
     If the residuals exceed the noise of the rows there is no covariance: intervals would not cover
-    the truth.
+    the truth. negligible: as for `whiten_rows`.
     """
-    theta, target, scale = whiten_terms(problem, candidate)
+    theta, target, scale = whiten_terms(problem, candidate, negligible=negligible)
     fit = LeastSquares.of_rows(theta, target)
     root = fit.root * scale[:, None]
     left = _compare_with_noise(target - theta @ fit.coef, n_free=len(scale))
-    return EquationFit(
-        equation=candidate.equation,
-        terms=candidate.terms,
+    return replace(
+        candidate,
         coef=fit.coef * scale,
         covariance=root @ root.T if left.leaves_noise else None,
         left=left,
@@ -311,7 +275,7 @@ def reweight(problem: RegressionRows, candidate: Candidate | EquationFit) -> Equ
 
 def whiten_terms(
     problem: RegressionRows,
-    candidate: Candidate | EquationFit,
+    candidate: Candidate,
     *,
     terms: Sequence[str] | None = None,
     negligible: float = 0.0,
@@ -325,22 +289,15 @@ def whiten_terms(
     names = candidate.terms if terms is None else tuple(terms)
     order = [problem.library.index(name) for name in names]
     scale = problem.coef_scale(0)
-    own, coef = np.isin(problem.term_names, candidate.terms), np.zeros(len(scale))
+    own, coef = np.isin(problem.library.names, candidate.terms), np.zeros(len(scale))
     places = [problem.library.index(name) for name in candidate.terms]
     coef[places] = candidate.coef / scale[places]
-    kept = np.isin(problem.term_names, names)
+    kept = np.isin(problem.library.names, names)
     rows = whiten_rows(problem, own, coef, n_steps=N_STEPS, negligible=negligible, kept=kept)
     return rows.theta[:, order], rows.target, scale[order]
 
 
-def _test_terms(problem: RegressionRows, fit: EquationFit) -> LeftOver:
-    """Residuals of a fit's terms, fitted again with weights as by `reweight`."""
-    theta, target, _ = whiten_terms(problem, fit, negligible=NEGLIGIBLE)
-    fitted = LeastSquares.of_rows(theta, target).coef
-    return _compare_with_noise(target - theta @ fitted, n_free=len(fitted))
-
-
-def _test_fit(problem: RegressionRows, fit: EquationFit, *, n_free: int) -> LeftOver:
+def _test_fit(problem: RegressionRows, fit: Candidate, *, n_free: int) -> LeftOver:
     """Residuals of a fit with its own coefficients, whitened about a free fit of its terms.
 
     The free fit is as close to the data as these terms allow, so the samples are corrected by it,

@@ -10,12 +10,8 @@ import numpy as np
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import judge_noise
-from ep2sindy.discovery.method import (
-    DiscoveryMethod,
-    IdentifiedEquations,
-    TrajectorySearch,
-)
+from ep2sindy.discovery.choice import IdentifiedEquations, judge_noise
+from ep2sindy.discovery.method import DiscoveryMethod, TrajectorySearch
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Relation, relations_of
@@ -75,22 +71,21 @@ def discover(
 def _discovery(
     found: IdentifiedEquations, method: DiscoveryMethod, runs: Sequence[Trajectory]
 ) -> Discovery:
-    choice = found.choice
-    test = judge_noise(choice, runs, estimate=found.estimate)
+    test = judge_noise(found, runs)
     # Intervals of a model that does not explain the data would not cover the truth.
-    model = replace(choice.model, clock=runs[0].clock)
+    model = replace(found.model, clock=runs[0].clock)
     return Discovery(
-        fronts={front.equation: front for front in choice.fronts},
-        chosen={each.equation: _as_in(choice.model, each) for each in choice.chosen},
+        fronts={front.equation: front for front in found.fronts},
+        chosen={each.equation: _as_in(found.model, each) for each in found.chosen},
         model=replace(model, covariance=None) if test.misfit else model,
         method=method,
         ambiguities=found.ambiguities,
         noise_test=test,
-        note=choice.note or test.misfit,
+        note=found.note or test.misfit,
         remarks=found.remarks,
         estimate=found.estimate,
-        constraint=choice.constraint,
-        others=choice.others,
+        constraint=found.constraint,
+        others=found.others,
     )
 
 

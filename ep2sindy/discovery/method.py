@@ -19,37 +19,20 @@ from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import Choice, choose, choose_system
+from ep2sindy.discovery.choice import IdentifiedEquations, choose, choose_system
 from ep2sindy.estimation.cost import check_limit_s
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
 from ep2sindy.library.roles import Roles
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
 from ep2sindy.regression.bootstraps import Bootstraps, Resamples, Supports, draw_resamples, pool
+from ep2sindy.regression.formulations import WeightedWeak
 from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.searches import BestSubset, Search
-from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.values import check_kind, set_counts
-from ep2sindy.selection.criteria import EBIC, Evidence
-from ep2sindy.selection.rule import Selection
-
-
-@dataclass(frozen=True, eq=False)
-class IdentifiedEquations:
-    """Result of applying a method to runs.
-
-    choice: the candidates of every equation, with their scores, and the model of the chosen ones.
-    ambiguities: terms that these data cannot tell apart, and warnings of too few rows for the
-    terms. remarks: sentences on where the samples deviate from the assumptions. estimate: of states
-    and coefficients together; None after a regression.
-    """
-
-    choice: Choice
-    ambiguities: Sequence[Ambiguity]
-    remarks: Sequence[str]
-    estimate: Estimate | None = None
+from ep2sindy.selection.criteria import EBIC, Evidence, Selection
 
 
 @dataclass(frozen=True)
@@ -116,7 +99,7 @@ class TrajectorySearch:
     courses: Mapping[str, str] | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
-        set_counts(self, {"depth": 1} | ({} if self.max_terms is None else {"max_terms": 1}))
+        set_counts(self, {"depth": 1, "max_terms": 1})
         check_limit_s(self.limit_s)
         check_kind("selection", self.selection, Selection, "ep.Evidence()")
         if self.selection.basis == "rows":
@@ -148,8 +131,12 @@ class TrajectorySearch:
         found = self._estimate(task, progress)
         library = found.model.library  # with the terms of known equations
         task = replace(task, runs=found.runs, hidden=(), library=library)
-        choice = self._choose(found, task, progress)
-        return IdentifiedEquations(choice, _ambiguities_of_samples(task), found.remarks, found)
+        return replace(
+            self._choose(found, task, progress),
+            ambiguities=_ambiguities_of_samples(task),
+            remarks=found.remarks,
+            estimate=found,
+        )
 
     def _estimate(self, task: Task, progress: Progress) -> Estimate:
         provenance = self.provenance | _labels(task)
@@ -163,7 +150,7 @@ class TrajectorySearch:
             progress=progress,
         )
 
-    def _choose(self, found: Estimate, task: Task, progress: Progress) -> Choice:
+    def _choose(self, found: Estimate, task: Task, progress: Progress) -> IdentifiedEquations:
         """Candidates of every equation with their scores, and the model by the selection rule."""
         fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
         decision = self.selection.decide(fronts, task, progress=progress)
@@ -172,7 +159,9 @@ class TrajectorySearch:
             return replace(choice, model=replace(choice.model, courses=found.model.courses))
         scored = [front.with_scores(s) for front, s in zip(fronts, decision.scores, strict=True)]
         best = [front.best for front in scored]
-        return Choice(scored, best, found.model, found.note, constraint=found.constraint)
+        return IdentifiedEquations(
+            scored, best, found.model, found.note, constraint=found.constraint
+        )
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
@@ -196,22 +185,9 @@ def _front(
     kept = [support for k, support in ranked if k < depth or support.deviance == 0.0]
     if not kept or kept[0].coef:
         kept = [ScoredSupport({}, float("inf")), *kept]
-    return ParetoFront(state, [_candidate(state, support, library) for support in kept])
-
-
-def _candidate(state: str, support: ScoredSupport, library: Library) -> Candidate:
-    """A candidate without rows and bootstraps behind it."""
-    terms = tuple(name for name in library.names if name in support.coef)
-    return Candidate(
-        equation=state,
-        terms=terms,
-        coef=np.array([support.coef[name] for name in terms]),
-        r2_train=float("nan"),
-        r2_test=float("nan"),
-        share=float("nan"),
-        inclusion=np.full(len(terms), np.nan),
-        deviance=support.deviance,
-    )
+    ordered = [{name: s.coef[name] for name in library.names if name in s.coef} for s in kept]
+    pairs = zip(ordered, kept, strict=True)
+    return ParetoFront(state, [Candidate.of(state, coef, s.deviance) for coef, s in pairs])
 
 
 def _ambiguities_of_samples(task: Task) -> tuple[Ambiguity, ...]:
@@ -296,20 +272,22 @@ class Regression:
             )
         if any(run.missing is not None for run in task.runs):
             task = replace(task, runs=[run.complete() for run in task.runs])
-        if task.roles is not None:
-            return self._identify_under(task.roles, task, rng=rng, progress=progress)
-        equations = self.search_equations(task, rng=rng, progress=progress)
-        fronts = [equation.front for equation in equations]
-        choice = self.choose(fronts, task, progress=progress)
+        if task.roles is None:
+            equations = self.search_equations(task, rng=rng, progress=progress)
+            fronts = [equation.front for equation in equations]
+            choice = self.choose(fronts, task, progress=progress)
+        else:
+            choice = self._choose_under(task.roles, task, rng=rng, progress=progress)
         found: list[Ambiguity] = []
-        for rows in dict.fromkeys(front.rows for front in fronts):
+        for rows in dict.fromkeys(front.rows for front in choice.fronts):
             # Known equations are not searched, so too few rows do no harm to them.
             if not set(rows.equations) <= set(task.terms):
                 found += few_rows(rows)
             found += ambiguities(rows)
-        return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(task.runs))
+        remarks = _limits(task.runs)
+        return replace(choice, ambiguities=tuple(dict.fromkeys(found)), remarks=remarks)
 
-    def _identify_under(
+    def _choose_under(
         self, roles: Roles, task: Task, *, rng: np.random.Generator, progress: Progress
     ) -> IdentifiedEquations:
         """Search all equations at once for systems that keep the roles, and let the rule decide.
@@ -332,9 +310,7 @@ class Regression:
         systems = search_conserving_systems(problems, task, roles, self.search, depth=self.depth)
         decision = self.selection.judge(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)
-        choice = choose_system(systems.fronts, decision, task.runs, provenance=provenance)
-        found = [each for rows in problems for each in (*few_rows(rows), *ambiguities(rows))]
-        return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(task.runs))
+        return choose_system(systems.fronts, decision, task.runs, provenance=provenance)
 
     def search_equations(
         self, task: Task, *, rng: np.random.Generator | int, progress: Progress = SILENT
@@ -358,7 +334,7 @@ class Regression:
 
     def choose(
         self, fronts: Sequence[ParetoFront], task: Task, *, progress: Progress = SILENT
-    ) -> Choice:
+    ) -> IdentifiedEquations:
         """Select a candidate from every front, and fit it."""
         provenance = self.provenance | _labels(task)
         return choose(fronts, self.selection, task, provenance=provenance, progress=progress)
@@ -413,24 +389,14 @@ def method_of(
             f"a search of trajectories draws no bootstraps: {bootstraps!r} came; take "
             "Bootstraps(n=0) (bootstraps=none), or a regression"
         )
-    plain = TrajectorySearch()
-    return replace(
-        search,
-        selection=_once("selection", search.selection, selection, plain.selection),
-        depth=_once("depth", search.depth, depth, plain.depth),
-    )
-
-
-def _once(name: str, own: Any, given: Any, default: Any) -> Any:
-    """A setting of the search, or what was given beside it: a config always has a value there.
-
-    Raises ValueError for a setting that the search has already, with another value.
-    """
-    if given == default:
-        return own
-    if own not in (default, given):
-        raise ValueError(
-            f"{name} must be set once: {own!r} came in the search (search.{name}), and "
-            f"{given!r} beside it; leave one of them out"
-        )
-    return given
+    set_here: dict[str, Any] = {}
+    for name, given in (("selection", selection), ("depth", depth)):
+        own, default = getattr(search, name), getattr(TrajectorySearch(), name)
+        if given != default:  # a config always has a value there
+            if own not in (default, given):
+                raise ValueError(
+                    f"{name} must be set once: {own!r} came in the search (search.{name}), and "
+                    f"{given!r} beside it; leave one of them out"
+                )
+            set_here[name] = given
+    return replace(search, **set_here)

@@ -39,8 +39,8 @@ from ep2sindy.model.display import model_lines
 from ep2sindy.model.free_run import FreeCycle, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.bootstraps import Bootstraps
+from ep2sindy.regression.formulations import WeightedWeak
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.parallel import Once, at_once
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences

@@ -306,7 +306,7 @@ def search_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
         point["inclusion"][row] = equation.supports.inclusion[chosen.n_terms]
         point["weight"][row] = weigh_terms(point["coef"][row] * problem.theta_scale)
         fits = equation.draws.fits(equation.number, equation.found, mask)
-        point["coef_draws"][:, row] = problem.coef_SI(fits, equation.number)
+        point["coef_draws"][:, row] = fits * problem.coef_scale(equation.number)
         point["weight_draws"][:, row] = weigh_terms(fits)
         point["r2_train"][row], point["r2_test"][row] = chosen.r2_train, chosen.r2_test
         point["n_terms"][row] = chosen.n_terms

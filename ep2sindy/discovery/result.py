@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ep2sindy._stubs import dotted_names, place_of
 from ep2sindy.data.runs import Run
-from ep2sindy.discovery.choice import LeftOver, NoiseTest
+from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.method import DiscoveryMethod
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.forecasting.bands import Forecast
@@ -26,10 +26,10 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.storage import read_as, read_stored
 from ep2sindy.regression.ambiguity import Ambiguity
-from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
+from ep2sindy.regression.front import Candidate, Cloud, LeftOver, ParetoFront
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
-from ep2sindy.selection.rule import OtherSystem
+from ep2sindy.selection.criteria import OtherSystem
 
 FORMAT = "ep2sindy.Discovery/1"
 

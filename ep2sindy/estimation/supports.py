@@ -12,9 +12,8 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.likelihood import Gram, within_bounds
 from ep2sindy.estimation.problem import ByCoefficient, EstimationProblem, Support
-from ep2sindy.regression.exchanges import exchange_terms
 from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, invert_gram
-from ep2sindy.regression.searches import search_subsets
+from ep2sindy.regression.searches import exchange_terms, find_best_subsets
 
 MAX_SWEEPS = 10  # over the equations; two or three usually suffice
 # Weight of the cost of choosing among terms. Below 0.5 there are more false terms than true ones
@@ -158,7 +157,7 @@ def offer_supports(
     target = np.where(at_hand, xy / size, 0.0)
     problem_of_one = unit[None], (target / np.sqrt(yy))[None], np.ones(1)
     max_terms, n_own = problem.max_terms, int(own.sum())
-    masks, proven = search_subsets(
+    masks, proven = find_best_subsets(
         *problem_of_one,
         max_terms=min(max_terms, PROVEN_TERMS, n_own),
         n_best=N_BEST,

@@ -47,8 +47,8 @@ from ep2sindy.estimation.solver import (
     smooth_states,
 )
 from ep2sindy.estimation.supports import N_BEST, term_prices
-from ep2sindy.regression.exchanges import exchange_terms
 from ep2sindy.regression.gram_kernels import invert_gram
+from ep2sindy.regression.searches import exchange_terms
 
 # Model errors of the first set: the state nearly free, or quite. One alone leaves out more true
 # terms.

@@ -6,11 +6,10 @@ log(n_i / 1 m^-3).
 
 from __future__ import annotations
 
-import operator
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, partial
 from math import isfinite
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -55,9 +54,7 @@ class Kind:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by name; a user's function is registered again in the receiving process."""
-        if not self.own:
-            return _built_in, (self.name,)
-        return _register_received, (self.name, self.value, self.slope, self.domain)
+        return _receive, (self.name, *((self.value, self.slope, self.domain) if self.own else ()))
 
 
 @dataclass(frozen=True)
@@ -90,9 +87,15 @@ class Function:
         with np.errstate(all="ignore"):
             return float(self.value(np.array([x]))[0])
 
-    def derivative(self) -> tuple[float, Function]:
+    @property
+    def is_variable(self) -> bool:
+        """True for the variable itself."""
+        return not self.kind.name
+
+    def derivative(self) -> tuple[float, Function | None]:
+        """Factor and function whose product is the derivative; None for the function one."""
         assert not self.is_slope, "second derivatives are never needed"
-        return self.scale, replace(self, is_slope=True)
+        return self.scale, None if self.is_variable else replace(self, is_slope=True)
 
     def scaled(self, scale: float) -> tuple[float, Function]:
         if self.kind.degree is None or not scale > 0.0:
@@ -137,15 +140,10 @@ class Function:
             return wrong | ~np.isfinite(self.value(x)) | ~np.isfinite(slope.value(x))
 
     @property
-    def has_poles(self) -> bool:
-        """True if the domain consists of several intervals."""
-        return len(self.kind.domain) > 1
-
-    @property
     def need(self) -> str:
         """Condition on the variable, in words: `x > 0`."""
         argument = Part("", self.variable, self.scale, self.shift).argument
-        if self.has_poles:
+        if len(self.kind.domain) > 1:  # at poles
             ends = ", ".join(number_text(high) for _, high in self.kind.domain[:-1])
             return f"{argument} to stay on one side of {ends}"
         ((low, high),) = self.kind.domain
@@ -176,6 +174,7 @@ def _of(name: str) -> Values:
 _POSITIVE: tuple[Interval, ...] = ((0.0, np.inf),)
 _POLE: tuple[Interval, ...] = ((-np.inf, 0.0), (0.0, np.inf))
 _BUILT_IN = (
+    Kind("", lambda x: x, lambda x: array_namespace(x).ones_like(x), degree=1.0),  # the identity
     Kind("sin", _of("sin"), _of("cos")),
     Kind("cos", _of("cos"), lambda x: -array_namespace(x).sin(x)),
     Kind("exp", _of("exp"), _of("exp"), ((-np.inf, LARGEST_EXPONENT),)),
@@ -192,11 +191,11 @@ INVERSE = "inverse"  # name that asks for the reciprocal of every variable
 
 def function_names() -> list[str]:
     """Names of all functions that terms may use, in the order of registration."""
-    return [INVERSE if name == RECIPROCAL else name for name in _kinds]
+    return [INVERSE if name == RECIPROCAL else name for name in _kinds if name]
 
 
 def function_of(part: Part) -> Function:
-    """Function that a part of a term's name stands for.
+    """Function that a part of a term's name stands for; of a variable alone the identity.
 
     Raises UnknownFunctionError, listing the known functions; ValueError if the variable is
     multiplied by zero, or a number is not finite.
@@ -212,6 +211,11 @@ def function_of(part: Part) -> Function:
     if not part.scale:
         raise ValueError(f"a function must be of its variable: {part.text!r} multiplies it by 0")
     return Function(_kinds[name], part.variable, part.scale, part.shift)
+
+
+def variable_factor(name: str) -> Function:
+    """The factor that is a variable itself."""
+    return Function(_kinds[""], name)
 
 
 def register_function(
@@ -244,22 +248,12 @@ def register_function(
     if not low < high:
         raise ValueError(f"a domain must be an interval (low, high): {domain} came")
     if derivative is None:
-        derivative = _derive(name, value, (low, high))
+        needs = f"a derivative is found by itself for {FORMULA}: {name!r} is none"
+        way_out = f"give it, as in ep.register_function({name!r}, value, derivative)"
+        _record(value, (low, high), needs, way_out)
+        derivative = partial(_evaluate_slope, value, (low, high))
     _check_derivative(name, value, derivative, low, high)
     _kinds[name] = Kind(name, value, derivative, ((low, high),), own=True)
-
-
-def _derive(name: str, value: Values, domain: Interval) -> Values:
-    """The derivative of a formula. Raises ValueError, with the way out, for what is none."""
-    try:
-        slope = DerivedSlope(value, domain)
-        slope(points_inside(*domain))
-    except NoFormulaError as error:
-        raise ValueError(
-            f"a derivative is found by itself for {FORMULA}: {name!r} is none ({error}); give it, "
-            f"as in ep.register_function({name!r}, value, derivative)"
-        ) from error
-    return slope
 
 
 def _check_derivative(
@@ -313,25 +307,23 @@ def formula(kind: Kind, argument: sympy.Expr) -> sympy.Expr:
 
     Raises ValueError for a function that is no formula of NumPy's arithmetic and functions.
     """
-    try:
-        x, found = _record(kind.value, kind.domain[0])
-    except NoFormulaError as error:
-        raise ValueError(
-            f"a function of your own leaves the package as {FORMULA}: {kind.name!r} came, which is "
-            f"none ({error}); register it again, written so, and load the model again, or leave "
-            "the function out of the library"
-        ) from error
+    needs = (
+        f"a function of your own leaves the package as {FORMULA}: {kind.name!r} came, which is none"
+    )
+    way_out = (
+        "register it again, written so, and load the model again, or leave the function out of the "
+        "library"
+    )
+    x, found = _record(kind.value, kind.domain[0], needs, way_out)
     return found.xreplace({x: argument})
 
 
-class NoFormulaError(ValueError):
-    """A function that cannot be recorded as a formula."""
-
-
-def _record(value: Values, domain: Interval) -> tuple[sympy.Symbol, sympy.Expr]:
+def _record(
+    value: Values, domain: Interval, needs: str = "", way_out: str = ""
+) -> tuple[sympy.Symbol, sympy.Expr]:
     """A symbol, and what a function computes of it, checked at a few points of its domain.
 
-    Raises NoFormulaError with the reason if it is none.
+    needs, way_out: of the ValueError that is raised, with the reason, if it is no formula.
     """
     import sympy  # imported here because it takes half a second and most runs do not need it
 
@@ -343,30 +335,22 @@ def _record(value: Values, domain: Interval) -> tuple[sympy.Symbol, sympy.Expr]:
         if not np.allclose(numbers, value(points), rtol=1e-9, atol=0.0):
             raise ValueError(f"as a formula it has other values, {numbers}")
     except (TypeError, ValueError, AttributeError, ArithmeticError, IndexError) as error:
-        raise NoFormulaError(f"{error!s:.150}") from error
+        raise ValueError(f"{needs} ({error!s:.150}); {way_out}") from error
     return x, found
 
 
-@dataclass(frozen=True)
-class DerivedSlope:
-    """The derivative of a formula, as a function of an array; it is pickled by the formula."""
+def _evaluate_slope(value: Values, domain: Interval, x: np.ndarray) -> np.ndarray:
+    """The derivative of a formula at an array; a partial of it is pickled by the formula."""
+    return np.zeros(x.shape) + _slope_of(value, domain)(x)  # that of x is one, whatever the shape
 
-    value: Values
-    domain: Interval
 
-    @cached_property
-    def _slope(self) -> Values:
-        import sympy
+@cache
+def _slope_of(value: Values, domain: Interval) -> Values:
+    import sympy
 
-        x, found = _record(self.value, self.domain)
-        slope: Values = sympy.lambdify(x, sympy.diff(found, x), "numpy")
-        return slope
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        return np.zeros(x.shape) + self._slope(x)  # that of x is one, whatever the shape
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return DerivedSlope, (self.value, self.domain)
+    x, found = _record(value, domain)
+    slope: Values = sympy.lambdify(x, sympy.diff(found, x), "numpy")
+    return slope
 
 
 class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
@@ -382,26 +366,27 @@ class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
         import sympy
 
         name = ufunc.__name__
-        if method != "__call__" or settings or name not in {**ARITHMETIC, **SYMPY_NAMES}:
+        if method != "__call__" or settings or name not in {*ARITHMETIC, *SYMPY_NAMES}:
             used = f"np.{name}" if method == "__call__" else f"np.{name}.{method}"
             raise TypeError(f"it uses {used}")
-        of = ARITHMETIC[name] if name in ARITHMETIC else getattr(sympy, SYMPY_NAMES[name])
+        # NumPy applies arithmetic to any objects, one by one.
+        of = ufunc if name in ARITHMETIC else getattr(sympy, SYMPY_NAMES[name])
         return Recorded(of(*map(_unwrap, args)))
 
 
-# NumPy's names of functions, and what does the same with sympy's expressions.
-ARITHMETIC: Mapping[str, Callable[..., Any]] = MappingProxyType(
-    {
-        "add": operator.add,
-        "subtract": operator.sub,
-        "multiply": operator.mul,
-        "divide": operator.truediv,
-        "power": operator.pow,
-        "negative": operator.neg,
-        "positive": operator.pos,
-        "square": lambda x: x**2,
-        "reciprocal": lambda x: 1 / x,
-    }
+# NumPy's arithmetic, and its functions with the names that sympy has for them.
+ARITHMETIC = frozenset(
+    [
+        "add",
+        "subtract",
+        "multiply",
+        "divide",
+        "power",
+        "negative",
+        "positive",
+        "square",
+        "reciprocal",
+    ]
 )
 SYMPY_NAMES: Mapping[str, str] = MappingProxyType(
     {name: name for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh")}
@@ -426,12 +411,6 @@ def number_sympy(value: float) -> sympy.Expr:
     return sympy.Integer(int(value)) if value.is_integer() else sympy.Float(value)
 
 
-def _built_in(name: str) -> Kind:
-    return _kinds[name]
-
-
-def _register_received(
-    name: str, value: Values, slope: Values, domain: tuple[Interval, ...]
-) -> Kind:
-    """Register a user's function received from another process, unless it is known already."""
-    return _kinds.setdefault(name, Kind(name, value, slope, domain, own=True))
+def _receive(name: str, *own: Any) -> Kind:
+    """A function by its name; a user's, from another process, is registered unless it is known."""
+    return _kinds.setdefault(name, Kind(name, *own, own=True)) if own else _kinds[name]

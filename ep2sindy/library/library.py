@@ -14,12 +14,10 @@ from array_api_compat import array_namespace
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from ep2sindy.library.functions import Function
+from ep2sindy.library.functions import Function, variable_factor
 from ep2sindy.library.names import check_state
 from ep2sindy.library.terms import (
-    Factor,
     Term,
-    VariableFactor,
     check_degrees,
     check_exponents,
     check_values,
@@ -75,7 +73,7 @@ class Library:
 
     @cached_property
     def terms(self) -> tuple[Term, ...]:
-        factors: list[Factor] = [*map(VariableFactor, self.variables), *self.functions]
+        factors = [*map(variable_factor, self.variables), *self.functions]
         return tuple(
             product({f: p for f, p in zip(factors, row, strict=True) if p}, self.variables)
             for row in self.exponents.tolist()
@@ -189,7 +187,12 @@ class Library:
         that evaluates the terms (only `rows`, if given) at the current content of that array.
         """
         n = len(known)
-        columns, table = np.ones(n + 1 + len(self.functions)), self.columns_of(known, rows)
+        columns, others = (
+            np.ones(n + 1 + len(self.functions)),
+            range(n, n + 1 + len(self.functions)),
+        )
+        places = np.array([*map(list(known).index, self.variables), *others])
+        table = places[self.table if rows is None else self.table[rows]]
         functions = [
             (n + 1 + k, f, list(known).index(f.variable))
             for k, f in enumerate(self.functions)
@@ -202,18 +205,6 @@ class Library:
             return columns[table].prod(axis=1)
 
         return columns[:n], terms
-
-    def columns_of(
-        self, known: Sequence[str], rows: np.ndarray | None = None
-    ) -> Int[np.ndarray, "rows degree"]:
-        """Rows of `table` for columns in the order: variables in `known`, a one, functions.
-
-        known: must hold all variables of the library.
-        """
-        n = len(known)
-        others = range(n, n + 1 + len(self.functions))
-        places = np.array([*map(list(known).index, self.variables), *others])
-        return places[self.table if rows is None else self.table[rows]]
 
     def with_derivatives(
         self, n: int
@@ -262,14 +253,14 @@ def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:
     """Library of these terms in this order, without repetitions."""
     distinct = list(dict.fromkeys(terms))
     used = (factor for term in distinct for factor, _ in term.factors)
-    factors: list[Factor] = list(dict.fromkeys([*map(VariableFactor, variables), *used]))
+    factors = list(dict.fromkeys([*map(variable_factor, variables), *used]))
     check_exponents(len(distinct), len(factors))
     places = {factor: k for k, factor in enumerate(factors)}
     exponents = np.zeros((len(distinct), len(factors)), dtype=np.int64)
     for row, term in zip(exponents, distinct, strict=True):
         for factor, power in term.factors:
             row[places[factor]] = power
-    functions = [factor for factor in factors if isinstance(factor, Function)]
+    functions = [factor for factor in factors if not factor.is_variable]
     return Library(variables, exponents, functions)
 
 

@@ -27,13 +27,7 @@ _DIVISOR = rf"(?:\(\s*+{ARGUMENT}\s*+\)|{VARIABLE}){_POWER}"
 
 PRODUCT = rf"(?:1\s*+/\s*+{_DIVISOR}|{_FACTOR})(?:\s*+\*\s*+{_FACTOR}|\s*+/\s*+{_DIVISOR})*"
 
-_PLAIN = rf"{VARIABLE}{_POWER}"
-
-_PLAIN_PRODUCT = re.compile(rf"\s*+{_PLAIN}(?:\s*+\*\s*+{_PLAIN})*\s*+")
-
 _TERM = re.compile(rf"\s*+{PRODUCT}\s*+")
-
-_PARTS = re.compile(rf"({VARIABLE})(?:\^(\d++))?")
 
 _FACTORS = re.compile(
     rf"(?P<over>/)?\s*+(?:(?P<function>[^\W\d]\w*+)?\(\s*+(?P<argument>{ARGUMENT})\s*+\)"
@@ -156,12 +150,13 @@ def _split_argument(text: str) -> tuple[str, float, float]:
 
 def split_factors(name: str) -> list[tuple[str, int]]:
     """Variables and powers of a product: `n_i^2*<n_n*R_ion>` -> (n_i, 2), (<n_n*R_ion>, 1)."""
-    if not _PLAIN_PRODUCT.fullmatch(name):
+    parts = split_term(name)
+    if not parts or any(part.function for part in parts):
         raise ValueError(
             f"a product is variables joined by *, with whole powers: {name!r:.300} came; write it "
             "like 'n_i^2*n_n'"
         )
-    return [(variable, _power(power, name)) for variable, power in _PARTS.findall(name)]
+    return [(part.variable, part.power) for part in parts]
 
 
 def product_of(powers: Mapping[str, int]) -> str:

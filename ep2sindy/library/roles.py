@@ -93,7 +93,11 @@ class Roles:
     def __post_init__(self) -> None:
         check_list("exchange", self.exchange)
         for entry in self.exchange:
-            if isinstance(entry, str) or len(entry) not in (2, 3) or _is_same(*entry[:2]):
+            if (
+                isinstance(entry, str)
+                or len(entry) not in (2, 3)
+                or _bodies(entry[0]) == _bodies(entry[1])
+            ):
                 raise ValueError(
                     "an exchange joins two states, (from, to), or sides such as 'A + B', by any "
                     f"term, or by those that a third entry names: {entry!r} came"
@@ -222,10 +226,11 @@ class Roles:
             )
         zones, states = list(sizes), self.states
         exchange = [
-            (*pair, _list_exchanges(*pair, near=[f"{giver}@{z}" for z in _neighbours(zones, k)]))
+            (*pair, _list_exchanges(*pair, near=[f"{giver}@{z}" for z in neighbours]))
             for k, zone in enumerate(zones)
             for giver, taker, _ in [role for role in self._roles if role.giver and role.taker]
             for pair in [(f"{giver}@{zone}", f"{taker}@{zone}")]
+            for neighbours in [(*zones[max(k - 1, 0) : k], *zones[k + 1 : k + 2])]
         ]
         for zone, beyond in pairwise(zones):
             own = [f"{state}@{zone}" for state in states]
@@ -370,19 +375,9 @@ def _bodies(side: str) -> Counter[str]:
     return Counter(state.strip() for state in side.split("+") if side)
 
 
-def _is_same(*sides: str) -> bool:
-    """Whether the same bodies stand on all sides."""
-    return len({frozenset(_bodies(side).items()) for side in sides}) == 1
-
-
 def _holds(term: str, side: str) -> bool:
     """Whether all bodies of a side are factors of a term."""
     return _bodies(side) <= Counter(factors_of(term))
-
-
-def _neighbours(zones: Sequence[str], k: int) -> list[str]:
-    """The neighbours of a zone."""
-    return [*zones[max(k - 1, 0) : k], *zones[k + 1 : k + 2]]
 
 
 def _list_exchanges(giver: str, taker: str, *, near: Sequence[str]) -> list[str]:

@@ -10,30 +10,10 @@ from dataclasses import dataclass
 from math import comb, prod
 
 from ep2sindy.library.functions import Function, function_names, function_of
-from ep2sindy.library.names import RECIPROCAL, Part, split_term
+from ep2sindy.library.names import RECIPROCAL, split_term
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.values import check_count, check_list
 from ep2sindy.trust.memory import check_memory
-
-
-@dataclass(frozen=True)
-class VariableFactor:
-    """A factor that is a variable itself."""
-
-    name: str
-
-    @property
-    def variable(self) -> str:
-        return self.name
-
-    def derivative(self) -> tuple[float, Factor | None]:
-        return 1.0, None
-
-    def unit(self, unit: str) -> str:
-        return unit
-
-
-Factor = VariableFactor | Function
 
 
 @dataclass(frozen=True)
@@ -43,7 +23,7 @@ class Term:
     factors: (factor, power) in the order of `product`, so that equal terms compare equal.
     """
 
-    factors: tuple[tuple[Factor, int], ...]
+    factors: tuple[tuple[Function, int], ...]
 
     @property
     def name(self) -> str:
@@ -72,11 +52,11 @@ class Term:
         return unit_product((f.unit(units[f.variable]), power) for f, power in self.factors)
 
 
-def product(powers: Mapping[Factor, int], variables: Sequence[str]) -> Term:
+def product(powers: Mapping[Function, int], variables: Sequence[str]) -> Term:
     """Term with these powers; each function follows its variable, in the order of `variables`."""
 
-    def place(factor: Factor) -> tuple[int, bool, str]:
-        return variables.index(factor.variable), factor.name != factor.variable, factor.name
+    def place(factor: Function) -> tuple[int, bool, str]:
+        return variables.index(factor.variable), not factor.is_variable, factor.name
 
     return Term(tuple((f, powers[f]) for f in sorted(powers, key=place) if powers[f]))
 
@@ -86,13 +66,13 @@ def read_term(name: str, variables: Sequence[str]) -> Term:
     return product(read_factors(name, variables), variables)
 
 
-def read_factors(name: str, variables: Sequence[str]) -> dict[Factor, int]:
+def read_factors(name: str, variables: Sequence[str]) -> dict[Function, int]:
     """Read the factors of a term name, and their powers.
 
     Raises ValueError for a name that is not a term, an unknown variable or function, or a degree
     beyond 100.
     """
-    powers: dict[Factor, int] = {}
+    powers: dict[Function, int] = {}
     for factor, power in _factors(name):
         if factor.variable not in variables:
             raise ValueError(
@@ -126,7 +106,7 @@ def functions_named(names: Sequence[str], variables: Sequence[str]) -> list[Func
                     "into products, or come with function_degree=2; a function of your own is "
                     "registered first, by ep.register_function"
                 )
-            found += [f for f in read_factors(text, variables) if isinstance(f, Function)]
+            found += read_factors(text, variables)
     return list(dict.fromkeys(found))
 
 
@@ -135,13 +115,8 @@ def variables_of(name: str) -> list[str]:
     return list(dict.fromkeys(factor.variable for factor, _ in _factors(name)))
 
 
-def _factors(name: str) -> list[tuple[Factor, int]]:
-    return [(factor_of(part), part.power) for part in split_term(name)]
-
-
-def factor_of(part: Part) -> Factor:
-    """Factor that a part of a term's name stands for: a variable or a function of one."""
-    return function_of(part) if part.function else VariableFactor(part.variable)
+def _factors(name: str) -> list[tuple[Function, int]]:
+    return [(function_of(part), part.power) for part in split_term(name)]
 
 
 # Limits on the size of a library, checked before it is built.

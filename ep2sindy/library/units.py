@@ -43,15 +43,8 @@ def check_unit(unit: str) -> None:
         )
 
 
-@cache
-def unit_errors() -> tuple[type[Exception], ...]:
-    """Exceptions that pint raises for text that is not a unit."""
-    import pint
-
-    return (
-        pint.PintError, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError,
-        TokenError,
-    )  # fmt: skip
+# What pint raises for text that is not a unit.
+UNIT_ERRORS = (ValueError, TypeError, AttributeError, ArithmeticError, AssertionError, TokenError)
 
 
 @cache
@@ -75,7 +68,7 @@ def _powers(unit: str) -> dict[str, float]:
     try:
         check_unit(unit)
         parsed = registry().parse_units(unit)
-    except unit_errors():
+    except UNIT_ERRORS:
         return {unit: 1.0}
     return {registry().get_symbol(name): float(p) for name, p in parsed._units.items()}  # type: ignore[arg-type]
 
@@ -101,7 +94,7 @@ def unit_like(text: str, like: str | None = None) -> bool:
         check_unit(text)
         plain = _FACTOR_BEFORE.sub("", text.strip())
         parsed = registry().parse_units(netcdf_powers(plain)) if plain else None
-    except unit_errors():
+    except UNIT_ERRORS:
         return False
     if parsed is None or like is None:
         return parsed is not None
@@ -181,7 +174,7 @@ def seconds_in(unit: str) -> float:
     try:
         check_unit(unit)
         return float(registry().Quantity(unit).to("s").magnitude)
-    except unit_errors() as error:
+    except UNIT_ERRORS as error:
         raise ValueError(
             f"a unit of time must be such as 's', 'us', 'h' or 'year': {unit!r} came"
         ) from error

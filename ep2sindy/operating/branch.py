@@ -31,7 +31,7 @@ from ep2sindy.operating.records import (
 from ep2sindy.operating.shared_support import discover_shared
 from ep2sindy.refinement.law import LawRefinement
 from ep2sindy.refinement.problem import RefinementSettings
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress

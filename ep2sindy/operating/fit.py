@@ -32,9 +32,8 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.regression.constrained import constrained_fit
-from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.formulations import Differential, RandomSplit
 from ep2sindy.regression.pooled import invert_covariance, pool_coefficients
-from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.signals.spectrum import samples_in_periods

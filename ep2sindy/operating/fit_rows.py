@@ -139,7 +139,7 @@ def _weigh_rows(
         theta, target, scale = whiten_terms(problem, candidate, terms=terms)
     else:
         columns = [problem.library.index(name) for name in terms]
-        theta, target = problem.train_theta[:, columns], problem.train_target(equation)
+        theta, target = problem.train_theta[:, columns], problem.scaled_target(equation)
         scale = problem.coef_scale(equation)[columns]
     left = LeastSquares.of_rows(theta, target).squares
     # For rows without noise the residuals are rounding, which is no scale to judge by.

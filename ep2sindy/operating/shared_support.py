@@ -22,8 +22,7 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_kind
-from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.rule import Selection
+from ep2sindy.selection.criteria import EBIC, Selection
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +200,7 @@ def _shared_front(
     by_point = [errors_of(fits[p]) for p in problems]
     errors = np.exp(np.log(np.maximum(by_point, ROUNDING)).mean(axis=0))
     order = order_front(masks.sum(axis=1), errors, depth=depth)
-    names = np.array(any_problem.term_names)
+    names = np.array(any_problem.library.names)
     return SharedFront(
         equation=equation,
         supports=tuple(tuple(names[mask].tolist()) for mask in masks[order]),

@@ -50,8 +50,6 @@ def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
     A term is simpler if its degree is lower, or if it is earlier in the library.
     """
     xx = problem.train_gram.xx
-    if _all_usable(problem.library, xx, SAME):
-        return np.ones(len(xx), dtype=np.bool_)
     usable = _distinct(problem.library, xx)
     for j, parts in _combinations(problem.library, lambda: problem.train_theta, xx):
         usable[j] = len(parts) > MAX_PARTS
@@ -106,21 +104,7 @@ def find_ambiguities(
     theta: returns the columns of the library's terms, of unit norm or zero; it is called only where
     the Gram matrix xx does not tell.
     """
-    if _all_usable(library, xx, ALIKE):
-        return ()
     return (*_zero(library, xx), *_alike(library, xx), *_dependent(library, theta, xx))
-
-
-def _all_usable(library: Library, xx: Float[np.ndarray, "terms terms"], same: float) -> bool:
-    """True if all is finite, and no term is zero, repeats another, or combines simpler ones.
-
-    same: 1 - |cosine| below which two terms are the same.
-    """
-    squares, order = np.diag(xx), order_by_degree(library)
-    if not (np.isfinite(xx).all() and (squares > 0.0).all()):
-        return False
-    apart = np.abs(xx - np.diag(squares)) <= 1.0 - same
-    return bool(apart.all() and independent_terms(xx[np.ix_(order, order)]).all())
 
 
 def _zero(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -136,11 +135,6 @@ class Resamples:
     counted: bool
     largest: int
 
-    @cached_property
-    def n_kept(self) -> Int[np.ndarray, " terms"]:
-        """Number of draws that kept each term; one instead of zero, to divide by."""
-        return np.maximum(self.kept.sum(axis=0), 1)
-
     def search(
         self,
         search: Search,
@@ -184,7 +178,8 @@ class Resamples:
                 same_size = (support & (self.scale[k] > 0.0))[None]
             xx, xy = self.xx[k], self.xy[k, equation]
             fits = fit_masks(xx, xy, same_size)
-            coef[k] = fits[int(np.argmax(explained_squares(fits, xx, xy)))] * self.scale[k]
+            best = int(np.argmax(explained_squares(fits, xx, xy))) if len(fits) > 1 else 0
+            coef[k] = fits[best] * self.scale[k]
         return coef
 
 
@@ -244,7 +239,7 @@ def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ te
         equation=draws.equations[equation],
         masks=masks,
         share=in_draw.mean(axis=0) + unknown,
-        inclusion=held / draws.n_kept + unknown,
+        inclusion=held / np.maximum(draws.kept.sum(axis=0), 1) + unknown,
     )
 
 

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.library.relations import ROUNDING, Constraint, place_of
+from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.bootstraps import Resamples
 from ep2sindy.regression.gram_kernels import invert_gram
@@ -29,7 +29,6 @@ def constrained_fit(
     problems: Sequence[RegressionRows],
     constraint: Constraint,
     *,
-    signs: Mapping[tuple[str, str], int] | None = None,
     units: Mapping[str, str] = MappingProxyType({}),
     provenance: Mapping[str, str] = MappingProxyType({}),
 ) -> SparseModel:
@@ -43,24 +42,14 @@ def constrained_fit(
     The covariance is that of the free coefficients, propagated through C; it is singular, and
     zero for fixed values. It treats all rows as independent, although the rows of two equations
     share the noise of samples. If all rows are whitened, their variance is 1; otherwise it is
-    that of the residuals. A coefficient at its bound is held there, at zero, without covariance.
+    that of the residuals.
 
     problems: as a formulation assembles them. The model has the constraint's states.
-    signs: (state, term) -> +1 or -1, for coefficients that depend on exactly one free one.
-    Raises ValueError for a state without rows, coefficients that these rows cannot tell apart,
-    or a sign that cannot be satisfied.
+    Raises ValueError for a state without rows, or coefficients that these rows cannot tell apart.
     """
     library = problems[0].library
     names, states = constraint.coefficients, constraint.states
-    signed = [
-        (place_of(library, names, state, term, f"the sign of {(state, term)}"), sign)
-        for (state, term), sign in (signs or {}).items()
-    ]
-    equations = weigh_equations(problems, constraint)
-    coef, covariance = _solve(equations, constraint, _bounds(constraint, signed))
-    for k, sign in signed:
-        if sign * coef[k] <= ROUNDING * abs(constraint.d[k]):
-            coef[k] = 0.0  # at its bound, apart from rounding
+    coef, covariance = _solve(weigh_equations(problems, constraint), constraint)
     values = [
         {term: c for (s, term), c in zip(names, coef.tolist(), strict=True) if s == state}
         for state in states
@@ -101,36 +90,6 @@ def fit_draws(
     return free[:, :, 0] @ constraint.C.T + constraint.d
 
 
-def _bounds(
-    constraint: Constraint, signed: Sequence[tuple[int, int]]
-) -> Float[np.ndarray, "2 free"]:
-    """Lower and upper bounds of the free coefficients that follow from the required signs."""
-    bounds = np.outer([-np.inf, np.inf], np.ones(len(constraint.free)))
-    for k, sign in signed:
-        name = constraint.coefficients[k]
-        if sign not in (-1, 1):
-            raise ValueError(f"a sign is +1 or -1: {sign!r} came for {name}")
-        deciding = np.flatnonzero(constraint.C[k])
-        if len(deciding) != 1:
-            names = [constraint.coefficients[j] for j in constraint.free[deciding]]
-            raise ValueError(
-                f"a sign needs a coefficient that follows from one free one: {name} "
-                f"{f'follows from {names}' if names else 'has a fixed value'}"
-            )
-        (j,) = deciding
-        bound = -constraint.d[k] / constraint.C[k, j]
-        if sign * constraint.C[k, j] > 0.0:
-            bounds[0, j] = max(bounds[0, j], bound)
-        else:
-            bounds[1, j] = min(bounds[1, j], bound)
-        if bounds[0, j] >= bounds[1, j]:
-            raise ValueError(
-                f"the sign of {name} contradicts the others: with the relations they leave no "
-                f"room for {constraint.coefficients[constraint.free[j]]}"
-            )
-    return bounds
-
-
 @dataclass(frozen=True, eq=False)
 class WeightedEquation:
     """Rows of one equation, with its part of the constraint's coefficients.
@@ -156,7 +115,7 @@ class WeightedEquation:
             white = _whiten(self.problem, self.terms, coef / scale, n_steps=0)
             return white.theta[:, self.terms] / scale, white.target
         theta = self.problem.train_theta[:, self.terms] / self.std
-        return theta / scale, self.problem.train_target(self.number) / self.std
+        return theta / scale, self.problem.scaled_target(self.number) / self.std
 
 
 def _whiten(
@@ -188,7 +147,7 @@ def weigh_equations(
 def _fit_alone(
     problem: RegressionRows, number: int, at: np.ndarray, terms: np.ndarray
 ) -> WeightedEquation:
-    theta, target = problem.train_theta[:, terms], problem.train_target(number)
+    theta, target = problem.train_theta[:, terms], problem.scaled_target(number)
     fit = LeastSquares.of_rows(theta, target)
     variance = fit.squares / max(len(target) - len(terms), 1)
     least = MIN_RESIDUAL**2 * np.square(target).mean()
@@ -207,9 +166,7 @@ def _fit_alone(
 
 
 def _solve(
-    equations: Sequence[WeightedEquation],
-    constraint: Constraint,
-    bounds: Float[np.ndarray, "2 free"],
+    equations: Sequence[WeightedEquation], constraint: Constraint
 ) -> tuple[Float[np.ndarray, " coefs"], Float[np.ndarray, "coefs coefs"]]:
     """All coefficients and their covariance, in SI; noisy rows are reweighted in each pass."""
     C, d = constraint.C, constraint.d
@@ -223,11 +180,11 @@ def _solve(
             terms, slope = equation.rows(coef[equation.at])
             theta = np.concatenate([theta, terms @ C[equation.at]])
             target = np.concatenate([target, slope - terms @ d[equation.at]])
-        fit = LeastSquares.of_rows(theta, target, bounds)
+        fit = LeastSquares.of_rows(theta, target)
         if not fit.is_determined:
             names = [constraint.coefficients[k] for k in constraint.free[fit.dependent]]
             raise ValueError(f"coefficients must be independent to be fitted: {names} are not")
         coef = constraint.coef(fit.coef)
-    root, n_free = C @ fit.root, int((~fit.held).sum())
-    variance = 1.0 if all(noisy) else fit.squares / max(len(target) - n_free, 1)
+    root = C @ fit.root
+    variance = 1.0 if all(noisy) else fit.squares / max(len(target) - C.shape[1], 1)
     return coef, root @ root.T * variance

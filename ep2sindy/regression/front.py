@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 
@@ -13,27 +13,41 @@ from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
-from ep2sindy.regression.least_squares import fit_masks_to_rows
+from ep2sindy.regression.least_squares import Blocks, fit_masks_to_rows, sum_residuals
 from ep2sindy.regression.rows import Grams, RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
 
-ROWS_AT_ONCE = 4096  # rows whose residuals, of all fits, are held at once
+
+@dataclass(frozen=True)
+class LeftOver:
+    """Residuals of one equation on its rows, whitened by the noise that propagates into them.
+
+    chi_squared: per row, 1 if the residuals are nothing but noise. autocorrelation: of the
+    residuals of neighbouring rows, then 0. leaves_noise: True if chi_squared is consistent with
+    noise alone.
+    """
+
+    chi_squared: float
+    autocorrelation: float
+    leaves_noise: bool
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """One support of one equation, with its fit.
 
-    coef: (terms of the support,), in SI. From a regression: least squares on the training rows;
-    from a search of trajectories: the most likely values given the other equations.
+    coef: (terms of the support,), in SI. From a regression: least squares on the training rows, or
+    weighted by their noise; from a search of trajectories: the most likely values given the other
+    equations.
     r2_train, r2_test: 1 - SS_res/SS_tot with the data as truth; NaN if there are no such rows.
     share: share of bootstraps that found this support. inclusion: for each of its terms, the share
     of bootstraps in which the term was in a support of this size. Both are NaN without bootstraps.
     deviance: -2 log likelihood of whole trajectories plus the penalty for the terms, relative to
     the best system; None if only rows were fitted.
     score: value of the selection rule, the lowest of the front being selected; NaN before
-    selection.
+    selection. covariance: (terms, terms) of coef after a weighted fit, in SI; None if the noise of
+    the rows is not known, or if the residuals exceed it. left: residuals of that fit.
     """
 
     equation: str
@@ -45,6 +59,15 @@ class Candidate:
     inclusion: Float[np.ndarray, " support"]
     deviance: float | None = None
     score: float = float("nan")
+    covariance: Float[np.ndarray, "support support"] | None = None
+    left: LeftOver | None = None
+
+    @staticmethod
+    def of(equation: str, coef: Mapping[str, float], deviance: float | None = None) -> Candidate:
+        """A candidate of these terms, without rows and bootstraps behind it."""
+        nan, terms = float("nan"), tuple(coef)
+        values, unknown = np.array([coef[term] for term in terms]), np.full(len(terms), np.nan)
+        return Candidate(equation, terms, values, nan, nan, nan, unknown, deviance)
 
     @property
     def n_terms(self) -> int:
@@ -278,17 +301,17 @@ def _fit(problem: RegressionRows, supports: Supports) -> list[Candidate]:
     equation, masks = problem.equations.index(supports.equation), supports.masks
     gram = problem.train_gram
 
-    def residuals(coef: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        left = np.zeros_like(coef)
-        return _residual_squares(problem, equation, coef, test=False, products=left), left
+    def blocks(*, test: bool = False) -> Blocks:
+        n_terms = len(problem.library)
+        return ((c[:n_terms], c[n_terms + equation]) for c in problem.blocks(test=test))
 
-    coef, squares = fit_masks_to_rows(gram.xx, gram.xy[equation], masks, residuals)
+    coef, squares = fit_masks_to_rows(gram.xx, gram.xy[equation], masks, blocks)
     r2_train = r2_of(squares, spread=_squares_about_mean(problem, equation, test=False))
     r2_test = np.full(len(coef), np.nan)
     if problem.test.any():
-        squares = _residual_squares(problem, equation, coef, test=True)
+        squares, _ = sum_residuals(coef, blocks(test=True))
         r2_test = r2_of(squares, spread=_squares_about_mean(problem, equation, test=True))
-    names, coef_SI = np.array(problem.term_names), problem.coef_SI(coef, equation)
+    names, coef_SI = np.array(problem.library.names), coef * problem.coef_scale(equation)
     return [
         Candidate(
             equation=supports.equation,
@@ -305,30 +328,7 @@ def _fit(problem: RegressionRows, supports: Supports) -> list[Candidate]:
 
 def _squares_about_mean(problem: RegressionRows, equation: int, *, test: bool) -> float:
     """Sum of squares of a scaled target about its mean, exactly zero for a constant."""
-    values = problem.test_target(equation) if test else problem.train_target(equation)
-    values = values - values[0]
+    values = problem.scaled_target(equation, test=test)
+    values -= values[0]
     values -= values.mean()
     return float(values @ values)
-
-
-def _residual_squares(
-    problem: RegressionRows,
-    equation: int,
-    coef: Float[np.ndarray, "supports terms"],
-    *,
-    test: bool,
-    products: Float[np.ndarray, "_ terms"] | None = None,
-) -> Float[np.ndarray, " supports"]:
-    """Squares of every support's residual, on training or held-out rows.
-
-    products: if given, the products of the residuals and the terms are added.
-    """
-    squares, n_terms = np.zeros(len(coef)), len(problem.library)
-    for columns in problem.blocks(test=test):
-        for start in range(0, columns.shape[1], ROWS_AT_ONCE):
-            some = columns[:, start : start + ROWS_AT_ONCE]
-            left = some[n_terms + equation] - coef @ some[:n_terms]
-            squares += np.einsum("sr,sr->s", left, left)
-            if products is not None:
-                products += left @ some[:n_terms].T
-    return squares

@@ -6,7 +6,7 @@ rule, from Gram matrices (`gram_kernels`), and refined on the rows (`fit_masks_t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,27 +22,26 @@ REFINED = 1e-9
 # Share of the largest singular value of dependent columns below which a direction stays out.
 CUTOFF = float(np.sqrt(DEPENDENT))
 
-Residuals = Callable[
-    [Float[np.ndarray, "supports terms"]],
-    tuple[Float[np.ndarray, " supports"], Float[np.ndarray, "supports terms"]],
-]
+ROWS_AT_ONCE = 4096  # rows whose residuals, of all fits, are held at once
+
+# Columns of terms and targets of one equation, block by block.
+Blocks = Iterable[tuple[Float[np.ndarray, "terms _"], Float[np.ndarray, " _"]]]
 
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
     """The coefficients b of one support that fit its rows X to the target y.
 
-        minimise |y - X b|^2, with lower <= b <= upper where bounds are given
+        minimise |y - X b|^2
 
     Assumes residuals of equal variance, independent from row to row; then the covariance of b is
-    variance * root @ root.T. A coefficient at its bound is held there, without covariance.
+    variance * root @ root.T.
     A column depends on those before it if they leave DEPENDENT of its square or less. Then the rows
     do not determine b, and of all minimisers it is the least in columns of unit norm: directions
     whose square is DEPENDENT of the largest or less stay out. Units of columns do not matter.
-    squares: |y - X b|^2. rank: number of directions that the rows determine. held: mask of the
-    coefficients at a bound. upper: triangle R of the QR factors of the columns of unit norm.
-    Source: Bjorck 1996, Numerical Methods for Least Squares Problems, 1.3 and 2.7; for bounds
-    Stark & Parker 1995, Computational Statistics 10, 129.
+    squares: |y - X b|^2. rank: number of directions that the rows determine. upper:
+    triangle R of the QR factors of the columns of unit norm.
+    Source: Bjorck 1996, Numerical Methods for Least Squares Problems, 1.3 and 2.7.
 
     >>> t = np.linspace(0.0, 1.0, 9)
     >>> fit = ep.regression.LeastSquares.of_rows(np.column_stack([t, t**2]), 3.0 * t - t**2)
@@ -53,15 +52,12 @@ class LeastSquares:
     coef: Float[np.ndarray, " terms"]
     squares: float
     rank: int
-    held: Bool[np.ndarray, " terms"]
     norms: Float[np.ndarray, " terms"]
     upper: Float[np.ndarray, "terms terms"]
 
     @staticmethod
     def of_rows(
-        theta: Float[np.ndarray, "rows terms"],
-        target: Float[np.ndarray, " rows"],
-        bounds: Float[np.ndarray, "2 terms"] | None = None,
+        theta: Float[np.ndarray, "rows terms"], target: Float[np.ndarray, " rows"]
     ) -> LeastSquares:
         n, norms, size = theta.shape[1], column_norms(theta), np.linalg.norm(target) or 1.0
         columns = np.column_stack([theta / norms, target / size])
@@ -70,15 +66,11 @@ class LeastSquares:
         upper, right, beyond = triangle[:n, :n], triangle[:n, n], triangle[n:, n]
         is_whole = bool((np.square(np.diag(upper)) > DEPENDENT).all())
         coef, _, rank, _ = np.linalg.lstsq(upper, right, rcond=None if is_whole else CUTOFF)
-        held = np.zeros(n, dtype=np.bool_)
-        if bounds is not None and is_whole:
-            coef, held = _within(upper, right, coef, bounds * norms / size)
         squares = np.square(beyond).sum() + np.square(right - upper @ coef).sum()
         return LeastSquares(
             coef=coef * size / norms,
             squares=float(squares * size**2),
             rank=n if is_whole else int(rank),
-            held=held,
             norms=norms,
             upper=upper,
         )
@@ -91,9 +83,8 @@ class LeastSquares:
     @cached_property
     def root(self) -> Float[np.ndarray, "terms terms"]:
         """A root of the covariance of the coefficients, for rows of variance 1."""
-        root, cutoff = np.zeros_like(self.upper), 1e-15 if self.is_determined else CUTOFF
-        root[~self.held] = np.linalg.pinv(self.upper[:, ~self.held], rcond=cutoff)
-        return root / self.norms[:, None]
+        cutoff = 1e-15 if self.is_determined else CUTOFF
+        return np.linalg.pinv(self.upper, rcond=cutoff) / self.norms[:, None]
 
     @property
     def dependent(self) -> Bool[np.ndarray, " terms"]:
@@ -102,40 +93,38 @@ class LeastSquares:
         return (np.abs(directions) > 1e-3).any(axis=0)
 
 
-def _within(
-    upper: Float[np.ndarray, "n n"],
-    right: Float[np.ndarray, " n"],
-    free: Float[np.ndarray, " n"],
-    bounds: Float[np.ndarray, "2 n"],
-) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Coefficients within bounds, and which are at one; `free` are those without bounds."""
-    if ((bounds[0] < free) & (free < bounds[1])).all():
-        return free, np.zeros(len(free), dtype=np.bool_)
-    from scipy.optimize import lsq_linear  # import takes 0.5 s; most searches do not need it
-
-    solution = lsq_linear(upper, right, bounds=bounds, method="bvls", max_iter=10 * len(free) + 10)
-    assert solution.success
-    return solution.x, solution.active_mask != 0
-
-
 def fit_masks_to_rows(
     xx: Float[np.ndarray, "terms terms"],
     xy: Float[np.ndarray, " terms"],
     masks: Bool[np.ndarray, "supports terms"],
-    residuals: Residuals,
+    blocks: Callable[[], Blocks],
 ) -> tuple[Float[np.ndarray, "supports terms"], Float[np.ndarray, " supports"]]:
     """Coefficients of every support and the squares that they leave; NaN for dependent terms.
 
     The Gram matrix squares the condition number of the rows, so its solution is refined with the
     residuals of the rows themselves (Bjorck 1996, Numerical Methods for Least Squares, 2.9.3).
-    residuals: of coefficients, the squares of what they leave, and its products with the terms.
+    blocks: returns the rows, which are gone through once per step.
     """
     coef = fit_masks(xx, xy, masks)
     for _ in range(2):
-        squares, left = residuals(coef)
+        squares, left = sum_residuals(coef, blocks())
         step = solve_masks(xx, left, masks)
         coef += step
         squares = squares - (step * (2.0 * left - step @ xx)).sum(axis=1)  # what the step explains
         if not (np.abs(step) > REFINED * np.abs(coef).max(axis=1, keepdims=True)).any():
             break  # the next step would be as much smaller again
     return coef, squares
+
+
+def sum_residuals(
+    coef: Float[np.ndarray, "supports terms"], blocks: Blocks
+) -> tuple[Float[np.ndarray, " supports"], Float[np.ndarray, "supports terms"]]:
+    """Squares of every support's residual, and the products of the residuals and the terms."""
+    squares, products = np.zeros(len(coef)), np.zeros_like(coef)
+    for columns, target in blocks:
+        for start in range(0, len(target), ROWS_AT_ONCE):
+            rows = slice(start, start + ROWS_AT_ONCE)
+            left = target[rows] - coef @ columns[:, rows]
+            squares += np.einsum("sr,sr->s", left, left)
+            products += left @ columns[:, rows].T
+    return squares, products

@@ -124,10 +124,6 @@ class RegressionRows:
                 "or more data"
             )
 
-    @property
-    def term_names(self) -> tuple[str, ...]:
-        return self.library.names
-
     @cached_property
     def theta_scale(self) -> Float[np.ndarray, " terms"]:
         """L2 norm of each column over the training rows; 1 for a column of zeros."""
@@ -147,10 +143,6 @@ class RegressionRows:
         return self._scaled(self.test)
 
     @property
-    def train_rows(self) -> Float[np.ndarray, "train columns"]:
-        return self.train_columns.T
-
-    @property
     def n_train(self) -> int:
         return len(self.test) - int(np.count_nonzero(self.test))
 
@@ -166,23 +158,15 @@ class RegressionRows:
 
     @property
     def train_theta(self) -> Float[np.ndarray, "train terms"]:
-        return self.train_rows[:, : len(self.library)]
+        return self.train_columns[: len(self.library)].T
 
-    def train_target(self, equation: int) -> Float[np.ndarray, " train"]:
-        return self._scaled_target(equation, test=False)
-
-    def test_target(self, equation: int) -> Float[np.ndarray, " test"]:
-        return self._scaled_target(equation, test=True)
+    def scaled_target(self, equation: int, *, test: bool = False) -> Float[np.ndarray, " _"]:
+        """Scaled target of an equation on the training rows, or on held-out ones."""
+        return self.target[self.test == test, equation] / self.target_scale[equation]
 
     def coef_scale(self, equation: int) -> Float[np.ndarray, " terms"]:
         """Factors that convert coefficients of scaled columns to SI."""
         return self.target_scale[equation] / self.theta_scale
-
-    def coef_SI(
-        self, coef: Float[np.ndarray, "*draws terms"], equation: int
-    ) -> Float[np.ndarray, "*draws terms"]:
-        """Convert coefficients of scaled columns to SI; equals coef * coef_scale up to rounding."""
-        return coef * self.target_scale[equation] / self.theta_scale
 
     @cached_property
     def train_products(self) -> Float[np.ndarray, "columns columns"]:
@@ -217,7 +201,6 @@ class RegressionRows:
         Each row is counted `weights` times. All draws share the products of a row, so each draw is
         one row of a matrix product. Rows are processed in blocks to keep these products small.
         """
-        self.check_grams(len(weights))
         n = len(self.library) + len(self.equations)
         (left, right), begin = np.triu_indices(n), 0
         sums, products = np.zeros((len(weights), len(left))), np.empty((len(weights), n, n))
@@ -241,12 +224,6 @@ class RegressionRows:
             xy=products[n:, :n].copy(),
             yy=products.diagonal()[n:],
         )
-
-    def _scaled_target(self, equation: int, *, test: bool) -> Float[np.ndarray, " _"]:
-        if len(self.test) <= MOST_ROWS:  # the scaled columns are at hand
-            columns = self.test_columns if test else self.train_columns
-            return columns[len(self.library) + equation]
-        return self.target[self.test == test, equation] / self.target_scale[equation]
 
     def _scaled(
         self, chosen: Bool[np.ndarray, " rows"], start: int = 0
@@ -285,9 +262,5 @@ class Formulation(Protocol):
     def smoother(self) -> Smoother | None: ...
 
     def assemble(
-        self,
-        trajectories: Sequence[Trajectory],
-        library: Library,
-        *,
-        rng: np.random.Generator,
+        self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> tuple[RegressionRows, ...]: ...

@@ -13,6 +13,7 @@ from ep2sindy.regression.gram_kernels import (
     ROUNDING,
     WITHIN,
     append_term,
+    extend,
     substitute,
 )
 from ep2sindy.runtime.compilation import LOOPS, compiled
@@ -157,6 +158,28 @@ def _leave(xx, active, n_active, term, lower):
     return kept
 
 
+def threshold_terms(xx, xy, thresholds, masks):
+    """Drop terms from masks (thresholds, terms) until all that are left exceed the threshold."""
+    n = len(xy)
+    _threshold_terms(
+        xx, xy, thresholds, masks, np.empty((n, n)), np.empty(n), np.empty(n, dtype=np.int64)
+    )
+
+
+@compiled(**LOOPS)
+def _threshold_terms(xx, xy, thresholds, masks, lower, coef, active):
+    n_active = np.int64(0)
+    for m in range(len(masks)):
+        dropped = True
+        while dropped:
+            n_active, solved = extend(xx, masks[m], active, n_active, lower)
+            substitute(lower, xy, active, n_active, coef)
+            dropped = False
+            for i in range(n_active):
+                if not (solved and abs(coef[i]) > thresholds[m]):
+                    masks[m, active[i]], dropped = False, True
+
+
 # For kernels that are given their arrays; sweeps are made in place, so these are not separate ones.
 PLAIN: dict[str, Any] = {"error_model": "numpy"}
 PLAIN_INNER = {**PLAIN, "no_cpython_wrapper": True}
@@ -264,8 +287,11 @@ def _eliminate(levels, level, j, smallest):
                     below[a, b] = here[a, b]
 
 
-def best_subsets(xx, xy, yy, max_terms, n_best, most_work):
-    """The `n_best` supports of least residual of every size up to max_terms, proven best or not.
+@compiled(**PLAIN)
+def search_subsets(
+    xx, xy, yy, most_work, levels, smallest, scratch, chosen, following, best, best_masks
+):
+    """Search the supports of least residual of every size; returns false if it ended without proof.
 
     One support serves several problems, each with its own coefficients. The product of their
     residuals is minimised (for one problem, the residual), so the scales of the targets do not
@@ -274,30 +300,9 @@ def best_subsets(xx, xy, yy, max_terms, n_best, most_work):
     leaf costs one division. A branch is cut if all of its columns together leave a larger
     residual than the best known (Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231).
     xx: (problems, terms, terms), the most informative columns first, for early cuts;
-    xy: (problems, terms); yy: (problems,). most_work: multiplications after which the search ends
-    without a proof.
-    Returns (supports, terms) of bool, the empty support first, and whether they are proven best.
-    """
-    n_problems, n_terms = xy.shape
-    depth, size = min(max_terms, n_terms), n_terms + 1
-    best = np.empty((depth + 1, n_best))
-    best_masks = np.empty((depth + 1, n_best, n_terms), dtype=np.bool_)
-    chosen, following = np.empty((2, depth + 1), dtype=np.int64)
-    proven = _search_subsets(
-        xx, xy, yy, most_work, np.empty((depth + 1, n_problems, size, size)),
-        np.empty((n_problems, size)), np.empty((size, size)), chosen, following, best, best_masks,
-    )  # fmt: skip
-    return best_masks[best < np.inf], proven
-
-
-@compiled(**PLAIN)
-def _search_subsets(
-    xx, xy, yy, most_work, levels, smallest, scratch, chosen, following, best, best_masks
-):
-    """Branch and bound of `best_subsets`; returns false if it ended for the work that it had done.
-
+    xy: (problems, terms); yy: (problems,). most_work: multiplications after which the search ends.
     Writes residuals to best (sizes, n_best), infinite where there is no support, and supports to
-    best_masks (sizes, n_best, terms). The others are scratch.
+    best_masks (sizes, n_best, terms), the empty one first. The others are scratch.
     """
     _begin(xx, xy, yy, levels, smallest, best, best_masks)
     n_problems, size = smallest.shape

@@ -14,8 +14,8 @@ from scipy.sparse import csr_array
 from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.library.library import Library
+from ep2sindy.regression.gram_kernels import banded_covariance
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
-from ep2sindy.regression.window_kernels import banded_covariance
 
 # Largest correction of a sample, in standard deviations of its noise; with a wrong model the
 # corrections would otherwise grow without limit.

@@ -1,14 +1,23 @@
-"""Windows of weak rows: weighted sums over short stretches of neighbouring samples."""
+"""Windows of weak rows: test functions on stretches of neighbouring samples, as weighted sums.
+
+Samples at unequal steps are first brought to an even grid.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import block_diag, csr_array
+
+from ep2sindy.data.numbers import rounding_s
+from ep2sindy.runtime.values import set_counts
+
+Signal = Float[np.ndarray, " samples"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,3 +106,219 @@ def _windows(
     shape = len(first), n_samples
     mean, slope = (csr_array((each, places, starts), shape=shape) for each in weights)
     return Windows(mean, slope)
+
+
+# Value of a bump, relative to its centre, at the first sample inside its edge.
+EDGE = 1e-10
+
+# Largest deviation from an even grid, in steps, that is attributed to rounding of the recorded
+# times. The error of such a sample is a twentieth of the signal's change in a step.
+ROUNDED = 0.05
+
+
+@runtime_checkable
+class WindowFunctions(Protocol):
+    """Interface of the test functions: windows for one sampled signal."""
+
+    def windows(self, t: Signal, x: Signal, *, rng: np.random.Generator) -> Windows: ...
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """The thesis's test functions: 1 over `n_windows` random windows of `n_points` samples.
+
+    Integrals use the trapezoidal rule; that of the derivative is the difference of x at the ends.
+    Two points give the difference quotient and the mean of two samples: the differential form.
+    Steps may be unequal.
+    Source: the thesis, Eqs. 10 and 11.
+    """
+
+    n_windows: int = 3000
+    n_points: int = 100
+
+    def __post_init__(self) -> None:
+        set_counts(self, {"n_windows": 1, "n_points": 2})
+
+    def windows(self, t: Signal, x: Signal, *, rng: np.random.Generator) -> Windows:
+        """Raises ValueError for windows longer than the trajectory."""
+        _check_width(self.n_points, len(t), "n_points")
+        first = np.sort(rng.integers(len(t) - self.n_points + 1, size=self.n_windows))
+        last = first + self.n_points - 1
+        half_steps = 0.5 * np.diff(t)
+        weights = np.append(half_steps, 0.0) + np.insert(half_steps, 0, 0.0)
+        inside = first[:, None] + np.arange(self.n_points)
+        mean = weights[inside]
+        mean[:, 0] = half_steps[first]
+        mean[:, -1] = half_steps[last - 1]
+        length_s = (t[last] - t[first])[:, None]
+        slope = np.zeros(mean.shape)
+        slope[:, 0], slope[:, -1] = -1.0, 1.0
+        return Windows.even(first, mean / length_s, slope / length_s, len(t))
+
+
+@dataclass(frozen=True)
+class Bumps:
+    """Smooth test functions phi = (1 - s^2)^p on windows that overlap, s from -1 to 1.
+
+    half_width_s: half the length of a window, in s, or None to take it from the spectrum of
+    each state: the change point between signal and noise lies `tau_hat` standard deviations into
+    the tail of the bump's own spectrum (see `spectral_half_width`). The source takes 2. Narrower
+    bumps keep more of the fast components, and admit more noise, which smoothed states and the
+    covariance of the rows can handle.
+    overlap: successive windows are half_width / overlap apart. The power p makes phi fall to
+    1e-10 at the edge, so that the trapezoidal rule is practically exact.
+    Source: Messenger & Bortz 2021, doi:10.1137/20M1343166.
+    """
+
+    half_width_s: float | None = None
+    tau_hat: float = 0.7
+    overlap: int = 4
+
+    def __post_init__(self) -> None:
+        if self.half_width_s is not None and not self.half_width_s > 0.0:
+            raise ValueError(
+                f"half_width_s must be positive: {self.half_width_s} came; leave it out to "
+                "have it chosen from the spectrum"
+            )
+        if not self.tau_hat > 0.0 or self.overlap < 1:
+            raise ValueError(
+                "tau_hat must be positive and overlap at least 1: "
+                f"tau_hat={self.tau_hat}, overlap={self.overlap} came"
+            )
+
+    def windows(self, t: Signal, x: Signal, *, rng: np.random.Generator) -> Windows:
+        """Weights of all windows over one signal.
+
+        Samples at unequal steps are interpolated onto an even grid; the interpolation weights
+        become part of the rows. Then at most one window is centred about each sample, since more
+        would depend on each other.
+        Raises ValueError for windows that do not fit the trajectory.
+        """
+        if is_even(t):
+            return self._even_windows(x, (t[-1] - t[0]) / (len(t) - 1))
+        grid, lines = even_grid(t)
+        windows = self._even_windows(lines @ x, grid[1] - grid[0])
+        middle = grid[(windows.first + windows.last) // 2]
+        kept = windows.taken(keep_one_per_sample(t, middle))
+        mean, slope = kept.mean @ lines, kept.slope @ lines
+        mean.sort_indices()
+        slope.sort_indices()
+        return Windows.of_matrices(mean, slope)
+
+    def _even_windows(self, x: np.ndarray, dt_s: float) -> Windows:
+        half_width = self._half_width(x, dt_s)
+        _check_width(2 * half_width + 1, len(x), "half_width_s")
+        power = bump_power(half_width)
+        s = np.arange(-half_width, half_width + 1) / half_width
+        phi = (1.0 - s**2) ** power
+        fall = s * (1.0 - s**2) ** (power - 1.0)
+        # Scaled so that the slope of a straight line is exact however few samples a bump spans.
+        fall /= fall @ s * half_width * dt_s
+        first = np.arange(0, len(x) - 2 * half_width, max(1, half_width // self.overlap))
+        return Windows.even(first, phi / phi.sum(), fall, len(x))
+
+    def _half_width(self, x: np.ndarray, dt_s: float) -> int:
+        if self.half_width_s is None:
+            return spectral_half_width(x, tau_hat=self.tau_hat)
+        half_width = round(self.half_width_s / dt_s)
+        if half_width < 2:
+            raise ValueError(
+                f"half_width_s must span two steps or more: {self.half_width_s:g} s came with "
+                f"steps of {dt_s:g} s"
+            )
+        return half_width
+
+
+def bump_power(half_width: Any) -> Any:
+    """Power p for which (1 - s^2)^p falls to EDGE one sample inside the edge; two or more."""
+    edge = 1.0 - (1.0 - 1.0 / np.asarray(half_width)) ** 2
+    return np.maximum(2.0, np.ceil(np.log(EDGE) / np.log(edge)))
+
+
+def spectral_half_width(x: Signal, *, tau_hat: float) -> int:
+    """Half-width in samples of the narrowest bump whose spectrum lies below the change point.
+
+    The spectrum of (1 - s^2)^p is close to a Gaussian of standard deviation
+    n sqrt(2p + 3) / (2 pi half_width) bins; `tau_hat` standard deviations must lie below the
+    change point between signal and noise.
+    """
+    n, widths = len(x), np.arange(2, max(3, (len(x) - 1) // 4))
+    deviation = n * np.sqrt(2.0 * bump_power(widths) + 3.0) / (2.0 * np.pi * widths)
+    fits = tau_hat * deviation <= spectral_change_point(x)
+    return int(widths[np.argmax(fits)] if fits.any() else widths[-1])
+
+
+def spectral_change_point(x: Signal) -> int:
+    """Frequency bin that separates signal from noise, where the cumulated spectrum bends most.
+
+    The cumulated amplitude spectrum is approximated by two chords that meet at the bend; the bend
+    with the least sum of squares is chosen.
+    """
+    total = np.cumsum(np.abs(np.fft.rfft(x - x.mean())))
+    last = len(total) - 1
+    if last < 2:
+        return 1
+    # Two hundred trial corners, denser at low bins, locate a bend well enough.
+    corners = np.unique(np.geomspace(1, last - 1, 200).astype(int))
+    bins = np.arange(last + 1.0)
+    until = np.concatenate([[0], corners, [last]])
+    at = until.astype(float)
+    sums = np.array([
+        at, at * (at + 1.0) / 2.0, at * (at + 1.0) * (2.0 * at + 1.0) / 6.0,
+        *(np.cumsum(each)[until] for each in (total, bins * total, total**2)),
+    ])  # fmt: skip
+    misfit = np.zeros(len(corners))
+    for first, end in ((np.s_[:1], np.s_[1:-1]), (np.s_[1:-1], np.s_[-1:])):
+        low = total[until[first]]
+        rise = (total[until[end]] - low) / (at[end] - at[first])
+        start = low - rise * at[first]
+        # Squares of the bins after the first one; at both ends of a chord there is no misfit.
+        n, k, kk, y, ky, yy = sums[:, end] - sums[:, first]
+        misfit += yy + n * start**2 + kk * rise**2
+        misfit += 2.0 * (k * start * rise - y * start - ky * rise)
+    return int(corners[np.argmin(misfit)])
+
+
+def _check_width(n_points: int, n_samples: int, name: str) -> None:
+    if n_points > n_samples:
+        raise ValueError(
+            f"a window must fit the trajectory: {n_points} samples were asked of {n_samples}; "
+            f"lower {name} or use more data"
+        )
+
+
+def is_even(t: Signal) -> bool:
+    """Return true if the times lie on an even grid, apart from rounding."""
+    step = (t[-1] - t[0]) / (len(t) - 1)
+    off = np.abs(t - t[0] - step * np.arange(len(t))).max()
+    return bool(off <= max(ROUNDED * step, rounding_s(t)))
+
+
+def even_grid(
+    t: Signal,
+) -> tuple[Float[np.ndarray, " points"], csr_array]:
+    """Even grid with about the median step, and the matrix (points, samples) that interpolates.
+
+    Interpolation is linear: weights are not negative, so noise is never amplified.
+    """
+    n_steps = max(1, round(float((t[-1] - t[0]) / np.median(np.diff(t)))))
+    grid = np.linspace(t[0], t[-1], n_steps + 1)
+    left = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
+    share = (grid - t[left]) / (t[left + 1] - t[left])
+    weights = np.stack([1.0 - share, share], axis=1)
+    columns = np.stack([left, left + 1], axis=1)
+    starts = np.arange(0, 2 * len(grid) + 1, 2)
+    lines = csr_array((weights.ravel(), columns.ravel(), starts), shape=(len(grid), len(t)))
+    lines.eliminate_zeros()
+    return grid, lines
+
+
+def keep_one_per_sample(
+    t: Signal, middle: Float[np.ndarray, " windows"]
+) -> Int[np.ndarray, " kept"]:
+    """Indices of windows to keep: the first of all windows nearest to the same sample.
+
+    middle: increasing times of the middles of the windows.
+    """
+    nearest = np.searchsorted(0.5 * (t[1:] + t[:-1]), middle)
+    return np.flatnonzero(np.diff(nearest, prepend=-1) > 0)

@@ -52,10 +52,12 @@ def check_positive(name: str, value: float) -> None:
 def set_counts(settings: object, least: Mapping[str, int]) -> None:
     """Check fields of a frozen value that hold whole numbers, and keep each as an int.
 
-    least: name of a field -> its least value.
+    least: name of a field -> its least value. A field that is None by default may be None.
     """
     for name, fewest in least.items():
-        object.__setattr__(settings, name, check_count(name, getattr(settings, name), fewest))
+        value = getattr(settings, name)
+        if value is not None or getattr(type(settings), name) is not None:
+            object.__setattr__(settings, name, check_count(name, value, fewest))
 
 
 def check_list(name: str, value: object) -> None:

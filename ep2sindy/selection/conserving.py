@@ -12,8 +12,6 @@ from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.relations import Place, Process
 from ep2sindy.library.roles import Roles, constraint_of, shares_of
-from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.refine import with_coef
 from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.gram_kernels import fit_masks
@@ -91,7 +89,7 @@ def _join_rows(
             if not shares.any():
                 continue  # the whole equation is known
             fixed = np.array([known.get((state, term), 0.0) for term in library.names])
-            target = problem.train_target(k)
+            target = problem.scaled_target(k)
             theta = problem.train_theta
             left = target - theta @ LeastSquares.of_rows(theta, target).coef
             std = max(float(left.std()), MIN_RESIDUAL * float(np.sqrt(np.square(target).mean())))
@@ -140,12 +138,9 @@ def _build_system(
     held = constraint_of(task.library, task.states, processes, roles.told)
     if held is None:
         return None
-    empty = np.zeros((len(task.library), len(task.states)))
-    model = SparseModel(task.library, task.states, empty, task.runs[0].units)
     known = roles.known
     told = np.array([known.get(held.coefficients[k], 0.0) for k in held.free])
-    coef = held.coef(shares_of(held) @ values + told)
-    return TrialSystem(with_coef(model, held, coef)[0], held, means)
+    return TrialSystem.of(task, held, shares_of(held) @ values + told, means)
 
 
 def _average_terms(task: Task, processes: Sequence[Process]) -> Float[np.ndarray, " processes"]:
@@ -163,7 +158,10 @@ def _add_fronts(
     rows = {state: problem for problem in problems for state in problem.equations}
     fronts, places = [], np.zeros((len(systems), len(task.states)), dtype=np.int64)
     for column, state in enumerate(task.states):
-        masks = np.stack([_mask(system, state, task) for system in systems])
+        terms = [
+            [term for s, term in system.constraint.coefficients if s == state] for system in systems
+        ]
+        masks = np.stack([np.isin(task.library.names, own) for own in terms])
         different, owner = np.unique(masks, axis=0, return_inverse=True)
         order = np.argsort(different.sum(axis=1), kind="stable")
         nothing = np.zeros((1, masks.shape[1]), dtype=np.bool_)
@@ -171,9 +169,3 @@ def _add_fronts(
         fronts.append(ParetoFront(state, fit_supports(rows[state], state, masks), rows[state]))
         places[:, column] = 1 + np.argsort(order)[owner.ravel()]
     return Systems(fronts, places, systems)
-
-
-def _mask(system: TrialSystem, state: str, task: Task) -> Bool[np.ndarray, " terms"]:
-    mask = np.zeros(len(task.library), dtype=np.bool_)
-    mask[[task.library.index(term) for s, term in system.constraint.coefficients if s == state]] = 1
-    return mask

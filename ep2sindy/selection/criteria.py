@@ -1,22 +1,82 @@
-"""Rules that score candidates one by one: information criteria, evidence, knee."""
+"""Selection rules: their protocol, what they decide, and those that score candidates one by one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import comb, log
-from typing import ClassVar
+from heapq import heappop, heappush
+from itertools import islice
+from math import comb, log, prod
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ep2sindy.data.coerce import Task
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Constraint, Relation, binding
+from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.front import Fronts, ParetoFront
 from ep2sindy.regression.least_squares import LeastSquares, fit_masks_to_rows
 from ep2sindy.regression.whitening import whiten_rows
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.rule import Basis, Decision
+
+Basis = Literal["rows", "likelihood", "runs"]
+
+
+@dataclass(frozen=True)
+class OtherSystem:
+    """A system of as many free coefficients as the selected one, which lives too.
+
+    terms: by equation, such as `n_i'`, or under roles by role, such as `n_n to n_i`. Figures are
+    the worst over the folds that the system was not fitted to. deviation: of frequency, amplitudes
+    and waveform, in units of the bounds. f_error, amplitude: relative errors. waveform: in standard
+    deviations.
+    """
+
+    terms: Mapping[str, tuple[str, ...]]
+    deviation: float
+    f_error: float
+    amplitude: float
+    waveform: float
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """What a rule decides.
+
+    scores: for each front, one per candidate, the winner's the least. model: the winner refined,
+    with the covariance of its coefficients; None if the rule scores candidates one by one, and the
+    coefficients are still to be fitted. note: how it was decided, in words. constraint: what the
+    winner's coefficients obey; None if the rule does not say. others: systems of its size that
+    would do as well, the best first.
+    """
+
+    scores: Sequence[Float[np.ndarray, " _candidates"]]
+    model: SparseModel | None = None
+    note: str = ""
+    constraint: Constraint | None = None
+    others: Sequence[OtherSystem] = ()
+
+
+@runtime_checkable
+class Selection(Protocol):
+    """A rule that scores every candidate of every front; the lowest score of a front is selected.
+
+    label: name of the score in tables. basis: what is scored: "rows" of a regression, the
+    "likelihood" of trajectories, or "runs" of whole systems, one candidate per equation, of which
+    the rule refines the winner. `decide` gets the fronts of all equations, what was asked (its
+    runs, and the relations between coefficients), and whom to notify of the systems it tries.
+    """
+
+    @property
+    def label(self) -> str: ...
+
+    @property
+    def basis(self) -> Basis: ...
+
+    def decide(self, fronts: Fronts, task: Task, *, progress: Progress = SILENT) -> Decision: ...
+
 
 # Least residual squares, as a share of the target's squares: below this value a criterion would
 # select terms that fit the discretisation error of noise-free data.
@@ -80,9 +140,9 @@ class EBIC:
         until the leader stays the same.
         """
         problem = front.rows
-        masks = np.array([np.isin(problem.term_names, c.terms) for c in front.candidates])
+        masks = np.array([np.isin(problem.library.names, c.terms) for c in front.candidates])
         equation = problem.equations.index(front.equation)
-        theta, target = problem.train_theta, problem.train_target(equation)
+        theta, target = problem.train_theta, problem.scaled_target(equation)
         n_rows, leader = float(len(target)), -1
         n_effective = (
             n_rows if self.coarsening is None else n_rows / (1.0 + n_rows / self.coarsening)
@@ -121,12 +181,9 @@ def _fit_all(
     # R of the QR factors holds all that least squares needs, without squaring the condition number.
     triangle = np.asarray(np.linalg.qr(np.column_stack([theta, target]), mode="r"))
     columns, right = triangle[:, :-1], triangle[:, -1]
-
-    def residuals(coef: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        left = right - coef @ columns.T
-        return np.square(left).sum(axis=1), left @ columns
-
-    coef, squares = fit_masks_to_rows(columns.T @ columns, columns.T @ right, masks, residuals)
+    coef, squares = fit_masks_to_rows(
+        columns.T @ columns, columns.T @ right, masks, lambda: [(columns.T, right)]
+    )
     for k in np.flatnonzero(np.isnan(squares)):  # weights have made its terms dependent
         fit = LeastSquares.of_rows(columns[:, masks[k]], right)
         coef[k], squares[k] = 0.0, fit.squares
@@ -149,11 +206,6 @@ class Evidence:
         self, fronts: Fronts, task: Task | None = None, *, progress: Progress = SILENT
     ) -> Decision:
         deviances = [[candidate.deviance for candidate in front.candidates] for front in fronts]
-        if any(None in values for values in deviances):
-            raise ValueError(
-                "Evidence weighs what a search of trajectories found: these fronts come from "
-                "rows; take TrajectorySearch() (search=trajectory), or select by EBIC"
-            )
         return Decision([np.array(values, dtype=np.float64) for values in deviances])
 
 
@@ -205,3 +257,100 @@ class Knee:
         height = np.log(np.maximum(errors, FLOOR))
         height = (height - height.min()) / max(float(np.ptp(height)), np.finfo(float).tiny)
         return np.hypot(height, sizes / norm)
+
+
+# Combinations of candidates, one per equation: the most promising first, and their scores.
+
+# Upper bound on the error of a system, also used if it dies, diverges or cannot be refined. The
+# unit is the variance of the data (a constant at the mean has error 1), or the bound of a free run.
+MAX_ERROR = 10.0
+
+# Most combinations to look at for one that the relations admit, per combination to be tried.
+TRIED = 64
+
+
+def combinations(
+    fronts: Fronts, most: int, relations: Sequence[Relation] = ()
+) -> Int[np.ndarray, "combinations fronts"]:
+    """Choices of one candidate per front, by index, that have the terms named by the relations.
+
+    If there are more than `most`, these are the most promising ones: those with the least sum of
+    ranks, a candidate's rank being its place in its own front by deviance or, after a regression,
+    by EBIC. They are returned in the order of their indices.
+    Memory grows with `most` alone, and at most TRIED times as many are looked at.
+    Raises ValueError if none of these has the terms that the relations name.
+    """
+    ranks = [_rank_candidates(front) for front in fronts]
+    kept = list(islice(cheapest_first(fronts, ranks, relations, most_tried=TRIED * most), most))
+    if not kept:
+        raise ValueError(
+            f"the relations {[r.text for r in relations]} name terms that no combination of "
+            "candidates has; raise the search's max_terms, or depth"
+        )
+    found = np.array(kept, dtype=np.int64)
+    return found[np.lexsort(found.T[::-1])]
+
+
+def cheapest_first(
+    fronts: Fronts,
+    costs: Sequence[Float[np.ndarray, " _candidates"]],
+    relations: Sequence[Relation],
+    *,
+    most_tried: int,
+) -> Iterator[Int[np.ndarray, " fronts"]]:
+    """Choices with the terms that relations name, by the summed cost of their candidates."""
+    order = [np.argsort(cost, kind="stable") for cost in costs]
+    ranked = best_first([cost[places] for cost, places in zip(costs, order, strict=True)])
+    for choice in islice(ranked, most_tried):
+        place = np.array([places[rank] for places, rank in zip(order, choice, strict=True)])
+        if not relations or binding(relations, support_of(fronts, place)) is not None:
+            yield place
+
+
+def _rank_candidates(front: ParetoFront) -> Float[np.ndarray, " _candidates"]:
+    """Rank of each candidate in its front, the most promising first; by R2 if no rows were kept.
+
+    Where rows are kept they are not ranked by R2: of rows that were fitted it rises with every
+    term, so that the largest supports would come first.
+    """
+    costs = np.array([c.deviance for c in front.candidates], dtype=np.float64)
+    if np.isnan(costs).any():  # of None: only a search of trajectories knows a deviance
+        costs = front.errors if front.problem is None else EBIC().decide([front]).scores[0]
+    return np.argsort(np.argsort(costs, kind="stable")).astype(np.float64)
+
+
+def best_first(costs: Sequence[Float[np.ndarray, " _"]]) -> Iterator[tuple[int, ...]]:
+    """Every choice of one place in each row of costs, by the summed cost, then by the places.
+
+    costs: each row in ascending order. A choice is put on the heap by one other alone, in which
+    its last place that is not zero is lower by one. So none comes twice, nothing is remembered but
+    the heap, and the heap grows by less than the number of rows at every choice.
+    """
+
+    def cost(choice: tuple[int, ...]) -> float:
+        return sum(float(row[k]) for row, k in zip(costs, choice, strict=True))
+
+    first = (0,) * len(costs)
+    heap = [(cost(first), first)] if all(map(len, costs)) else []
+    while heap:
+        _, choice = heappop(heap)
+        yield choice
+        last = max((k for k, place in enumerate(choice) if place), default=0)
+        for k in range(last, len(costs)):
+            if choice[k] + 1 < len(costs[k]):
+                later = (*choice[:k], choice[k] + 1, *choice[k + 1 :])
+                heappush(heap, (cost(later), later))
+
+
+def describe_left_out(fronts: Fronts, n_tried: int, most: int) -> str:
+    """Note on combinations that were not tried, empty if the cap left out none."""
+    n_all = prod(len(front.candidates) for front in fronts)
+    if n_tried < most or n_all <= most:
+        return ""
+    return f"; the {n_tried} most promising of {n_all} combinations were tried"
+
+
+def support_of(fronts: Fronts, choice: Int[np.ndarray, " fronts"]) -> dict[str, tuple[str, ...]]:
+    """The terms of every state in one combination."""
+    pairs = zip(fronts, choice, strict=True)
+    return {front.equation: front.candidates[k].terms for front, k in pairs}

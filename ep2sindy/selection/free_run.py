@@ -30,9 +30,8 @@ from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
-from ep2sindy.selection.combinations import MAX_ERROR, score_combinations
+from ep2sindy.selection.criteria import MAX_ERROR, Basis, Decision
 from ep2sindy.selection.refined import RefinedScore
-from ep2sindy.selection.rule import Basis, Decision
 from ep2sindy.selection.systems import (
     Fold,
     Records,
@@ -222,37 +221,32 @@ class FreeRunScore:
         self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT
     ) -> Decision:
         """Decide among given systems, as `decide` does among the combinations of candidates."""
-        fronts, places, systems = found.fronts, found.places, found.systems
-        records = smooth_records(fronts, runs)
-        cycles = find_cycles(records, [front.equation for front in fronts])
+        records = smooth_records(found.fronts, runs)
+        cycles = find_cycles(records, [front.equation for front in found.fronts])
         if isinstance(cycles, str):
             rule = RefinedScore(max_combinations=self.max_combinations)
             decision = rule.judge(found, runs, progress=progress)
             return replace(
                 decision, note=f"{cycles}: chosen by windows held out instead{found.left_out}"
             )
-        trials = self._trials(records, cycles, systems, progress)
+        records = replace(records, cycles=cycles)
+        trials = self._trials(records, found.systems, progress)
         errors = np.array([trial.error for trial in trials])
         living = find_living(trials)
-        winner, model, note = self._winner(records, cycles, trials, living, progress)
+        winner, model, note = self._winner(records, trials, living, progress)
         limit = max(1.0, float(errors[winner]))
-        scores = score_combinations(fronts, places, errors, limit=limit, winner=winner)
-        note = f"{note}{found.left_out}"
-        others = list_others(trials, living, winner)
-        return Decision(scores, model, note, systems[winner].constraint, others)
+        scores = found.score(errors, limit=limit, winner=winner)
+        note, held = f"{note}{found.left_out}", found.systems[winner].constraint
+        return Decision(scores, model, note, held, list_others(trials, living, winner))
 
-    def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
+    def _window(self, records: Records) -> int:
         """Number of samples in a window."""
-        frequency_Hz = [cycle.frequency_Hz for cycle in cycles]
+        frequency_Hz = [cycle.frequency_Hz for cycle in records.cycles]
         dt_s = [run.dt_s for run in records.runs]
         return samples_in_periods(self.window_periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
 
     def _trials(
-        self,
-        records: Records,
-        cycles: Sequence[Cycle],
-        systems: Sequence[TrialSystem],
-        progress: Progress,
+        self, records: Records, systems: Sequence[TrialSystem], progress: Progress
     ) -> list[Trial]:
         """Refine and run every system, fold by fold; one that lacks an equation cannot live."""
         whole = [k for k, system in enumerate(systems) if system.model.coef.any(axis=0).all()]
@@ -262,7 +256,7 @@ class FreeRunScore:
             return trials
         some = [systems[k] for k in whole]
         tried = [
-            self._try_fold(records, cycles, some, fold, progress)
+            self._try_fold(records, some, fold, progress)
             for fold in folds(records.runs, self.n_folds)
         ]
         for k, worst in zip(whole, np.max(tried, axis=0), strict=True):
@@ -270,12 +264,7 @@ class FreeRunScore:
         return trials
 
     def _try_fold(
-        self,
-        records: Records,
-        cycles: Sequence[Cycle],
-        systems: Sequence[TrialSystem],
-        fold: Fold,
-        progress: Progress,
+        self, records: Records, systems: Sequence[TrialSystem], fold: Fold, progress: Progress
     ) -> Float[np.ndarray, "systems 5"]:
         """The figures of a `Trial` of every system in one fold."""
         first = systems[0].model
@@ -283,7 +272,7 @@ class FreeRunScore:
             records.runs,
             fold.fitted,
             first,
-            window=self._window(records, cycles),
+            window=self._window(records),
             n_windows=self.n_windows,
             seed=self.seed,
         )
@@ -301,7 +290,7 @@ class FreeRunScore:
         fields = VectorField.of(first, np.stack([model.coef for model in refined.models]))
         judged, densities = [], densities_of(records.runs[0], first.states)
         with progress.stage(None, "run", "free runs over the fold") as advance:
-            for t, paths, cycle in run_over(fields, fold.held, records, cycles, self.n_starts):
+            for t, paths, cycle in run_over(fields, fold.held, records, self.n_starts):
                 judged.append(self._judge(t, paths, cycle, first.states, densities))
                 advance(len(paths))
         worst = np.column_stack([np.max(judged, axis=0), refined.loss])
@@ -332,18 +321,17 @@ class FreeRunScore:
         return found
 
     def _winner(
-        self,
-        records: Records,
-        cycles: Sequence[Cycle],
-        trials: Sequence[Trial],
-        living: Sequence[int],
-        progress: Progress,
+        self, records: Records, trials: Sequence[Trial], living: Sequence[int], progress: Progress
     ) -> tuple[int, SparseModel, str]:
         """Index of the winning system, the system refined on all data, and how it won."""
-        ranked = sorted(living, key=lambda k: self._rank(trials[k]))
-        ranked = order_equals(ranked, trials)
+
+        def rank(k: int) -> tuple[bool, int, float]:
+            """The smallest system first, and of one size the one with the best waveform."""
+            return trials[k].error > self.margin, trials[k].system.n_free, trials[k].waveform
+
+        ranked = order_equals(sorted(living, key=rank), trials)
         by_error = sorted(range(len(trials)), key=lambda k: (trials[k].error, trials[k].loss))
-        window = self._window(records, cycles)
+        window = self._window(records)
         found: list[Confirmed] = []
         best = (ranked or by_error)[: self.n_confirmed]
         for k in count_pieces(progress, best, "system", "refined on all data"):
@@ -357,7 +345,7 @@ class FreeRunScore:
                 n_reweights=0,
                 seed=self.seed,
             )
-            own = self._confirm(k, trials[k], model, records, cycles)
+            own = self._confirm(k, trials[k], model, records)
             living_on = [each for each in found if each.run.verdict is Verdict.LIVES]
             resting = [each for each in living_on if not each.share and not each.repels]
             if own.share and resting and not own.outdoes(resting[0]):
@@ -368,28 +356,20 @@ class FreeRunScore:
         won = min(found, key=Confirmed.rank)
         return won.number, won.run.model, won.text(len(living), len(trials))
 
-    def _rank(self, trial: Trial) -> tuple[bool, int, float]:
-        """Sorts the smallest system first, and of one size the one with the best waveform."""
-        return trial.error > self.margin, trial.system.n_free, trial.waveform
-
     def _confirm(
-        self,
-        number: int,
-        trial: Trial,
-        model: SparseModel,
-        records: Records,
-        cycles: Sequence[Cycle],
+        self, number: int, trial: Trial, model: SparseModel, records: Records
     ) -> Confirmed:
         """Free run of a refined system over the longest record, from the start of its cycle."""
-        pairs = zip(records.runs, cycles, strict=True)
+        pairs = zip(records.runs, records.cycles, strict=True)
         longest, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
         start = cycle.waveform(cycle.phase[:1])[0]
         run = free_run(model, longest, initial=start, bounds=self.bounds, judged=self.judged)
-        share, repels = _attraction(run, cycles) if run.verdict is Verdict.LIVES else (0.0, False)
+        lives, period_s = run.verdict is Verdict.LIVES, 1.0 / records.cycles[0].frequency_Hz
+        share, repels = _attraction(run, period_s) if lives else (0.0, False)
         return Confirmed(number, trial, run, share, trial.system.broken(model), repels)
 
 
-def _attraction(run: FreeRun, cycles: Sequence[Cycle]) -> tuple[float, bool]:
+def _attraction(run: FreeRun, period_s: float) -> tuple[float, bool]:
     """Share of starts that reach the model's cycle, and whether departures from it grow.
 
     The share is zero if departures do not die out. A model with inputs is followed from its start
@@ -397,7 +377,6 @@ def _attraction(run: FreeRun, cycles: Sequence[Cycle]) -> tuple[float, bool]:
     """
     if run.model.inputs:
         return 1.0, False
-    period_s = 1.0 / cycles[0].frequency_Hz
     cycle = limit_cycle(run.model, run.rollout.states[-1], period_s=period_s)
     if cycle is None:
         return 0.0, False
@@ -438,18 +417,15 @@ def _spirals(cycle: Cycle, states: Float[np.ndarray, "samples n_states"]) -> boo
 
 
 def run_over(
-    systems: VectorField,
-    held: Sequence[Stretch],
-    records: Records,
-    cycles: Sequence[Cycle],
-    n_starts: int,
+    systems: VectorField, held: Sequence[Stretch], records: Records, n_starts: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, Cycle]]:
     """Times and paths of every system over every held-out stretch, one start after the other."""
     joined = np.concatenate(records.smoothed)
     centre, reach = joined.mean(axis=0), BLOW_UP * joined.std(axis=0)
     inputs = systems.library.variables[systems.n_states :]
     for part in held:
-        run, x, cycle = records.runs[part.run], records.smoothed[part.run], cycles[part.run]
+        run, x = records.runs[part.run], records.smoothed[part.run]
+        cycle = records.cycles[part.run]
         per_period = steps_in(1.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
         first, n_samples = part.start, part.stop - part.start
         no_courses = [None] * len(inputs)

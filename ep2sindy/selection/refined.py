@@ -12,16 +12,13 @@ from jaxtyping import Float, Int
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.gaps import mean_step
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.refine import refine_batch, smooth_batch
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, dominant_window
 from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.runtime.values import set_counts
-from ep2sindy.selection.combinations import MAX_ERROR, find_smallest, score_combinations
-from ep2sindy.selection.criteria import FLOOR
-from ep2sindy.selection.rule import Basis, Decision
+from ep2sindy.selection.criteria import FLOOR, MAX_ERROR, Basis, Decision
 from ep2sindy.selection.systems import (
     Records,
     Stretch,
@@ -102,18 +99,18 @@ class RefinedScore:
 
         A winner whose refined coefficients do not meet the demands on them is passed over.
         """
-        fronts, places, systems = found.fronts, found.places, found.systems
-        errors, limit = self._judge(systems, smooth_records(fronts, runs), progress)
+        systems = found.systems
+        errors, limit = self._judge(systems, smooth_records(found.fronts, runs), progress)
         broken: list[str] = []
         for _ in systems:
-            winner = find_smallest(fronts, places, errors, limit=limit)
+            winner = found.find_smallest(errors, limit=limit)
             with progress.stage(None, "", "the best system refined on all data"):
                 model = systems[winner].refine_on_all(runs)
             broken = systems[winner].broken(model)
             if not broken:
                 break
             errors[winner] = np.inf
-        scores = score_combinations(fronts, places, errors, limit=limit, winner=winner)
+        scores = found.score(errors, limit=limit, winner=winner)
         note = describe_demands(self.label, broken) + found.left_out
         return Decision(scores, model, note, systems[winner].constraint)
 
@@ -122,14 +119,13 @@ class RefinedScore:
     ) -> tuple[Float[np.ndarray, " combinations"], float]:
         """Error of every combination on windows it was not refined on, and the winner's limit."""
         models = [system.model for system in systems]
-        constraints = [system.constraint for system in systems]
         spread = np.concatenate(records.smoothed).std(axis=0)
         folds = self._folds(records.runs, models[0])
         parts = []
         n_fits = 2 * len(folds) * len(_order_by_size(models))
         with progress.stage(n_fits, "fit", "systems and window starts") as advance:
             for fitted, held in folds:
-                refined = _refine(models, fitted, constraints, advance)
+                refined = _refine(systems, fitted, advance)
                 scale = held.scale[: len(spread)] / spread
                 parts.append(_residuals(refined, held, advance) * scale)
         return _errors_and_limit(np.concatenate(parts, axis=1))
@@ -186,15 +182,13 @@ def _order_by_size(models: Sequence[SparseModel]) -> Int[np.ndarray, " models"]:
 
 
 def _refine(
-    models: Sequence[SparseModel],
-    batch: WindowBatch,
-    constraints: Sequence[Constraint],
-    advance: Advance,
+    systems: Sequence[TrialSystem], batch: WindowBatch, advance: Advance
 ) -> list[SparseModel]:
-    """Every model refined on the same windows; models without terms stay as they are.
+    """Every system refined on the same windows; models without terms stay as they are.
 
     One that did not converge, and follows its own windows no better, stays as it is, too.
     """
+    models = [system.model for system in systems]
     order, refined = _order_by_size(models), list(models)
     if not order.size:
         return refined
@@ -203,7 +197,7 @@ def _refine(
         [models[k] for k in order],
         batch,
         method=method,
-        constraints=[constraints[k] for k in order],
+        constraints=[systems[k].constraint for k in order],
         points_per_batch=together,
         advance=advance,
     )

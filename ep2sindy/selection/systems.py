@@ -13,15 +13,21 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Process, binding, constraint
 from ep2sindy.library.roles import process_amounts
-from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
 from ep2sindy.refinement.steps import fastest_step
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.regression.front import Fronts
-from ep2sindy.selection.combinations import combinations, describe_left_out, support_of
-from ep2sindy.selection.criteria import FLOOR
-from ep2sindy.selection.rule import OtherSystem
+from ep2sindy.selection.criteria import (
+    FLOOR,
+    MAX_ERROR,
+    OtherSystem,
+    combinations,
+    describe_left_out,
+    support_of,
+)
+from ep2sindy.signals.attractor import Cycle
 from ep2sindy.signals.kalman import KalmanSmoother
 
 # Most time steps, over windows and systems, of one refinement batch: more would not fit the cache.
@@ -41,6 +47,18 @@ class TrialSystem:
     model: SparseModel
     constraint: Constraint
     means: Float[np.ndarray, " processes"] | None = None
+
+    @staticmethod
+    def of(
+        task: Task,
+        held: Constraint,
+        free: Float[np.ndarray, " free"],
+        means: Float[np.ndarray, " processes"] | None = None,
+    ) -> TrialSystem:
+        """The system with these values of the free coefficients."""
+        empty = np.zeros((len(task.library), len(held.states)))
+        model = SparseModel(task.library, held.states, empty, task.runs[0].units)
+        return TrialSystem(with_coef(model, held, held.coef(free))[0], held, means)
 
     @property
     def n_free(self) -> int:
@@ -135,6 +153,28 @@ class Systems:
     systems: Sequence[TrialSystem]
     left_out: str = ""
 
+    def score(
+        self, errors: Float[np.ndarray, " systems"], *, limit: float, winner: int
+    ) -> list[Float[np.ndarray, " _candidates"]]:
+        """Scores of candidates from the errors of their systems.
+
+        limit: errors up to this value cannot be told from the least. winner: index of the system
+        that is selected among them. A candidate's score is the least error of all systems with it,
+        no less than the limit, or MAX_ERROR if there are none. The winner's candidates score
+        marginally below the limit.
+        """
+        scores = np.maximum(errors, limit)
+        scores[winner] = np.nextafter(limit, 0.0)
+        return [
+            np.array([scores[at == k].min(initial=MAX_ERROR) for k in range(len(front.candidates))])
+            for front, at in zip(self.fronts, self.places.T, strict=True)
+        ]
+
+    def find_smallest(self, errors: Float[np.ndarray, " systems"], *, limit: float) -> int:
+        """Index of the system of fewest terms, then least error, among errors up to the limit."""
+        n_terms = sum(f.sizes[k] for f, k in zip(self.fronts, self.places.T, strict=True))
+        return int(np.lexsort((errors, n_terms, errors > limit))[0])
+
 
 def combine(fronts: Fronts, task: Task, *, most: int) -> Systems:
     """The combinations of candidates as systems, the most promising if there are more than `most`.
@@ -148,15 +188,12 @@ def combine(fronts: Fronts, task: Task, *, most: int) -> Systems:
 
 def _combine_one(fronts: Fronts, choice: Int[np.ndarray, " fronts"], task: Task) -> TrialSystem:
     """System of one combination: free coefficients as found, the others by the relations."""
-    library, states = task.library, [front.equation for front in fronts]
-    chosen = [front.candidates[k] for front, k in zip(fronts, choice, strict=True)]
-    coef = coef_matrix(library, [candidate.coef_by_term for candidate in chosen])
-    model = SparseModel(library, states, coef, task.runs[0].units)
     support = support_of(fronts, choice)
-    held = constraint(library, support, binding(task.relations, support) or ())
-    places = [(library.index(term), states.index(state)) for state, term in held.coefficients]
-    free = np.array([coef[places[k]] for k in held.free])
-    return TrialSystem(with_coef(model, held, held.coef(free))[0], held)
+    held = constraint(task.library, support, binding(task.relations, support) or ())
+    pairs = zip(fronts, choice, strict=True)
+    coef = {front.equation: front.candidates[k].coef_by_term for front, k in pairs}
+    places = [held.coefficients[k] for k in held.free]
+    return TrialSystem.of(task, held, np.array([coef[state][term] for state, term in places]))
 
 
 def find_broken_demands(
@@ -195,10 +232,11 @@ def plan_refinement(batch: WindowBatch, library: Library) -> tuple[MultipleShoot
 
 @dataclass(frozen=True, eq=False)
 class Records:
-    """The trajectories to judge equations on, with smoothed states."""
+    """The trajectories to judge equations on, with smoothed states, and the cycles of each."""
 
     runs: Sequence[Trajectory]
     smoothed: Sequence[Float[np.ndarray, "_ n_states"]]
+    cycles: Sequence[Cycle] = ()
 
 
 def smooth_records(fronts: Fronts, runs: Sequence[Trajectory]) -> Records:

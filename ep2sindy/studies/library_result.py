@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import LeftOver, NoiseTest
+from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.estimate import Estimate, Rival
@@ -21,7 +21,7 @@ from ep2sindy.library.units import Clock
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.ambiguity import usable_terms
-from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
+from ep2sindy.regression.front import Candidate, LeftOver, ParetoFront, fit_support
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
@@ -223,7 +223,7 @@ def refit(
     for state, terms in published.items():
         if state in found.fronts:
             problem = problems[state]
-            at_hand = set(compress(problem.term_names, usable_terms(problem)))
+            at_hand = set(compress(problem.library.names, usable_terms(problem)))
             if set(terms) <= at_hand:
                 fits[state] = fit_support(problem, state, list(terms))
     return fits

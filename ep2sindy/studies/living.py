@@ -34,7 +34,7 @@ from ep2sindy.regression.searches import Search
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.rule import OtherSystem, Selection
+from ep2sindy.selection.criteria import OtherSystem, Selection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.spectrum import samples_in_periods

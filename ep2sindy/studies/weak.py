@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import EquationFit, assemble_model, reweight
+from ep2sindy.discovery.choice import assemble_model, reweight
 from ep2sindy.library.library import Library
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.scores import r2
-from ep2sindy.regression.front import fit_support
+from ep2sindy.regression.formulations import Weak
+from ep2sindy.regression.front import Candidate, fit_support
 from ep2sindy.regression.rows import Formulation, RegressionRows
-from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
-from ep2sindy.regression.weak import Weak
+from ep2sindy.regression.windows import Boxes, Bumps, WindowFunctions
 from ep2sindy.report.document import Equation, Table, Text
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
@@ -197,7 +197,7 @@ def fit_terms(
     setting: Setting,
     *,
     rng: np.random.Generator,
-) -> dict[str, tuple[EquationFit, RegressionRows]]:
+) -> dict[str, tuple[Candidate, RegressionRows]]:
     """Fit given terms, state by state, and keep the rows of the fits.
 
     Raises ValueError as the form's `assemble` and `fit_support` do.
@@ -207,8 +207,7 @@ def fit_terms(
     for problem in problems:
         for state in problem.equations:
             plain = fit_support(problem, state, terms[state])
-            fit = EquationFit(state, plain.terms, plain.coef)
-            found[state] = (reweight(problem, plain) if setting.weighted else fit, problem)
+            found[state] = (reweight(problem, plain) if setting.weighted else plain, problem)
     return found
 
 
@@ -265,7 +264,7 @@ def _half_widths(
     }
 
 
-def _r2_own_rows(fit: EquationFit, problem: RegressionRows) -> float:
+def _r2_own_rows(fit: Candidate, problem: RegressionRows) -> float:
     columns = [problem.library.index(name) for name in fit.terms]
     prediction = fit.coef[None] @ problem.theta[:, columns].T
     truth = problem.target[:, problem.equations.index(fit.equation)]

@@ -1,13 +1,15 @@
-"""Weak form: regression of integrals against test functions, so that no noise is differentiated.
+"""Formulations: how trajectories become rows, in differential form or in weak form.
 
-`WeightedWeak` whitens the rows under the whole library. Inputs that are known exactly, because
-they were set and not measured, are treated as free of noise.
+In the weak form, integrals against test functions are regressed, so that no noise is
+differentiated. `WeightedWeak` whitens these rows under the whole library. Inputs that are known
+exactly, because they were set and not measured, are treated as free of noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,14 +20,129 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.inputs import plausible_courses
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.regression.least_squares import LeastSquares
-from ep2sindy.regression.rows import NoisyRows, RegressionRows
-from ep2sindy.regression.splits import RandomSplit, Split
-from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
+from ep2sindy.regression.rows import MOST_ROWS, NoisyRows, RegressionRows, TermsAt
 from ep2sindy.regression.whitening import whiten_rows
-from ep2sindy.regression.windows import Windows
-from ep2sindy.runtime.values import check_kind, check_list, set_counts
+from ep2sindy.regression.windows import Boxes, Bumps, WindowFunctions, Windows
+from ep2sindy.runtime.values import check_kind, check_list, locked, set_counts
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
-from ep2sindy.signals.smoothers import Smoother
+from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
+
+
+@runtime_checkable
+class Split(Protocol):
+    """Interface that chooses the held-out groups of one trajectory; groups are in time order."""
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]: ...
+
+
+@dataclass(frozen=True)
+class RandomSplit:
+    """Hold out a random share of the groups of each trajectory, as in the thesis."""
+
+    test_fraction: float = 0.25
+
+    def __post_init__(self) -> None:
+        _check_fraction(self.test_fraction)
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
+        return BlockSplit(self.test_fraction, max(n_groups, 1)).held_out(n_groups, rng)
+
+
+@dataclass(frozen=True)
+class BlockSplit:
+    """Hold out contiguous blocks of each trajectory.
+
+    Neighbours in a time series are correlated, so randomly held-out rows would resemble training
+    rows.
+    """
+
+    test_fraction: float = 0.25
+    n_blocks: int = 20
+
+    def __post_init__(self) -> None:
+        _check_fraction(self.test_fraction)
+        set_counts(self, {"n_blocks": 1})
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
+        n_blocks = min(self.n_blocks, n_groups)
+        chosen = rng.permutation(n_blocks)[: round(self.test_fraction * n_blocks)]
+        return np.isin(np.arange(n_groups) * n_blocks // max(n_groups, 1), chosen)
+
+
+def _check_fraction(fraction: float) -> None:
+    if not 0.0 <= fraction < 1.0:
+        raise ValueError(f"test_fraction must lie in [0, 1): {fraction} came")
+
+
+@dataclass(frozen=True)
+class Differential:
+    """Regress the derivative at every sample on the library at that sample.
+
+    smooth_library: evaluate the terms on smoothed samples (default) or on raw ones (the thesis).
+    With noise in the terms a wrong support can score best.
+    """
+
+    smoother: Smoother = field(default_factory=SavitzkyGolay)
+    smooth_library: bool = True
+    split: Split = field(default_factory=RandomSplit)
+
+    def __post_init__(self) -> None:
+        check_kind("smoother", self.smoother, Smoother, "ep.signals.SavitzkyGolay()")
+        check_kind("split", self.split, Split, "ep.RandomSplit()")
+
+    def assemble(
+        self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
+    ) -> tuple[RegressionRows, ...]:
+        """Stack the rows of all trajectories; every row uses samples of one stretch without a gap.
+
+        All equations share their rows, so there is one regression.
+        Raises ValueError for no trajectory, trajectories with different states, or a variable of
+        the library that a trajectory lacks.
+        """
+        check_agreement(trajectories, library.variables)
+        check_domain(trajectories, library, smooth=self.smooth_library)
+        pieces = [piece for run in trajectories for piece in run.stretches()]
+        n_samples = [run.n_samples for run in pieces]
+        values = np.empty((sum(n_samples), len(library.variables)))
+        target = np.empty((len(values), len(trajectories[0].state_names)))
+        ends = np.cumsum(n_samples)
+        for run, end in zip(pieces, ends.tolist(), strict=True):
+            rows = slice(end - run.n_samples, end)
+            self._fill(run, library, values[rows], target[rows])
+        terms = TermsAt(library, values)
+        problem = RegressionRows(
+            theta=terms if len(values) > MOST_ROWS else terms[:],
+            target=locked(target),
+            library=library,
+            equations=trajectories[0].state_names,
+            groups=np.arange(len(values)),
+            test=np.concatenate([self.split.held_out(n, rng) for n in n_samples]),
+            trajectories=tuple(trajectories),
+        )
+        return (problem,)
+
+    def _fill(
+        self,
+        run: Trajectory,
+        library: Library,
+        values: Float[np.ndarray, "samples variables"],
+        target: Float[np.ndarray, "samples n_states"],
+    ) -> None:
+        """Write the library's variables and the derivatives of one trajectory at its samples."""
+        n_columns = 1 if run.n_samples > MOST_ROWS else len(run.names)  # at once: each is copied
+        values[:] = run.columns(library.variables)
+        for k in range(0, target.shape[1], n_columns):
+            some = slice(k, k + n_columns)
+            target[:, some] = self.smoother.derivative(run.t, run.states[:, some])
+        if not self.smooth_library:
+            return
+        for k in range(0, values.shape[1], n_columns):
+            some = slice(k, k + n_columns)
+            values[:, some] = self.smoother.smooth(run.t, values[:, some])
+        if library.functions:
+            raw = noise_inside(library, run.columns(library.variables))
+            values[:] = keep_inside(library, values, raw)
+
 
 MAX_SEGMENTS = 20  # segments of a trajectory at most; each is held out or resampled as a whole
 
@@ -66,11 +183,7 @@ class Weak:
             )
 
     def assemble(
-        self,
-        trajectories: Sequence[Trajectory],
-        library: Library,
-        *,
-        rng: np.random.Generator,
+        self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> tuple[RegressionRows, ...]:
         """Assemble one regression per state, since every state has its own windows.
 
@@ -139,6 +252,18 @@ class Weak:
         windows, test = Windows.joined(parts), np.concatenate(tests)
         n_before = np.cumsum([0, *(run.segment[-1] + 1 for run in runs[:-1])])
         target = windows.slope @ np.concatenate([run.run.states[:, state] for run in runs])
+        noisy, names = None, runs[0].names
+        if self.errors_in_variables:
+            estimates = [run.estimate for run in runs if run.estimate is not None]
+            stds = [np.broadcast_to(e.noise_std, e.smoothed.shape) for e in estimates]
+            noisy = NoisyRows(
+                windows=windows.taken(~test),
+                target=target[~test],
+                state=names.index(name),
+                values=np.concatenate([run.run.columns(names) for run in runs]),
+                smoothed=np.concatenate([estimate.smoothed for estimate in estimates]),
+                noise_std=np.concatenate(stds),
+            )
         return RegressionRows(
             theta=windows.mean @ np.concatenate([run.terms for run in runs]),
             target=target[:, None],
@@ -147,9 +272,7 @@ class Weak:
             groups=np.concatenate([s + n for s, n in zip(segments, n_before, strict=True)]),
             test=test,
             trajectories=tuple(trajectories),
-            noisy=_noisy_rows(name, runs, windows.taken(~test), target[~test])
-            if self.errors_in_variables
-            else None,
+            noisy=noisy,
         )
 
 
@@ -184,23 +307,6 @@ class _Sampled:
         pure = (share == 0.0) | (share == 1.0)
         segment = self.segment[(first + last) // 2]
         return windows.taken(pure), segment[pure], share[pure] == 1.0
-
-
-def _noisy_rows(
-    name: str, runs: Sequence[_Sampled], windows: Windows, target: Float[np.ndarray, " rows"]
-) -> NoisyRows:
-    names = runs[0].names
-    estimates = [run.estimate for run in runs if run.estimate is not None]
-    return NoisyRows(
-        windows=windows,
-        target=target,
-        state=names.index(name),
-        values=np.concatenate([run.run.columns(names) for run in runs]),
-        smoothed=np.concatenate([estimate.smoothed for estimate in estimates]),
-        noise_std=np.concatenate(
-            [np.broadcast_to(e.noise_std, e.smoothed.shape) for e in estimates]
-        ),
-    )
 
 
 @dataclass(frozen=True)
@@ -252,7 +358,7 @@ class WeightedWeak:
             )
         everything = usable_terms(problem)
         coef = np.zeros(len(problem.library))
-        theta, target = problem.train_theta[:, everything], problem.train_target(0)
+        theta, target = problem.train_theta[:, everything], problem.scaled_target(0)
         coef[everything] = LeastSquares.of_rows(theta, target).coef
         white = whiten_rows(problem, everything, coef, n_steps=self.n_steps)
         # Whitened rows are in standard deviations; rescale to about the unit of the derivative.
@@ -291,12 +397,13 @@ def exact_columns(
         )
     if declared is not None:
         return np.isin(names, list(declared))
-    exact = np.zeros(len(names), dtype=np.bool_)
-    for k, (name, column) in enumerate(zip(names, run.columns(names).T, strict=True)):
-        if name in run.input_names:
-            noise = np.inf if noise_std is None else noise_std[k]
-            exact[k] = is_switched(column) or bool(noise <= NEGLIGIBLE * column.std())
-    return exact
+    noise = np.broadcast_to(np.inf if noise_std is None else noise_std, len(names))
+    columns = run.columns(names).T
+    is_exact = [
+        name in run.input_names and (is_switched(x) or bool(std <= NEGLIGIBLE * x.std()))
+        for name, x, std in zip(names, columns, noise, strict=True)
+    ]
+    return np.array(is_exact, dtype=np.bool_)
 
 
 def is_switched(samples: Float[np.ndarray, " samples"]) -> bool:
