@@ -109,16 +109,6 @@ def test_a_state_that_was_not_measured_is_fitted_by_the_model() -> None:
     assert estimator.filter(blind).mean == pytest.approx(truth, abs=0.05)
 
 
-def test_frequencies_and_amplitudes_come_with_intervals() -> None:
-    ahead = ep.forecast(SPRING, spring(0.05), 2.0 * np.pi * 20)
-    low, middle, high = ahead.frequency_Hz()
-    assert low <= middle <= high
-    assert middle == pytest.approx(0.5 / np.pi, rel=1e-3)
-    low, middle, high = ahead.amplitude("x")
-    assert low < np.sqrt(0.5) < high
-    assert ahead.diverged == 0.0
-
-
 def test_draws_have_the_covariance_that_was_asked_for() -> None:
     rng = np.random.default_rng(0)
     covariance = np.array([[4e20, 1e10], [1e10, 1.0]])

@@ -16,7 +16,6 @@ from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
 from ep2sindy.model.inputs import driven
 from ep2sindy.runtime.values import read_only
-from ep2sindy.signals.spectrum import dominant_frequency
 
 LEVEL = 0.9  # share of the samples that a band is to hold
 
@@ -60,24 +59,6 @@ class Forecast:
     def diverged(self) -> float:
         """Share of the draws that diverged."""
         return float(np.isnan(self.draws[:, -1]).any(axis=1).mean())
-
-    def frequency_Hz(self, level: float = LEVEL) -> tuple[float, float, float]:
-        """Dominant frequency of the first state: lower bound, median, upper bound over the draws.
-
-        Draws that diverged are left out; NaN if none is left.
-        """
-        kept = self.draws[~np.isnan(self.draws).any(axis=(1, 2)), :, 0]
-        return _interval([dominant_frequency(self.t, path) for path in kept], level)
-
-    def amplitude(self, state: str, level: float = LEVEL) -> tuple[float, float, float]:
-        """Standard deviation in time of a state: lower bound, median, upper bound over the draws.
-
-        Raises ValueError for an unknown state.
-        """
-        if state not in self.state_names:
-            raise ValueError(f"unknown state {state!r}; this forecast has {list(self.state_names)}")
-        kept = self.draws[~np.isnan(self.draws).any(axis=(1, 2)), :, self.state_names.index(state)]
-        return _interval(kept.std(axis=1).tolist(), level)
 
 
 def draw_forecasts(
@@ -124,10 +105,3 @@ def draw_forecasts(
         )
         for own, draws in zip(times, runs, strict=True)
     ]
-
-
-def _interval(values: Sequence[float], level: float) -> tuple[float, float, float]:
-    if not len(values):
-        return (float("nan"),) * 3
-    low, middle, high = np.quantile(values, [0.5 - 0.5 * level, 0.5, 0.5 + 0.5 * level])
-    return float(low), float(middle), float(high)

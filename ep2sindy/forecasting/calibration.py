@@ -7,12 +7,15 @@ a few places alone, less.
 
 from __future__ import annotations
 
+from bisect import bisect_left
+
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.bands import LEVEL
 from ep2sindy.forecasting.rolling import RollingStarts, StatesOf, spread_evenly
 from ep2sindy.forecasting.state_estimation import StateEstimator
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.signals.spectrum import is_uniform
 
@@ -23,7 +26,12 @@ FACTORS = 10.0 ** np.arange(-2.0, 2.1, 0.25)  # of the likeliest pushes
 
 @one_thread()
 def calibrate(
-    estimator: StateEstimator, run: Trajectory, *, states_of: StatesOf | None = None, seed: int = 0
+    estimator: StateEstimator,
+    run: Trajectory,
+    *,
+    states_of: StatesOf | None = None,
+    seed: int = 0,
+    progress: Progress = SILENT,
 ) -> StateEstimator:
     """The estimator with pushes whose bands hold 90 % of the record that the model was fitted to.
 
@@ -36,18 +44,16 @@ def calibrate(
     if estimator.model.inputs or not is_uniform(run.t) or len(first) < N_STARTS:
         return estimator
     first = first[spread_evenly(len(first), N_STARTS)]
-    names = [n for n, own in zip(estimator.model.states, estimator.measured, strict=True) if own]
-    rolling = RollingStarts(estimator, run, names, first, ahead)
-    ends = rolling.ends(states_of)
+    rolling = RollingStarts(estimator, run, first, ahead)
 
     def coverage(factor: float) -> float:
         pushed = rolling.with_pushes(factor)
-        return pushed.coverage(pushed.from_ends(ends, N_DRAWS, seed), LEVEL)
+        return pushed.coverage(pushed.forecast(ends, N_DRAWS, seed), LEVEL)
 
-    if abs(coverage(1.0) - LEVEL) <= TOLERANCE:
-        return estimator
-    below, above = 0, len(FACTORS) - 1
-    while above - below > 1:  # more pushes, wider bands
-        middle = (below + above) // 2
-        below, above = (middle, above) if coverage(FACTORS[middle]) < LEVEL else (below, middle)
+    with progress.stage(None, "", "width of the forecasts' bands"):
+        ends = rolling.ends(states_of)
+        if abs(coverage(1.0) - LEVEL) <= TOLERANCE:
+            return estimator
+        # More pushes make wider bands.
+        above = bisect_left(FACTORS[1:-1], LEVEL, key=coverage) + 1
     return rolling.with_pushes(float(FACTORS[above])).estimator

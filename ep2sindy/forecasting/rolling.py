@@ -43,14 +43,10 @@ def spread_evenly(n_all: int, n: int) -> Int[np.ndarray, " places"]:
 
 @dataclass(frozen=True, eq=False)
 class RollingStarts:
-    """Starts of forecasts: numbers of the first samples that are forecast, `longest` from each on.
-
-    names: the measured states.
-    """
+    """Starts of forecasts: numbers of the first samples that each forecasts, `longest` from it."""
 
     estimator: StateEstimator
     record: Trajectory
-    names: Sequence[str]
     first: Int[np.ndarray, " starts"]
     longest: int
 
@@ -62,7 +58,7 @@ class RollingStarts:
 
     @property
     def truth(self) -> Float[np.ndarray, "starts ahead measured"]:
-        samples = self.record.columns(self.names)
+        samples = self.record.columns(self.estimator.names)
         return np.stack([samples[k : k + self.longest] for k in self.first])
 
     def ends(self, states_of: StatesOf | None, advance: Advance = nothing) -> list[FittedState]:
@@ -74,12 +70,7 @@ class RollingStarts:
             advance(1)
         return found
 
-    def forecast(
-        self, states_of: StatesOf | None, n_draws: int, seed: int, advance: Advance = nothing
-    ) -> list[Forecast]:
-        return self.from_ends(self.ends(states_of, advance), n_draws, seed)
-
-    def from_ends(self, ends: Sequence[FittedState], n_draws: int, seed: int) -> list[Forecast]:
+    def forecast(self, ends: Sequence[FittedState], n_draws: int, seed: int) -> list[Forecast]:
         """Forecasts from fitted states; at equal steps, all of them are drawn together."""
         t, begins = self.record.t, self.record.t[self.first - 1]
         draw = partial(draw_forecasts, self.estimator, n_draws=n_draws, clock=self.record.clock)
@@ -94,18 +85,18 @@ class RollingStarts:
 
     def continued(self, baseline: Baseline) -> Float[np.ndarray, "starts ahead measured"]:
         """What a baseline forecasts from every start."""
-        samples, t = self.record.columns(self.names), self.record.t
+        samples, t = self.record.columns(self.estimator.names), self.record.t
         return np.stack(
             [baseline.ahead(samples[:k], t[:k], t[k : k + self.longest]) for k in self.first]
         )
 
     def measured(self, ahead: Sequence[Forecast]) -> Float[np.ndarray, "starts ahead measured"]:
-        return np.stack([each.states[:, self._columns] for each in ahead])
+        return np.stack([each.states[:, self.estimator.measured] for each in ahead])
 
     def coverage(self, ahead: Sequence[Forecast], level: float) -> float:
         """Share of the samples that bands hold."""
         low, high = (
-            np.stack(side)[:, :, self._columns]
+            np.stack(side)[:, :, self.estimator.measured]
             for side in zip(*[each.band(level) for each in ahead], strict=True)
         )
         return float(((low <= self.truth) & (self.truth <= high)).mean())
@@ -114,7 +105,3 @@ class RollingStarts:
         """The same with pushes larger by a factor."""
         noise = replace(self.estimator.noise, process=factor * self.estimator.noise.process)
         return replace(self, estimator=replace(self.estimator, noise=noise))
-
-    @property
-    def _columns(self) -> list[int]:
-        return [list(self.estimator.model.states).index(name) for name in self.names]

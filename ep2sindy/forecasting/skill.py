@@ -16,10 +16,10 @@ from ep2sindy.forecasting.bands import LEVEL, Forecast
 from ep2sindy.forecasting.baselines import Autoregression, Baseline, Harmonics, Persistence
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.rolling import RollingStarts, StatesOf, spread_evenly, spread_starts
-from ep2sindy.forecasting.state_estimation import StateEstimator, measured_states, tune_estimator
+from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.units import Clock
 from ep2sindy.model.model import SparseModel
-from ep2sindy.runtime.progress import Advance, nothing
+from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count
 from ep2sindy.signals.attractor import find_cycle
@@ -109,7 +109,8 @@ class ForecastSkill:
 
     def summary(self) -> dict[str, object]:
         """For `summary.json`: the errors at a few horizons."""
-        places = _pick_few(len(self.horizons_s))
+        last = len(self.horizons_s) - 1
+        places = sorted({round(k / 16 * last) for k in (0, 1, 2, 4, 8, 12, 16)})
         return {
             "horizons_periods": [self._in_unit(h) for h in self.horizons_s[places].tolist()],
             "nrmse": {name: values[places].tolist() for name, values in self.nrmse.items()},
@@ -136,7 +137,7 @@ def forecast_skill(
     n_draws: int = 100,
     estimator: StateEstimator | None = None,
     seed: int = 0,
-    advance: Advance = nothing,
+    progress: Progress | bool = False,
 ) -> ForecastSkill:
     """Forecast a held-out part again and again, each time from its own past, and count the errors.
 
@@ -147,21 +148,21 @@ def forecast_skill(
     (`ep.signals.embed`). estimator: calibrated on the fitted part. n_draws: of every forecast.
     Raises ValueError for a driven model, or a part that is too short.
     """
-    record = trajectory_of(run)
-    names = measured_states(model, record) if measured is None else list(measured)
-    _check_skill(model, record, n_fitted)
-    fitted = record.window(0, n_fitted)
+    record, watch = trajectory_of(run), as_progress(progress)
+    fitted = _fitted_part(model, record, n_fitted)
     if estimator is None:
-        estimator = tune_estimator(model, fitted, measured=names)
-        estimator = calibrate(estimator, fitted, states_of=states_of)
-    longest = _horizon_of(record, n_fitted, period_s := _period_of(fitted, names), horizon_s)
+        estimator = tune_estimator(model, fitted, measured=measured, progress=watch)
+        estimator = calibrate(estimator, fitted, states_of=states_of, progress=watch)
+    names, period_s = estimator.names, _period_of(fitted, estimator.names)
+    longest = _horizon_of(record, n_fitted, period_s, horizon_s)
     first = spread_starts(record.t, n_fitted, longest, check_count("starts", starts))
-    rolling = RollingStarts(estimator, record, names, first, longest)
-    ahead = rolling.forecast(states_of, check_count("n_draws", n_draws), seed, advance)
-    shown = spread_evenly(longest, N_HORIZONS)
-    baselines, order = _fit_baselines(fitted, names)
-    paths = {name: rolling.continued(baseline) for name, baseline in baselines.items()}
-    paths = {MODEL: rolling.measured(ahead), **paths}
+    rolling = RollingStarts(estimator, record, first, longest)
+    with watch.stage(len(first), "start", "forecasts") as advance:
+        ends = rolling.ends(states_of, advance)
+    ahead = rolling.forecast(ends, check_count("n_draws", n_draws), seed)
+    shown, (baselines, order) = spread_evenly(longest, N_HORIZONS), _fit_baselines(fitted, names)
+    paths = {MODEL: rolling.measured(ahead)}
+    paths |= {name: rolling.continued(each) for name, each in baselines.items()}
     scale = zero_to_one(record.columns(names)[n_fitted:].std(axis=0))
     errors = {n: horizon_errors(path, rolling.truth, scale)[shown] for n, path in paths.items()}
     return ForecastSkill(
@@ -176,7 +177,8 @@ def forecast_skill(
     )
 
 
-def _check_skill(model: SparseModel, record: Trajectory, n_fitted: int) -> None:
+def _fitted_part(model: SparseModel, record: Trajectory, n_fitted: int) -> Trajectory:
+    """The samples that were fitted. Raises ValueError for a driven model, or too few samples."""
     if model.inputs:
         raise ValueError(
             f"the skill of forecasts is counted for models without inputs: this one is driven by "
@@ -187,6 +189,7 @@ def _check_skill(model: SparseModel, record: Trajectory, n_fitted: int) -> None:
             "the fitted part must have eight samples or more, and leave four: "
             f"n_fitted={n_fitted} came for {record.n_samples} samples"
         )
+    return record.window(0, n_fitted)
 
 
 def _period_of(run: Trajectory, names: Sequence[str]) -> float:
@@ -235,8 +238,3 @@ def horizon_errors(
     """Root mean square error over starts and states at every horizon, in `scale`."""
     off = np.nan_to_num(np.abs(forecast - truth) / scale, nan=WORST, posinf=WORST)
     return np.sqrt(np.square(np.minimum(off, WORST)).mean(axis=(0, 2)))
-
-
-def _pick_few(n: int) -> list[int]:
-    """A few places of n, closer at the beginning."""
-    return sorted({round(share * (n - 1)) for share in (0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1)})

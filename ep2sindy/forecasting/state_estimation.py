@@ -100,6 +100,11 @@ class StateEstimator:
         return self.problem.measured
 
     @property
+    def names(self) -> list[str]:
+        """The measured states, in the model's order."""
+        return [name for name, own in zip(self.model.states, self.measured, strict=True) if own]
+
+    @property
     def memory(self) -> int:
         """Length in samples of the window that a start is fitted to."""
         return int(np.clip(MEMORY_PERIODS * self.per_period, MIN_MEMORY, MAX_MEMORY))
