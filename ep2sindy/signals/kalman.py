@@ -8,7 +8,6 @@ one. The start is diffuse: of the samples only the third differences count, whic
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -214,8 +213,11 @@ class KalmanSmoother:
     coarsest_s: float | None = None
 
     def __post_init__(self) -> None:
-        if self.log10_ratio is not None:
-            _check_ratio(self.log10_ratio)
+        if not LOG10_RATIO_MIN <= (self.log10_ratio or 0.0) <= LOG10_RATIO_MAX:
+            raise ValueError(
+                f"log10_ratio must lie in [{LOG10_RATIO_MIN:g}, {LOG10_RATIO_MAX:g}]: "
+                f"{self.log10_ratio:g} came; leave it out to have the most likely one found"
+            )
         check_memory_bounds(self.finest_s, self.coarsest_s)
 
     def estimate(
@@ -232,17 +234,19 @@ class KalmanSmoother:
         steps, step_s = scale_steps(t, values, MIN_SAMPLES)
         process, spread = WienerProcess.at(steps), values.max(axis=0) - values.min(axis=0)
         columns = (values - values[0]) / zero_to_one(spread)
-        signal, noise_std = np.empty(values.shape), np.empty(len(spread))
-        log10_ratio = self._ratios(process, columns, step_s)
-        for j, ratio in enumerate((10.0**log10_ratio).tolist()):
-            column = columns[:, j : j + 1]
-            signal[:, j : j + 1] = process.signal(column, ratio)
-            noise_std[j] = np.sqrt(process.likelihood(column, ratio)[1][0])
+        signal, (noise_std, ratios) = np.empty(values.shape), np.empty((2, len(spread)))
+        limits, given = (LOG10_RATIO_MIN, LOG10_RATIO_MAX), self.log10_ratio
+        bounds = ratio_bounds(self.finest_s, self.coarsest_s, step_s, limits)
+        for j in range(len(spread)):
+            column = columns[:, [j]]
+            ratios[j] = most_likely_ratio(process, column, *bounds) if given is None else given
+            signal[:, [j]] = process.signal(column, 10.0 ** ratios[j])
+            noise_std[j] = np.sqrt(process.likelihood(column, 10.0 ** ratios[j])[1][0])
         return KalmanEstimate(
             smoothed=values[0] + spread * signal,
             derivative=spread * process.slope(signal) / step_s,
             noise_std=spread * noise_std,
-            log10_ratio=log10_ratio,
+            log10_ratio=ratios,
         )
 
     def smooth(
@@ -256,14 +260,6 @@ class KalmanSmoother:
     ) -> Float[np.ndarray, "samples columns"]:
         """Raises ValueError for fewer than five samples."""
         return self.estimate(t, values).derivative
-
-    def _ratios(self, process: WienerProcess, values: np.ndarray, step_s: float) -> np.ndarray:
-        if self.log10_ratio is not None:
-            return np.full(values.shape[1], self.log10_ratio)
-        bounds = ratio_bounds(
-            self.finest_s, self.coarsest_s, step_s, (LOG10_RATIO_MIN, LOG10_RATIO_MAX)
-        )
-        return most_likely_ratios(process, values, *bounds)
 
 
 def ratio_bounds(
@@ -281,31 +277,20 @@ def ratio_bounds(
     return lowest, max(lowest, highest)
 
 
-def most_likely_ratios(
+def most_likely_ratio(
     process: WienerProcess,
-    values: Float[np.ndarray, "samples columns"],
+    column: Float[np.ndarray, "samples one"],
     lowest: float = LOG10_RATIO_MIN,
     highest: float = LOG10_RATIO_MAX,
-) -> Float[np.ndarray, " columns"]:
-    """log10 of the noise ratio of greatest likelihood for each column, within bounds."""
-    if not values.shape[1]:
-        return np.empty(0)  # LAPACK takes no empty right-hand sides
+) -> float:
+    """log10 of the noise ratio of greatest likelihood, within bounds."""
+
+    def misfit(log10_ratio: float) -> float:
+        return -float(process.likelihood(column, 10.0**log10_ratio)[0][0])
+
     decades = np.append(np.arange(lowest, highest, 1.0), highest)
-    on_grid = np.stack([-process.likelihood(values, 10.0**decade)[0] for decade in decades])
-    ratios = np.empty(values.shape[1])
-    for j, misfits in enumerate(on_grid.T):
-        column = values[:, j : j + 1]
-        ratios[j] = least_beside_grid(
-            partial(_misfit, process, column),
-            decades,
-            misfits,
-            tolerance=LOG10_RATIO_TOLERANCE,
-        )
-    return ratios
-
-
-def _misfit(process: WienerProcess, column: np.ndarray, log10_ratio: float) -> float:
-    return -float(process.likelihood(column, 10.0**log10_ratio)[0][0])
+    on_grid = np.array([misfit(decade) for decade in decades])
+    return least_beside_grid(misfit, decades, on_grid, tolerance=LOG10_RATIO_TOLERANCE)
 
 
 def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> None:
@@ -313,14 +298,6 @@ def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> Non
     for name, value in {"finest_s": finest_s, "coarsest_s": coarsest_s}.items():
         if value is not None and not value > 0.0:
             raise ValueError(f"{name} must be a positive time in s: {value} came")
-
-
-def _check_ratio(log10_ratio: float) -> None:
-    if not LOG10_RATIO_MIN <= log10_ratio <= LOG10_RATIO_MAX:
-        raise ValueError(
-            f"log10_ratio must lie in [{LOG10_RATIO_MIN:g}, {LOG10_RATIO_MAX:g}]: "
-            f"{log10_ratio:g} came; leave it out to have the most likely one found"
-        )
 
 
 def scale_steps(

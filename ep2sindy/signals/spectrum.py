@@ -21,9 +21,9 @@ def is_uniform(t: Float[np.ndarray, " samples"]) -> bool:
 
 
 def resample_evenly(
-    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], *, degree: int = 3
-) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
-    """Samples at equal steps, the mean of the given ones, by splines of a degree between gaps.
+    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
+) -> Float[np.ndarray, " samples"]:
+    """Samples at equal steps, the mean of the given ones, by cubic splines between gaps.
 
     A gap is bridged by a straight line: a spline would overshoot there.
     """
@@ -31,12 +31,12 @@ def resample_evenly(
 
     even = np.linspace(t[0], t[-1], len(t))
     values = np.interp(even, t, x)
-    for start, stop in between_gaps(t) if degree > 1 else ():
-        own, degree_here = t[start:stop], min(degree, stop - start - 1)
+    for start, stop in between_gaps(t):
+        own, degree = t[start:stop], min(3, stop - start - 1)
         inside = (even >= own[0]) & (even <= own[-1])
-        if degree_here > 1:
-            values[inside] = make_interp_spline(own, x[start:stop], k=degree_here)(even[inside])
-    return even, values
+        if degree > 1:
+            values[inside] = make_interp_spline(own, x[start:stop], k=degree)(even[inside])
+    return values
 
 
 def power_spectrum(
@@ -49,13 +49,9 @@ def power_spectrum(
     Returns frequencies in Hz and power density in u^2/Hz.
     """
     if not is_uniform(t):
-        x = resample_evenly(t, x)[1]
+        x = resample_evenly(t, x)
     rate_Hz = (len(t) - 1) / (t[-1] - t[0])
-    return _periodogram(x, rate_Hz)
-
-
-def _periodogram(x: np.ndarray, rate_Hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """Same as `scipy.signal.periodogram` with a Hann window, whose import takes half a second."""
+    # As scipy.signal.periodogram has it, whose import takes half a second.
     window = 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, len(x) + 1)[:-1])
     strength = np.cumsum(window**2)[-1]  # summed in order, to match SciPy to the last digit
     transform = fft.rfft((x - x.mean()) * (window * (1.0 / np.sqrt(strength * rate_Hz))))
