@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from scipy.linalg import cho_factor, cho_solve, null_space
 
-from ep2sindy.signals import kalman
-from ep2sindy.signals.kalman import KalmanSmoother, WienerProcess, most_likely_ratio
-from ep2sindy.signals.smoothers import Smoother
+from ep2sindy.signals import smoothers
+from ep2sindy.signals.smoothers import KalmanSmoother, Smoother, WienerProcess, most_likely_ratio
 from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 
 SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
@@ -91,7 +90,7 @@ def test_both_factorisations_give_one_likelihood(
     process, values = WienerProcess.at(steps), np.cumsum(rng.normal(size=(3000, 2)), axis=0)
     ratios = 10.0 ** np.arange(-10.0, 5.0, 2.0)
     plain = [process.likelihood(values, ratio) for ratio in ratios]
-    monkeypatch.setattr(kalman, "WELL_CONDITIONED", np.inf)
+    monkeypatch.setattr(smoothers, "WELL_CONDITIONED", np.inf)
     joint = [process.likelihood(values, ratio) for ratio in ratios]
     np.testing.assert_allclose(plain, joint, rtol=1e-6, atol=0.01)  # as WELL_CONDITIONED says
 

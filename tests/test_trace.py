@@ -10,7 +10,7 @@ from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.one_signal import SignalSearch, method_by_runs
 from ep2sindy.library.units import Clock
 from ep2sindy.signals.embedding import DROWNED, unexplained
-from ep2sindy.signals.kalman import ratio_bounds
+from ep2sindy.signals.smoothers import ratio_bounds
 from ep2sindy.signals.spectrum import signal_memory_s
 from ep2sindy.studies.trace import Study
 from tests.programs import composed

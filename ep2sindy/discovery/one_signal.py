@@ -28,8 +28,7 @@ from ep2sindy.discovery.signal_unknowns import (
     search_hidden,
 )
 from ep2sindy.estimation.explanation import FIRST_MAX_TERMS
-from ep2sindy.forecasting.calibration import calibrate
-from ep2sindy.forecasting.rolling import RollingStarts, spread_starts
+from ep2sindy.forecasting.forecast import RollingStarts, calibrate, spread_starts
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill, horizon_errors
 from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.library import Library, polynomial

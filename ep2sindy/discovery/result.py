@@ -18,8 +18,7 @@ from ep2sindy.data.runs import Run
 from ep2sindy.discovery.choice import LeftOver, NoiseTest
 from ep2sindy.discovery.method import DiscoveryMethod
 from ep2sindy.estimation.estimate import Estimate
-from ep2sindy.forecasting.bands import Forecast
-from ep2sindy.forecasting.forecast import forecast
+from ep2sindy.forecasting.forecast import Forecast, forecast
 from ep2sindy.library.relations import Constraint, Process
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel

@@ -36,7 +36,7 @@ from ep2sindy.estimation.observation import (
 )
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 from ep2sindy.estimation.supports import alternatives, best_support, excess, penalise, term_prices
-from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
+from ep2sindy.signals.smoothers import KalmanEstimate, KalmanSmoother
 
 SAMPLES_PER_TERM = 5  # of the library: fewer samples do not tell which terms are present
 ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap

@@ -20,8 +20,7 @@ from ep2sindy.signals.attractor import (
     waveform_errors,
     white_variance,
 )
-from ep2sindy.signals.oscillation import DIED_OUT, has_decayed
-from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
+from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency, has_decayed, power_spectrum
 
 LONG = 8.0  # fewest periods in a record whose first half may be left out as a transient
 REPEATS = 0.9  # least share of the variance that the waveform of a cycle explains; chaos: 0.5-0.75

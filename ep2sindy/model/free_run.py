@@ -26,8 +26,7 @@ from ep2sindy.model.stability import (
 )
 from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.attractor import follow_phase
-from ep2sindy.signals.oscillation import DIED_OUT
-from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency
 
 
 @dataclass(frozen=True, eq=False)

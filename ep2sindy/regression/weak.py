@@ -24,8 +24,7 @@ from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.whitening import whiten_rows
 from ep2sindy.regression.windows import Windows
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
-from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
-from ep2sindy.signals.smoothers import Smoother
+from ep2sindy.signals.smoothers import KalmanEstimate, KalmanSmoother, Smoother
 
 MAX_SEGMENTS = 20  # segments of a trajectory at most; each is held out or resampled as a whole
 

@@ -22,7 +22,7 @@ from ep2sindy.regression.front import Fronts
 from ep2sindy.selection.combinations import combinations, describe_left_out, support_of
 from ep2sindy.selection.criteria import FLOOR
 from ep2sindy.selection.rule import OtherSystem
-from ep2sindy.signals.kalman import KalmanSmoother
+from ep2sindy.signals.smoothers import KalmanSmoother
 
 # Most time steps, over windows and systems, of one refinement batch: more would not fit the cache.
 BATCH_STEPS = 6000

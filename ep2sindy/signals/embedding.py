@@ -15,8 +15,8 @@ from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.values import check_count
-from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.log_smoother import LogSmoother
+from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import signal_memory_s
 from ep2sindy.signals.trace import Trace
 

@@ -11,7 +11,7 @@ from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.runtime.values import read_only
-from ep2sindy.signals.kalman import WienerProcess, check_memory_bounds, ratio_bounds, scale_steps
+from ep2sindy.signals.smoothers import WienerProcess, check_memory_bounds, ratio_bounds, scale_steps
 
 # Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
 # time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.

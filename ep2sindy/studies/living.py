@@ -36,7 +36,7 @@ from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, p
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.rule import OtherSystem, Selection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
-from ep2sindy.signals.kalman import KalmanSmoother
+from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import power_spectrum, samples_in_periods
 from ep2sindy.studies.source import NO_ZONES, TELLING, Zones, told_roles
 from ep2sindy.studies.study import Count, Positive
