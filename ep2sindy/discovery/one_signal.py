@@ -225,10 +225,16 @@ class SignalSearch:
     ) -> tuple[Embedded, Discovery]:
         with progress.stage(None, "", f"{n_states} states of the signal"):
             states = self._embed(past, n_states)
-        library = self.library(states.run.state_names, self._fit_functions(states), self.degree)
-        known = {"relations": states.relations, "terms": states.terms}
-        method = self._method_for(states)
-        return states, discover(states.run, library, method, **known, seed=seed, progress=progress)
+        found = discover(
+            states.run,
+            self.library(states.run.state_names, self._fit_functions(states), self.degree),
+            self._method_for(states),
+            relations=states.relations,
+            terms=states.terms,
+            seed=seed,
+            progress=progress,
+        )
+        return states, found
 
     def _attempt(
         self, past: Trace, states: Embedded, found: Discovery, progress: Progress
@@ -248,8 +254,9 @@ class SignalSearch:
         return kind(self.harmonics, n_states).embed(signal)
 
     def library(self, names: Sequence[str], functions: Sequence[str], degree: int) -> Library:
-        extra = {"functions": functions, "function_degree": self.function_degree}
-        return polynomial(names, degree=degree, **extra)
+        return polynomial(
+            names, degree=degree, functions=functions, function_degree=self.function_degree
+        )
 
     def _fit_functions(self, states: Embedded) -> list[str]:
         """The functions, with numbers where they have a `?`."""
