@@ -298,7 +298,7 @@ def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ep.signals.LogSmoother(0.0), "finest_s must be a positive time"),
+        (lambda: ep.signals.LogSmoother(0.0), "finest_s must be positive and finite"),
         (lambda: ep.signals.Rate(n_states=6), "n_states must be 2 to 5: 6 came"),
         (lambda: ep.signals.prepare_signal(ep.lotka_volterra().trajectory()), "one signal must be"),
         (

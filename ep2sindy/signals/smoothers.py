@@ -19,7 +19,7 @@ from scipy.linalg.lapack import dgbtrf, dgbtrs, dpbtrf, dtbtrs
 
 from ep2sindy.data.numbers import least_beside_grid, zero_to_one
 from ep2sindy.data.trajectory import check_time
-from ep2sindy.runtime.values import read_only
+from ep2sindy.runtime.values import check_positive, read_only
 from ep2sindy.signals.spectrum import is_uniform
 
 # The range extends from a memory of about 200 samples to interpolation.
@@ -412,8 +412,8 @@ def most_likely_ratio(
 def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> None:
     """Raise ValueError for bounds on a smoother's memory that are no positive times."""
     for name, value in {"finest_s": finest_s, "coarsest_s": coarsest_s}.items():
-        if value is not None and not value > 0.0:
-            raise ValueError(f"{name} must be a positive time in s: {value} came")
+        if value is not None:
+            check_positive(name, value)
 
 
 def scale_steps(
