@@ -338,11 +338,11 @@ def offset() -> None:
             signal = ep.signals.prepare_signal(ep.Trajectory(run.t, x - x.mean(), [name]))
             library = ep.polynomial([name, "g"], degree=2)
             try:
-                found = fit_offset(signal, library, ep.TrajectorySearch(), SILENT)
+                value, low, high = fit_offset(signal, library, ep.TrajectorySearch(), SILENT)
             except ValueError:
                 continue
-            errors.append(abs(found.value / x.mean() - 1.0))
-            held += found.low < x.mean() < found.high
+            errors.append(abs(value / x.mean() - 1.0))
+            held += low < x.mean() < high
         print(
             f"mean of {name}, {100 * noise:.0f} % noise: found in {len(errors)} of {N_DRAWS}, off "
             f"by {100 * np.median(errors):.2g} % ({100 * max(errors):.2g} at most), {held} "

@@ -59,14 +59,14 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
     signal = prepare_signal(measured)
     n = round(0.75 * measured.n_samples)
     chosen = embed(signal.window(0, n))
-    states = embed(signal, chosen.embedding).embedded.run  # starts of other runs, and figures
+    states = chosen.embedding.embed(signal).run  # starts of other runs, and figures
     bounds = ep.FreeRunBounds(frequency=0.005, amplitude=0.05)
     rule = FreeRunScore(bounds=bounds, n_windows=40, judged=(NAME,), n_starts=8, seed=seed)
     search = BestSubset(max_terms=5, n_best=8)
     method = Regression(search=search, selection=rule, bootstraps=Bootstraps(n=0), depth=8)
     library = polynomial(states.state_names, degree=3)
-    known = {"relations": chosen.embedded.relations, "terms": chosen.embedded.terms}
-    model = discover(chosen.embedded.run, library, method, **known).model
+    known = {"relations": chosen.relations, "terms": chosen.terms}
+    model = discover(chosen.run, library, method, **known).model
     seconds = time.process_time() - begin
     record = np.column_stack([clean.states[:, 0], states.states[:, 1]])
     held = Trajectory(states.t, record, states.state_names).window(n, states.n_samples)

@@ -67,7 +67,7 @@ from ep2sindy.model.model import coef_matrix as coef_matrix
 
 # Forecasts
 from ep2sindy.forecasting.forecast import forecast as forecast
-from ep2sindy.forecasting.bands import Forecast as Forecast
+from ep2sindy.forecasting.forecast import Forecast as Forecast
 from ep2sindy.forecasting.skill import forecast_skill as forecast_skill
 from ep2sindy.forecasting.skill import ForecastSkill as ForecastSkill
 from ep2sindy.forecasting.state_estimation import estimate_states as estimate_states

@@ -18,6 +18,7 @@ from ep2sindy.signals.attractor import (
     waveform_errors,
     white_variance,
 )
+from ep2sindy.signals.spectrum import power_spectrum
 from ep2sindy.systems.systems import lorenz
 
 F_HZ, DT_S = 12.345, 1.5e-3
@@ -77,8 +78,10 @@ def test_white_noise_averages_out():
 def test_white_variance_is_that_of_the_noise():
     t = times(60.0)
     noise = np.random.default_rng(1).normal(size=len(t))
-    assert white_variance(t, 0.3 * noise) == pytest.approx(0.09, rel=0.1)
-    assert white_variance(t, spiky(t)[:, 1] + 0.3 * noise) == pytest.approx(0.09, rel=0.1)
+    assert white_variance(*power_spectrum(t, 0.3 * noise)) == pytest.approx(0.09, rel=0.1)
+    assert white_variance(*power_spectrum(t, spiky(t)[:, 1] + 0.3 * noise)) == pytest.approx(
+        0.09, rel=0.1
+    )
 
 
 def test_units_and_unequal_steps_change_nothing():

@@ -92,7 +92,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"model": {}}, "a model file must hold"),
     ({"method": {"class": "ep2sindy.write_field"}}, "no class 'ep2sindy.write_field' may stand"),
     ({"method": {"class": "os.system"}}, "no class 'os.system' may stand"),
-    ({"method": {"class": "ep2sindy.EBIC"}}, "a method that finds nothing: EBIC"),
+    ({"method": {"class": "ep2sindy.EBIC"}}, "method of another kind: EBIC"),
     ({"method": {**METHOD, "selection": "x"}}, "selection must be a Selection"),
     ({"fronts": {"mapping": []}, "chosen": {"mapping": []}}, "fronts and candidates of other"),
     ({"fronts": {"mapping": [["x", {"array": [], "type": "object"}]]}}, "an array of type"),

@@ -10,7 +10,7 @@ import ep2sindy as ep
 from ep2sindy.data.numbers import quantiles
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.likelihood import linearise
-from ep2sindy.forecasting.baselines import Autoregression, Harmonics, Persistence
+from ep2sindy.forecasting.skill import Autoregression, Harmonics, Persistence
 from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
 from tests.models import model_of
@@ -107,16 +107,6 @@ def test_a_state_that_was_not_measured_is_fitted_by_the_model() -> None:
     assert np.isnan(estimator.noise.samples[1])
     truth = [np.cos(run.t[-1]), -np.sin(run.t[-1])]
     assert estimator.filter(blind).mean == pytest.approx(truth, abs=0.05)
-
-
-def test_frequencies_and_amplitudes_come_with_intervals() -> None:
-    ahead = ep.forecast(SPRING, spring(0.05), 2.0 * np.pi * 20)
-    low, middle, high = ahead.frequency_Hz()
-    assert low <= middle <= high
-    assert middle == pytest.approx(0.5 / np.pi, rel=1e-3)
-    low, middle, high = ahead.amplitude("x")
-    assert low < np.sqrt(0.5) < high
-    assert ahead.diverged == 0.0
 
 
 def test_draws_have_the_covariance_that_was_asked_for() -> None:

@@ -31,8 +31,8 @@ from ep2sindy.regression.bootstraps import count_block_draws
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.parallel import Serial
-from ep2sindy.signals.oscillation import oscillation
 from ep2sindy.signals.smoothers import NoSmoothing
+from ep2sindy.signals.spectrum import oscillation
 from tests.models import plain_rows
 
 LIBRARY = ep.named_terms(["x", "y", "R", "u"], ["1", "x*u", "x*y*R"])

@@ -10,7 +10,7 @@ from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.one_signal import SignalSearch, method_by_runs
 from ep2sindy.library.units import Clock
 from ep2sindy.signals.embedding import DROWNED, unexplained
-from ep2sindy.signals.kalman import ratio_bounds
+from ep2sindy.signals.smoothers import ratio_bounds
 from ep2sindy.signals.spectrum import signal_memory_s
 from ep2sindy.studies.trace import Study
 from tests.programs import composed
@@ -54,7 +54,7 @@ def test_the_growth_rate_is_that_of_the_signal():
     run = toda()
     chosen = chosen_for(recorded(run.t, run.states[:, 0]))
     assert chosen.embedding == ep.signals.LogRate()
-    states = chosen.embedded.run
+    states = chosen.run
     assert states.state_names == ("x", "g")
     assert states.units == {"x": "A", "g": "s^-1"}
     inner = slice(20, -20)
@@ -65,7 +65,7 @@ def test_the_growth_rate_is_that_of_the_signal():
 
 def test_the_toda_oscillator_is_found_with_its_known_equation_exact():
     run = toda()
-    found = chosen_for(recorded(run.t, run.states[:, 0])).embedded
+    found = chosen_for(recorded(run.t, run.states[:, 0]))
     model = discovered(found, degree=3, max_terms=3)
     assert model.terms("x") == {"x*g": 1.0}
     kept = {term: model.terms("g")[term] for term in ("1", "x")}
@@ -76,8 +76,8 @@ def test_a_sine_of_either_sign_is_a_harmonic_oscillator():
     found = chosen_for(sine())
     assert found.embedding == ep.signals.Rate()
     assert "either sign" in found.reason
-    assert found.embedded.run.units == {"x": "A", "v": "A s^-1"}
-    model = discovered(found.embedded, degree=2, max_terms=2)
+    assert found.run.units == {"x": "A", "v": "A s^-1"}
+    model = discovered(found, degree=2, max_terms=2)
     assert model.terms("x") == {"v": 1.0}
     assert model.terms("v")["x"] == pytest.approx(-((2e3 * np.pi) ** 2), rel=0.01)
 
@@ -223,7 +223,7 @@ def test_three_states_of_a_signal_are_a_chain_of_derivatives():
     two_lines = recorded(t, np.sin(t) + 0.5 * np.sin(2 * t))
     signal = ep.signals.prepare_signal(two_lines, decimate=None)
     chosen = ep.signals.embed(signal, n_states=3)
-    states = chosen.embedded
+    states = chosen
     assert states.run.state_names == ("x", "v", "w")
     assert states.run.units == {"x": "A", "v": "A s^-1", "w": "A s^-2"}
     assert states.terms == {"x": ("v",), "v": ("w",)}
@@ -253,7 +253,7 @@ def test_neighbours_tell_how_many_states_there_are():
 
 def test_a_signal_named_as_the_rate_keeps_its_name():
     run = sine(mean=3.0)
-    found = chosen_for(recorded(run.t, run.states[:, 0], name="g")).embedded
+    found = chosen_for(recorded(run.t, run.states[:, 0], name="g"))
     assert found.run.state_names == ("g", "g_rate")
 
 
@@ -298,8 +298,7 @@ def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ep.signals.Delays(share=1.0), "share of the period must lie between 0 and 1"),
-        (lambda: ep.signals.LogSmoother(0.0), "finest_s must be a positive time"),
+        (lambda: ep.signals.LogSmoother(0.0), "finest_s must be positive and finite"),
         (lambda: ep.signals.Rate(n_states=6), "n_states must be 2 to 5: 6 came"),
         (lambda: ep.signals.prepare_signal(ep.lotka_volterra().trajectory()), "one signal must be"),
         (

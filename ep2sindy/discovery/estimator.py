@@ -189,14 +189,11 @@ def _trajectory(
         )
     n_samples, n_states = states.shape
     inputs = np.empty((n_samples, 0)) if u is None else _columns(u)
-    if names is None:
-        names = [*(f"x{k}" for k in range(n_states)), *(f"u{k}" for k in range(inputs.shape[1]))]
-    elif len(names) == n_states:
-        names = [*names, *(f"u{k}" for k in range(inputs.shape[1]))]
+    names = [f"x{k}" for k in range(n_states)] if names is None else list(names)
+    if len(names) == n_states:
+        names += [f"u{k}" for k in range(inputs.shape[1])]
     times = t * np.arange(n_samples) if np.ndim(t) == 0 else np.asarray(t)
-    return Trajectory(
-        times, states, list(names[:n_states]), inputs=inputs, input_names=list(names[n_states:])
-    )
+    return Trajectory(times, states, names[:n_states], inputs, names[n_states:])
 
 
 def _columns(u: Any) -> Float[np.ndarray, "samples n_inputs"]:

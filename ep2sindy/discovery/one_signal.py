@@ -1,12 +1,13 @@
-"""Equations of one measured signal: its states are found or made, its model is tested on its end.
+"""Equations of one measured signal: a preparation into states, then the one search `discover`.
 
-States that nobody measured are found along with their equations. If no such equations explain the
-signal to its noise, states are made of it by smoothing, and the equations searched by rows.
+The states are those that nobody measured, found along with their equations, or, if no such
+equations explain the signal to its noise, made of it by smoothing. Several preparations are
+compared by forecasts from the past alone; the model is tested on the end of the record.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -23,13 +24,11 @@ from ep2sindy.discovery.signal_unknowns import (
     HiddenStates,
     embed_hidden,
     fit_functions,
-    name_states,
     record_of,
     search_hidden,
 )
 from ep2sindy.estimation.problem import FIRST_MAX_TERMS
-from ep2sindy.forecasting.calibration import calibrate
-from ep2sindy.forecasting.rolling import RollingStarts, spread_starts
+from ep2sindy.forecasting.forecast import RollingStarts, calibrate, spread_starts
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill, horizon_errors
 from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.library import Library, polynomial
@@ -49,9 +48,9 @@ from ep2sindy.signals.embedding import (
     EMBEDDINGS,
     HARMONICS,
     AnyEmbedding,
-    Chosen,
     Embedded,
     Embedding,
+    LogRate,
     Rate,
     embed,
     unexplained,
@@ -66,10 +65,6 @@ CLEARLY, N_TRIED, N_DRAWS_TRIED = 0.8, 20, 20
 DEPTH_OF_BOTH = 2
 
 EXPLAINED = "their equations explain the signal to its noise"
-NOT_EXPLAINED = (
-    "no equations of the signal and states that nobody measured explain it to its noise and live: "
-    "states are made by smoothing"
-)
 
 MIN_FITTED = 4.0  # periods that a fitted part must have
 MIN_JUDGED = 1.5  # periods that a held-out part must have
@@ -77,14 +72,14 @@ MIN_JUDGED = 1.5  # periods that a held-out part must have
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """A model in a number of states.
+    """A model in the states that one preparation made.
 
     estimator: of its states along the fitted part. error: of its forecasts up to a period there, in
     standard deviations. share: of the next state's variance that neighbours in these states do not
     explain; None for hidden states, of which there is no next one.
     """
 
-    chosen: Chosen
+    states: Embedded
     found: Discovery
     estimator: StateEstimator
     error: float
@@ -92,7 +87,7 @@ class Attempt:
 
     @property
     def n_states(self) -> int:
-        return self.chosen.embedding.n_states
+        return self.states.embedding.n_states
 
     @property
     def text(self) -> str:
@@ -106,33 +101,24 @@ class Attempt:
         return f"{errors}; {left}"
 
 
-def choose_attempt(attempts: Sequence[Attempt]) -> Attempt:
-    """The fewest states, unless more forecast clearly better where they were fitted."""
-    best = attempts[0]
-    for each in attempts[1:]:
-        if each.error < CLEARLY * best.error:
-            best = each
-    return best
-
-
-def measure_forecast_error(past: Trace, chosen: Chosen, estimator: StateEstimator) -> float:
+def measure_forecast_error(past: Trace, states: Embedded, estimator: StateEstimator) -> float:
     """Error of forecasts up to a period from starts in the last half of the fitted part."""
-    record, longest = complete_states(past, chosen), max(2, round(past.per_period))
+    record, longest = complete_states(past, states.run), max(2, round(past.per_period))
     n = record.n_samples
     first = spread_starts(record.t, n // 2, longest, N_TRIED)
-    rolling = RollingStarts(estimator, record, [past.name], first, longest)
-    ahead = rolling.forecast(partial(embed_past, past, chosen.embedding), N_DRAWS_TRIED, seed=0)
+    rolling = RollingStarts(estimator, record, first, longest)
+    ends = rolling.ends(partial(embed_past, past, states.embedding))
+    ahead = rolling.forecast(ends, N_DRAWS_TRIED, seed=0)
     scale = past.x[n // 2 :].std()
     return float(horizon_errors(rolling.measured(ahead), rolling.truth, scale).mean())
 
 
-def complete_states(signal: Trace, chosen: Chosen) -> Trajectory:
+def complete_states(signal: Trace, known: Trajectory) -> Trajectory:
     """Samples of the signal as measured, with the other states beside it as far as they are known.
 
     Where a state is not known, at the beginning or beyond the fitted part, the nearest is taken;
     forecasts there make their own.
     """
-    known = chosen.embedded.run
     nearest = np.clip(np.searchsorted(known.t, signal.t), 0, known.n_samples - 1)
     states = known.states[nearest].copy()
     states[:, 0] = signal.x
@@ -141,9 +127,10 @@ def complete_states(signal: Trace, chosen: Chosen) -> Trajectory:
 
 def embed_past(signal: Trace, embedding: Embedding, past: Trajectory) -> Trajectory:
     """The states at a time, made from samples before it alone."""
+    own = signal.with_samples(past.t, past.states[:, 0])
     if isinstance(embedding, HiddenStates):  # the estimator fits them itself
-        return record_of(signal.with_samples(past.t, past.states[:, 0]))
-    return embedding.embed(signal.with_samples(past.t, past.states[:, 0])).run
+        return record_of(own)
+    return embedding.embed(own).run
 
 
 @dataclass(frozen=True)
@@ -151,8 +138,9 @@ class SignalSearch:
     """How states of one signal, and their equations, are searched.
 
     method: of the search in smoothed states. embedding, n_states, harmonics: how states are made.
-    degree, functions, function_degree: of the library. All are described at `from_one_signal`.
-    Raises ValueError for an embedding or a number of states that there is not.
+    degree, functions, function_degree: of the library. held_out: share of the record that judges.
+    All are described at `from_one_signal`.
+    Raises ValueError for an embedding, a number of states or a share that there is not.
     """
 
     method: AnyMethod
@@ -162,6 +150,7 @@ class SignalSearch:
     degree: int = 3
     functions: Sequence[str] = ()
     function_degree: int = 1
+    held_out: float = 0.25
 
     def __post_init__(self) -> None:
         known = ("hidden", *EMBEDDINGS)
@@ -173,125 +162,120 @@ class SignalSearch:
             raise ValueError(f"n_states must be auto or a number: {self.n_states!r} came")
         n_states = 2 if isinstance(self.n_states, str) else self.n_states
         Rate(self.harmonics, n_states)  # refuses settings that no embedding has
+        if not 0.0 <= self.held_out < 1.0:
+            raise ValueError(
+                f"held_out must be a share, 0 or more and below 1: {self.held_out!r} came"
+            )
 
-    def attempts(
-        self,
-        past: Trace,
-        whole: Trace,
-        *,
-        seed: int = 0,
-        progress: Progress = SILENT,
-        say: Callable[[str], None] | None = None,
-        once: Once = at_once,
-    ) -> list[Attempt]:
-        """One with hidden states if it explains the signal, or else one for every number.
+    def find(
+        self, signal: Trace, *, seed: int = 0, progress: Progress = SILENT, once: Once = at_once
+    ) -> SignalDiscovery:
+        """The model that forecasts the fitted part best, and its tests on the rest.
 
-        past: the part of the whole that is fitted. say: is told why hidden states are given up.
-        once: does each search, or takes it from a run that was broken off.
+        Fewer states are kept unless more forecast clearly better. once: does each search, or takes
+        it from a run that was broken off.
         """
-        numbers = self._numbers(whole)
+        past = self.fitted_part(signal)
+        attempts = self._attempts(past, seed, progress, once)
+        best = attempts[0]
+        for other in attempts[1:]:
+            best = other if other.error < CLEARLY * best.error else best
+        return evaluate(signal, past, best, attempts, progress=progress)
+
+    def fitted_part(self, signal: Trace) -> Trace:
+        """The samples to fit; all of them if the record is too short to hold out a part."""
+        n = len(signal.t)
+        n_fitted = round((1.0 - self.held_out) * n)
+        periods = np.array([n_fitted, n - n_fitted]) / signal.per_period
+        enough = periods[0] >= MIN_FITTED and periods[1] >= MIN_JUDGED
+        return signal.window(0, n_fitted if enough else n)
+
+    def _attempts(self, past: Trace, seed: int, progress: Progress, once: Once) -> list[Attempt]:
+        """One with hidden states if it explains the signal, or else one for every number."""
+        # A signal of two states either repeats itself or spirals.
+        own = [2] if repeats(past) else [2, 3]
+        numbers = own if isinstance(self.n_states, str) else [self.n_states]
         if self.embedding in ("auto", "hidden"):
-            libraries = self._libraries(past, numbers)
+            libraries = self._hidden_libraries(past, numbers)
             found, explains = search_hidden(past, libraries, self.by_trajectories, progress, once)
             if explains or self.embedding == "hidden":
-                chosen = embed_hidden(past, found, EXPLAINED if explains else "set")
-                return [self._attempt(past, chosen, found, progress)]
-            if say is not None:
-                say(NOT_EXPLAINED)
+                states = embed_hidden(past, found, EXPLAINED if explains else "set")
+                return [self._attempt(past, states, found, progress)]
         pairs = [once(partial(self._search_smoothed, past, n, seed, progress)) for n in numbers]
         return [self._attempt(past, chosen, found, progress) for chosen, found in pairs]
 
-    def _numbers(self, signal: Trace) -> list[int]:
-        """Numbers of states to try; a signal of two states either repeats itself or spirals."""
-        if self.n_states != "auto":
-            return [int(self.n_states)]
-        return [2] if repeats(signal) else [2, 3]
-
-    def _libraries(self, past: Trace, numbers: Sequence[int]) -> Iterator[Library]:
-        """Of the signal and hidden states, the smallest first."""
+    def _hidden_libraries(self, past: Trace, numbers: Sequence[int]) -> Iterator[Library]:
+        """Of the signal and hidden states, a growth rate or a rate and others; smallest first."""
+        natural = LogRate if past.is_positive else Rate
         for n_states in numbers:
-            names, functions = name_states(past, n_states), self.functions
+            functions = self.functions
             if any(FITTED in text for text in functions):
-                functions = self._fitted_functions(self._embed(past, n_states).embedded)
-            for degree in self._degrees:
+                functions = self._fit_functions(self._embed(past, n_states))
+            for degree in range(min(2, self.degree), self.degree + 1):
+                names = natural(n_states=n_states).names(past.name)
                 yield self.library(names, functions, degree)
-
-    @property
-    def _degrees(self) -> range:
-        """Of the libraries of hidden states, the smallest first."""
-        return range(min(2, self.degree), self.degree + 1)
 
     @property
     def by_trajectories(self) -> TrajectorySearch:
         own = self.method
-        if isinstance(own, TrajectorySearch):
-            return TrajectorySearch(max_terms=own.max_terms)
-        return TrajectorySearch()
+        return TrajectorySearch(own.max_terms if isinstance(own, TrajectorySearch) else None)
 
     def _search_smoothed(
         self, past: Trace, n_states: int, seed: int, progress: Progress
-    ) -> tuple[Chosen, Discovery]:
+    ) -> tuple[Embedded, Discovery]:
         with progress.stage(None, "", f"{n_states} states of the signal"):
-            chosen = self._embed(past, n_states)
-        return chosen, self._discover(chosen, past.name, seed, progress)
+            states = self._embed(past, n_states)
+        found = discover(
+            states.run,
+            self.library(states.run.state_names, self._fit_functions(states), self.degree),
+            self._method_for(states),
+            relations=states.relations,
+            terms=states.terms,
+            seed=seed,
+            progress=progress,
+        )
+        return states, found
 
     def _attempt(
-        self, past: Trace, chosen: Chosen, found: Discovery, progress: Progress
+        self, past: Trace, states: Embedded, found: Discovery, progress: Progress
     ) -> Attempt:
         with progress.stage(None, "", "forecasts where it was fitted"):
-            record = complete_states(past, chosen)
+            record = complete_states(past, states.run)
             estimator = tune_estimator(found.model, record, measured=[past.name])
-            error = measure_forecast_error(past, chosen, estimator)
-            own = chosen.embedding
+            error = measure_forecast_error(past, states, estimator)
+            own = states.embedding
             share = unexplained(past, own) if isinstance(own, AnyEmbedding) else None
-        return Attempt(chosen, found, estimator, error, share)
+        return Attempt(states, found, estimator, error, share)
 
-    def _embed(self, signal: Trace, n_states: int) -> Chosen:
+    def _embed(self, signal: Trace, n_states: int) -> Embedded:
         kind = EMBEDDINGS.get(self.embedding)
-        own = kind(harmonics=self.harmonics, n_states=n_states) if kind else None
-        return embed(signal, own, n_states=n_states, harmonics=self.harmonics)
+        if kind is None:
+            return embed(signal, n_states=n_states, harmonics=self.harmonics)
+        return kind(self.harmonics, n_states).embed(signal)
 
-    def library(
-        self, names: Sequence[str], functions: Sequence[str], degree: int | None = None
-    ) -> Library:
+    def library(self, names: Sequence[str], functions: Sequence[str], degree: int) -> Library:
         return polynomial(
-            names,
-            degree=self.degree if degree is None else degree,
-            functions=functions,
-            function_degree=self.function_degree,
+            names, degree=degree, functions=functions, function_degree=self.function_degree
         )
 
-    def _fitted_functions(self, known: Embedded) -> list[str]:
+    def _fit_functions(self, states: Embedded) -> list[str]:
         """The functions, with numbers where they have a `?`."""
-        library_of = partial(self.library, known.run.state_names)
-        return fit_functions(
-            self.functions, known.run, library_of, partial(_measure_misfit, self.method, known)
-        )
+        library_of = partial(self.library, states.run.state_names, degree=self.degree)
+        misfit = partial(_measure_misfit, self.method, states)
+        return fit_functions(self.functions, states.run, library_of, misfit)
 
-    def _discover(self, chosen: Chosen, signal: str, seed: int, progress: Progress) -> Discovery:
-        method, rule, known = self.method, self.method.selection, chosen.embedded
-        if rule.basis == "runs":  # the measured signal is judged, not derived states
+    def _method_for(self, states: Embedded) -> AnyMethod:
+        """The method; models that are run are judged by the measured signal alone."""
+        method, rule = self.method, self.method.selection
+        if rule.basis == "runs":
             from ep2sindy.selection.free_run import (
                 FreeRunScore,  # loads torch, only for this rule
             )
 
             if isinstance(rule, FreeRunScore):
-                method = replace(method, selection=replace(rule, judged=(signal,)))
-        if not known.terms:
-            method = replace(method, depth=min(method.depth, DEPTH_OF_BOTH))
-        found = discover(
-            known.run,
-            self.library(known.run.state_names, self._fitted_functions(known)),
-            method,
-            relations=known.relations,
-            terms=known.terms,
-            seed=seed,
-            progress=progress,
-        )
-        # Smoothing has made the states, so intervals would not cover the truth under a misfit.
-        return (
-            replace(found, model=replace(found.model, covariance=None)) if found.misfit else found
-        )
+                judged = (states.run.state_names[0],)
+                method = replace(method, selection=replace(rule, judged=judged))
+        return method if states.terms else replace(method, depth=min(method.depth, DEPTH_OF_BOTH))
 
 
 def repeats(signal: Trace) -> bool:
@@ -299,31 +283,20 @@ def repeats(signal: Trace) -> bool:
     return signal.cycle is not None and signal.cycle.share >= REPEATS
 
 
-def _measure_misfit(method: AnyMethod, known: Embedded, library: Library) -> float:
+def _measure_misfit(method: AnyMethod, states: Embedded, library: Library) -> float:
     """Share of the derivatives that the largest candidates leave, the product over equations.
 
     Infinite for a library that cannot be used on the states.
     """
     if isinstance(method, TrajectorySearch):
-        method = Regression(
-            WeightedWeak(), BestSubset(max_terms=method.max_terms or FIRST_MAX_TERMS)
-        )
+        method = Regression(search=BestSubset(max_terms=method.max_terms or FIRST_MAX_TERMS))
     try:
-        task = Task([known.run], library, relations_of(known.relations), known.terms)
+        task = Task([states.run], library, relations_of(states.relations), states.terms)
         equations = method.search_equations(task, rng=0)
     except ValueError:
         return float("inf")
-    fronts = [each.front for each in equations if each.front.equation in known.searched]
+    fronts = [each.front for each in equations if each.front.equation in states.searched]
     return float(np.prod([min(1.0 - c.r2_train for c in f.candidates) for f in fronts]))
-
-
-def count_fitted(signal: Trace, held_out: float) -> int:
-    """Number of samples to fit; all of them if the record is too short to hold out a part."""
-    n = len(signal.t)
-    n_fitted = round((1.0 - held_out) * n)
-    periods = np.array([n_fitted, n - n_fitted]) / signal.per_period
-    enough = periods[0] >= MIN_FITTED and periods[1] >= MIN_JUDGED
-    return n_fitted if enough else n
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,14 +326,26 @@ class SignalDiscovery:
     def model(self) -> SparseModel:
         return self.best.found.model
 
+    @property
+    def is_held_out(self) -> bool:
+        return self.skill is not None
+
+    @property
+    def where(self) -> str:
+        """What the model was run over, in words."""
+        held_out, whole = "its end, which was not fitted", "all of it, too short to hold out"
+        return held_out if self.is_held_out else whole
+
+    @property
+    def words(self) -> str:
+        """How the run went."""
+        return self.free.run.words(seen=not self.is_held_out, misfit=self.discovery.misfit)
+
     def __repr__(self) -> str:
-        where = (
-            "its end, which was not fitted" if self.skill else "all of it, too short to hold out"
-        )
-        run, misfit = self.free.run, self.discovery.misfit
+        states = self.best.states
         head = [
-            f"{self.signal.name}: {self.best.chosen.embedding.says} ({self.best.chosen.reason})",
-            f"run freely over {where}: {run.words(seen=not self.skill, misfit=misfit)}",
+            f"{self.signal.name}: {states.embedding.says} ({states.reason})",
+            f"run freely over {self.where}: {self.words}",
         ]
         tail = sentences(self.discovery.note) if self.discovery.note else []
         n_lines = N_LINES - len(head) - len(tail)
@@ -402,15 +387,10 @@ def from_one_signal(
     """
     search = SignalSearch(
         method or method_by_runs(), embedding, n_states, harmonics, degree, functions,
-        function_degree,
+        function_degree, held_out,
     )  # fmt: skip
-    if not 0.0 <= held_out < 1.0:
-        raise ValueError(f"held_out must be a share, 0 or more and below 1: {held_out!r} came")
-    watch = as_progress(progress)
-    found = prepare_signal(trajectory_of(run), signal, decimate=decimate, detrend=detrend)
-    n_fitted = count_fitted(found, held_out)
-    attempts = search.attempts(found.window(0, n_fitted), found, seed=seed, progress=watch)
-    return evaluate(found, n_fitted, attempts, progress=watch)
+    prepared = prepare_signal(trajectory_of(run), signal, decimate=decimate, detrend=detrend)
+    return search.find(prepared, seed=seed, progress=as_progress(progress))
 
 
 def method_by_runs() -> Regression:
@@ -424,36 +404,28 @@ def method_by_runs() -> Regression:
 
 
 def evaluate(
-    signal: Trace, n_fitted: int, attempts: Sequence[Attempt], *, progress: Progress = SILENT
-) -> SignalDiscovery:
+    signal: Trace, past: Trace, best: Attempt, attempts: Sequence[Attempt], *,
+    progress: Progress = SILENT,
+) -> SignalDiscovery:  # fmt: skip
     """Run the model freely over the held-out part, and forecast it again and again.
 
     The start is fitted to the samples before the held-out part. Without such a part, the whole
     record is compared, from the first of its states.
     """
-    best = choose_attempt(attempts)
-    chosen, model = best.chosen, best.found.model
-    whole = complete_states(signal, replace(
-        chosen, embedded=chosen.embedding.embed(signal)
-    ))  # fmt: skip
-    own = [signal.name]
-    is_whole, before = n_fitted == len(signal.t), partial(embed_past, signal, chosen.embedding)
+    known, own, model = best.states.run, best.states.embedding, best.found.model
+    whole, n_fitted = complete_states(signal, own.embed(signal).run), len(past.t)
+    is_whole, before = n_fitted == len(signal.t), partial(embed_past, signal, own)
+    estimator = best.estimator
     if is_whole:
-        first, estimator = int(np.searchsorted(signal.t, chosen.embedded.run.t[0])), best.estimator
-        start = chosen.embedded.run.states[0]
+        first, start = int(np.searchsorted(signal.t, known.t[0])), known.states[0]
     else:
-        first, past = n_fitted - 1, complete_states(signal.window(0, n_fitted), chosen)
-        with progress.stage(None, "", "width of the forecasts' bands"):
-            estimator = calibrate(best.estimator, past, states_of=before)
-        start = estimator.filter(before(past)).mean
-    measured = whole.window(first, whole.n_samples)
+        first, fitted = n_fitted - 1, complete_states(past, known)
+        estimator = calibrate(estimator, fitted, states_of=before, progress=progress)
+        start = estimator.filter(before(fitted)).mean
+    measured, names = whole.window(first, whole.n_samples), [signal.name]
     with progress.stage(None, "", "free run and limit cycle"):
-        cycle = FreeCycle.of(free_run(model, measured, initial=start, judged=own))
-    if is_whole:
-        return SignalDiscovery(signal, best, attempts, whole, measured, cycle, None)
-    with progress.stage(None, "start", "forecasts") as advance:
-        skill = forecast_skill(
-            model, whole, n_fitted=n_fitted, measured=own, states_of=before, estimator=estimator,
-            advance=advance,
-        )  # fmt: skip
+        cycle = FreeCycle.of(free_run(model, measured, initial=start, judged=names))
+    skill = None if is_whole else forecast_skill(
+        model, whole, n_fitted=n_fitted, states_of=before, estimator=estimator, progress=progress
+    )  # fmt: skip
     return SignalDiscovery(signal, best, attempts, whole, measured, cycle, skill)

@@ -5,9 +5,11 @@ The grid is cut into blocks of points, which are read and searched one after the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import product
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -23,9 +25,10 @@ from ep2sindy.library.relations import Constraint, Relation, constraint, relatio
 from ep2sindy.library.units import unit_product
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.constrained import fit_draws
+from ep2sindy.regression.front import Candidate
 from ep2sindy.runtime.parallel import Workers, run_alike
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
-from ep2sindy.runtime.values import check_kind, check_list
+from ep2sindy.runtime.values import check_count, check_kind, check_list
 
 NO_FIT = "no_fit"
 
@@ -122,12 +125,11 @@ def pointwise(
     part = field[list(search.variables)]
     blocks = blocks_of(part, block_points)
     result = _empty(part, search)
-    n_points = sum(block.n_points for block in blocks)
-    pieces = (part.isel(block.slices) for block in blocks)  # once read, none is held
-    with as_progress(progress).stage(n_points, "point") as advance:
+    pieces = (part.isel(block) for block in blocks)  # once read, none is held
+    with as_progress(progress).stage(result["status"].size, "point") as advance:
         for k, done in run_alike(workers, partial(_search_block, search), pieces, len(blocks)):
             _place(result, blocks[k], done)
-            advance(blocks[k].n_points)
+            advance(done["status"].size)
     if not (result["status"] == 0).any():
         raise ValueError(f"no point could be fitted: {_why_none(result)}")
     return result
@@ -182,45 +184,34 @@ def _empty(field: xr.Dataset, search: PointSearch) -> xr.Dataset:
     )
 
 
-def _place(result: xr.Dataset, block: Block, done: Mapping[str, np.ndarray]) -> None:
-    reasons = {str(result.attrs[NO_FIT]), str(done[NO_FIT])} - {""}
+def _place(result: xr.Dataset, block: Mapping[str, slice], done: xr.Dataset) -> None:
+    reasons = {str(result.attrs[NO_FIT]), str(done.attrs[NO_FIT])} - {""}
     result.attrs[NO_FIT] = min(reasons, default="")  # independent of the division into blocks
     for name in (*LAYOUT, "status"):
-        values, target = done[name], result[name].isel(block.slices)
-        target.values[...] = values.reshape(target.shape)
+        result[name].isel(block).values[...] = done[name].values
 
 
-def _search_block(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarray]:
-    """Results at every point of a block, points along the last axis; a reason if a fit failed."""
+def _search_block(search: PointSearch, block: xr.Dataset) -> xr.Dataset:
+    """Results at every point of a block; a reason if a fit failed."""
     block = block.load(scheduler="synchronous")  # chunks, if any, are read on this thread
-    t = grid_points(block, "time")
-    found: dict[str, list[np.ndarray]] = {name: [] for name in LAYOUT}
-    status, reasons = [], []
-    no_result = empty_point(search)
-    for values in _iterate_points(block, search.variables):
-        point = no_result
-        status.append(_judge_samples(values, search))
-        if status[-1] == 0:
+    result, t, reasons = _empty(block, search), grid_points(block, "time"), []
+    shape = result["status"].shape
+    grids = [grid_values(block[name]) for name in search.variables]
+    whole = np.broadcast_shapes(*(grid.shape for grid in grids))
+    grids = [np.broadcast_to(grid, whole).reshape(len(t), *shape) for grid in grids]
+    for place in np.ndindex(shape):
+        values = np.stack([grid[(..., *place)] for grid in grids])
+        status = _judge_samples(values, search)
+        if status == 0:
             try:
                 point = search_point(_trajectory(t, values, block, search), search)
+                for name, value in point.items():
+                    result[name].values[(..., *place)] = value
             except ValueError as error:
-                status[-1] = STATUSES.index(NO_FIT)
+                status = STATUSES.index(NO_FIT)
                 reasons.append(str(error))
-        for name, value in point.items():
-            found[name].append(value)
-    stacked = {name: np.stack(each, axis=-1) for name, each in found.items()}
-    flags = np.array(status, dtype=np.int8)
-    return stacked | {"status": flags, NO_FIT: np.array(min(reasons, default=""))}
-
-
-def _iterate_points(
-    block: xr.Dataset, names: Sequence[str]
-) -> Iterator[Float[np.ndarray, "variables samples"]]:
-    """All variables at one point after another, the samples of each contiguous in memory."""
-    shape = (block.sizes["time"], *(block.sizes.get(axis, 1) for axis in SPACE))
-    grids = [np.broadcast_to(grid_values(block[n]), shape).reshape(shape[0], -1) for n in names]
-    for point in range(grids[0].shape[1]):
-        yield np.stack([grid[:, point] for grid in grids])
+        result["status"].values[place] = status
+    return result.assign_attrs({NO_FIT: min(reasons, default="")})
 
 
 def _judge_samples(values: Float[np.ndarray, "variables samples"], search: PointSearch) -> int:
@@ -251,66 +242,55 @@ def _trajectory(
     )
 
 
-@dataclass(frozen=True)
-class Block:
-    """A rectangle of grid points: slices by axis of the field."""
-
-    slices: Mapping[str, slice]
-
-    @property
-    def n_points(self) -> int:
-        return int(np.prod([part.stop - part.start for part in self.slices.values()]))
-
-
-def blocks_of(field: xr.Dataset, n_points: int) -> list[Block]:
+def blocks_of(field: xr.Dataset, n_points: int) -> list[dict[str, slice]]:
     """Rectangles of at most `n_points` points, made of whole lines along the last axis if one fits.
 
-    Points that are neighbours in a file are then read together.
+    Points that are neighbours in a file are then read together. Each is a slice for every axis.
     Raises ValueError for n_points below one.
     """
-    if n_points < 1:
-        raise ValueError(f"a block needs a point: block_points={n_points} came")
-    steps, room = {}, n_points
+    room, parts = check_count("block_points", n_points), {}
     for axis in reversed([axis for axis in SPACE if axis in field.dims]):
-        steps[axis] = min(field.sizes[axis], room)
-        room = max(1, room // steps[axis])
-    blocks = [Block({})]
-    for axis in reversed(steps):
-        n = field.sizes[axis]
-        parts = [slice(k, min(k + steps[axis], n)) for k in range(0, n, steps[axis])]
-        blocks = [Block({**block.slices, axis: part}) for block in blocks for part in parts]
-    return blocks
+        n, step = field.sizes[axis], min(field.sizes[axis], room)
+        parts[axis] = [slice(k, min(k + step, n)) for k in range(0, n, step)]
+        room = max(1, room // step)
+    axes = list(reversed(parts))
+    return [dict(zip(axes, block, strict=True)) for block in product(*(parts[a] for a in axes))]
 
 
 # The search at one point.
 
 
-def empty_point(search: PointSearch) -> dict[str, np.ndarray]:
-    """The result at a point that cannot be fitted."""
-    sizes = search.sizes
-    return {name: np.full([sizes[d] for d in dims], np.nan) for name, dims in LAYOUT.items()}
-
-
 def search_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
     """Search, select and fit at one point, and the spread over the bootstraps."""
-    rng = np.random.default_rng(search.seed)
     task = Task([run], search.library, relations_of(search.relations))
-    equations = search.method.search_equations(task, rng=rng)
-    fronts = [equation.front for equation in equations]
-    choice = search.method.choose(fronts, task)
-    point = empty_point(search)
-    for row, (equation, chosen) in enumerate(zip(equations, choice.chosen, strict=True)):
-        problem = equation.front.rows
-        mask: Bool[np.ndarray, " terms"] = np.isin(search.library.names, chosen.terms)
-        point["coef"][row] = choice.model.coef[:, row]
-        point["inclusion"][row] = equation.supports.inclusion[chosen.n_terms]
-        point["weight"][row] = weigh_terms(point["coef"][row] * problem.theta_scale)
-        fits = equation.draws.fits(equation.number, equation.found, mask)
-        point["coef_draws"][:, row] = fits * problem.coef_scale(equation.number)
-        point["weight_draws"][:, row] = weigh_terms(fits)
-        point["r2_train"][row], point["r2_test"][row] = chosen.r2_train, chosen.r2_test
-        point["n_terms"][row] = chosen.n_terms
+    equations = search.method.search_equations(task, rng=np.random.default_rng(search.seed))
+    choice = search.method.choose([equation.front for equation in equations], task)
+    parts = zip(equations, choice.chosen, choice.model.coef.T, strict=True)
+    found = [_describe_equation(*part) for part in parts]
+    point = {
+        name: np.stack([row[name] for row in found], axis=dims.index("equation"))
+        for name, dims in LAYOUT.items()
+    }
     return point if choice.constraint is None else _constrained(point, equations, choice.constraint)
+
+
+def _describe_equation(
+    equation: SearchedEquation, chosen: Candidate, coef: Float[np.ndarray, " terms"]
+) -> dict[str, Any]:
+    """Results of one equation at a point, by the names of `LAYOUT`."""
+    problem = equation.front.rows
+    mask: Bool[np.ndarray, " terms"] = np.isin(problem.library.names, chosen.terms)
+    fits = equation.draws.fits(equation.number, equation.found, mask)
+    return {
+        "coef": coef,
+        "inclusion": equation.supports.inclusion[chosen.n_terms],
+        "weight": weigh_terms(coef * problem.theta_scale),
+        "coef_draws": fits * problem.coef_scale(equation.number),
+        "weight_draws": weigh_terms(fits),
+        "r2_train": chosen.r2_train,
+        "r2_test": chosen.r2_test,
+        "n_terms": chosen.n_terms,
+    }
 
 
 def _constrained(

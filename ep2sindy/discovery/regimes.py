@@ -2,8 +2,8 @@
 
 The pointwise study gives every point its equations. A term's weight at a point is its signed share
 of the equation. Regimes differ by which terms act, as source or sink, so a weight w counts as w |w|
-/ (w^2 + least^2): near 0 well below the share `least`, near +-1 well above it. The points are
-grouped by a Gaussian mixture of these values. No component is narrower than `resolution` or than
+/ (w^2 + LEAST^2): near 0 well below the share LEAST, near +-1 well above it. The points are
+grouped by a Gaussian mixture of these values. No component is narrower than RESOLUTION or than
 the bootstraps' own spread, and Schwarz's criterion decides on the number of components. Neighbours
 are alike and no regime is exact, so with enough points any difference would become significant: the
 likelihood is therefore raised to the power 1 / (1 + n_points / COARSENING). If equations change
@@ -27,12 +27,17 @@ from sklearn.mixture import GaussianMixture
 
 from ep2sindy.data.fields import SPACE
 from ep2sindy.runtime.threads import one_thread
+from ep2sindy.runtime.values import check_count
 
 N_STARTS = 20  # of the mixture's iteration, which may converge to a poor optimum
 
 COARSENING = 100.0  # number of points at which evidence stops growing
 
 UNSURE = 0.5  # confidence below which a point counts as unsure
+
+LEAST = 0.1  # share of an equation from which a term acts
+
+RESOLUTION = 0.2  # least width of a regime, in activities of terms
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +48,7 @@ class Regimes:
     equations. confidence: same shape, mean probability of the point's regime over the bootstraps;
     NaN where labels are -1.
     table: one row per regime, equation and term. acts: True if the median of |weight| reaches
-    `least`. in_support: share of the regime's points whose support holds the term. weight: the
+    LEAST. in_support: share of the regime's points whose support holds the term. weight: the
     median. coef, coef_low and coef_high: median, 16 % and 84 % of the points that hold the term, in
     the unit of the column coef_units. n_points, confidence (mean) and unsure (share of the points
     whose confidence is below UNSURE) are those of the regime.
@@ -80,8 +85,6 @@ def find_regimes(
     *,
     rng: np.random.Generator | int,
     max_regimes: int = 8,
-    least: float = 0.1,
-    resolution: float = 0.2,
 ) -> Regimes:
     """Group the points of a pointwise study by the terms that act in their equations.
 
@@ -110,14 +113,12 @@ def find_regimes(
         np.moveaxis(draws[valid], 1, 0).reshape(draws.shape[1], valid.sum(), -1),
         rng=rng,
         max_regimes=max_regimes,
-        least=least,
-        resolution=resolution,
     )
     grid = result["weight"].isel(equation=0, term=0, drop=True).transpose(*space)
     return Regimes(
         labels=xr.DataArray(labels.reshape(grid.shape), grid.coords, space, "regime"),
         confidence=xr.DataArray(confidence.reshape(grid.shape), grid.coords, space, "confidence"),
-        table=_table(result, labels, confidence, weights, coef, least),
+        table=_table(result, labels, confidence, weights, coef),
         at_limit=int(labels.max()) + 1 == max_regimes,
     )
 
@@ -135,8 +136,6 @@ def group_points(
     *,
     rng: np.random.Generator | int,
     max_regimes: int = 8,
-    least: float = 0.1,
-    resolution: float = 0.2,
 ) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, " points"]]:
     """Regime and confidence of every point; the order of the points does not matter.
 
@@ -144,18 +143,13 @@ def group_points(
     if it could not be fitted. The confidence is the probability of the point's regime under the
     mixture, averaged over the bootstraps. It is low if they disagree or fail, and for a point
     between two regimes.
-    Raises ValueError unless max_regimes is one or more, least and resolution above 0.
+    Raises ValueError unless max_regimes is one or more.
     """
-    rng = np.random.default_rng(rng)
-    if max_regimes < 1 or not least > 0.0 or not resolution > 0.0:
-        raise ValueError(
-            "grouping needs max_regimes of 1 or more, least and resolution above 0: "
-            f"max_regimes={max_regimes}, least={least}, resolution={resolution} came"
-        )
+    rng, _ = np.random.default_rng(rng), check_count("max_regimes", max_regimes)
     known = np.isfinite(draws).all(axis=2)
-    acting = _action(weights, least)
-    drawn = _action(np.where(known[:, :, None], draws, weights), least)
-    floor = resolution**2 + float(drawn.var(axis=0).mean())
+    acting = _action(weights)
+    drawn = _action(np.where(known[:, :, None], draws, weights))
+    floor = RESOLUTION**2 + float(drawn.var(axis=0).mean())
     mixture = _mixture(acting, floor, max_regimes, seed=int(rng.integers(2**31)))
     if mixture is None:
         return np.zeros(len(weights), dtype=np.int64), known.mean(axis=0)
@@ -169,9 +163,9 @@ def group_points(
     return labels, (known * agreeing).mean(axis=0)
 
 
-def _action(weights: np.ndarray, least: float) -> np.ndarray:
-    """Activity of a term by its weight: 0 if inactive, +-1/2 at the share `least`, at most +-1."""
-    return weights * np.abs(weights) / (weights**2 + least**2)
+def _action(weights: np.ndarray) -> np.ndarray:
+    """Activity of a term by its weight: 0 if inactive, +-1/2 at the share LEAST, at most +-1."""
+    return weights * np.abs(weights) / (weights**2 + LEAST**2)
 
 
 def _mixture(
@@ -215,7 +209,6 @@ def _table(
     confidence: Float[np.ndarray, " points"],
     weights: Float[np.ndarray, "points equations terms"],
     coef: Float[np.ndarray, "points equations terms"],
-    least: float,
 ) -> pd.DataFrame:
     """One row per regime, equation and term: see `Regimes`."""
     rows: list[dict[str, object]] = []
@@ -230,7 +223,7 @@ def _table(
                         "regime": regime,
                         "equation": str(equation),
                         "term": str(term),
-                        "acts": bool(np.median(np.abs(weights[inside, e, k])) >= least),
+                        "acts": bool(np.median(np.abs(weights[inside, e, k])) >= LEAST),
                         "in_support": np.count_nonzero(values) / inside.sum(),
                         "weight": float(np.median(weights[inside, e, k])),
                         "coef": middle,

@@ -18,8 +18,7 @@ from ep2sindy.data.runs import Run
 from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.method import DiscoveryMethod
 from ep2sindy.estimation.estimate import Estimate
-from ep2sindy.forecasting.bands import Forecast
-from ep2sindy.forecasting.forecast import forecast
+from ep2sindy.forecasting.forecast import Forecast, forecast
 from ep2sindy.library.relations import Constraint, Process
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
@@ -199,11 +198,19 @@ class Discovery:
         return f"Discovery of {len(self.chosen)} equations, chosen by {self.method.selection!r}"
 
 
-# Fields of a Discovery that are stored beside the model.
-_PARTS = (
-    "fronts", "chosen", "method", "ambiguities", "noise_test", "note", "remarks", "constraint",
-    "others",
-)  # fmt: skip
+# Fields of a Discovery that are stored beside the model, and the kind of each or of its values.
+_PARTS: Mapping[str, Any] = {
+    "fronts": ParetoFront,
+    "chosen": Candidate,
+    "method": DiscoveryMethod,
+    "ambiguities": Ambiguity,
+    "noise_test": NoiseTest,
+    "note": str,
+    "remarks": str,
+    "constraint": Constraint | None,
+    "others": OtherSystem,
+}
+_SINGLE = {"method", "noise_test", "note", "constraint"}
 
 
 def _encode(value: Any) -> Any:
@@ -261,20 +268,11 @@ def _class_named(name: str) -> type:
 
 def _check_parts(found: Discovery) -> None:
     """Raise ValueError for parts of other kinds, or not of the model's states and terms."""
-    if not isinstance(found.method, DiscoveryMethod):
-        raise ValueError(f"a method that finds nothing: {found.method!r:.80}")
-    parts: dict[str, tuple[Sequence[Any], Any]] = {
-        "noise_test": ([found.noise_test], NoiseTest),
-        "constraint": ([found.constraint], Constraint | None),
-        "ambiguities": (found.ambiguities, Ambiguity),
-        "others": (found.others, OtherSystem),
-        "note and remarks": ((found.note, *found.remarks), str),
-        "fronts": (list(found.fronts.values()), ParetoFront),
-        "chosen": (list(found.chosen.values()), Candidate),
-    }
-    for name, (values, kind) in parts.items():
-        if not all(isinstance(value, kind) for value in values):
-            raise ValueError(f"{name} of another kind")
+    for name, kind in _PARTS.items():
+        part = getattr(found, name)
+        values = part.values() if isinstance(part, Mapping) else part
+        if not all(isinstance(each, kind) for each in ([part] if name in _SINGLE else values)):
+            raise ValueError(f"{name} of another kind: {part!r:.80}")
     if {*found.fronts, *found.chosen} != set(found.model.states):
         raise ValueError(f"fronts and candidates of other states than {found.model.states}")
     for state, front in found.fronts.items():

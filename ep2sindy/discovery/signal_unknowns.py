@@ -25,7 +25,7 @@ from ep2sindy.model.comparison import SPIRALS, Verdict
 from ep2sindy.model.free_run import FreeCycle, free_run
 from ep2sindy.runtime.parallel import Once, at_once
 from ep2sindy.runtime.progress import Progress
-from ep2sindy.signals.embedding import Chosen, Embedded, LogRate, Rate
+from ep2sindy.signals.embedding import Embedded
 from ep2sindy.signals.trace import Trace, is_positive
 
 MAX_FITTED = 3000  # samples from the end of the fitted part that the search sees
@@ -55,21 +55,19 @@ class HiddenStates:
     def says(self) -> str:
         return f"the signal and {self.n_states - 1} that nobody measured"
 
-    def names(self, signal: str) -> tuple[str, ...]:
-        return tuple(self.estimator.model.states)
-
     def embed(self, signal: Trace) -> Embedded:
         model = self.estimator.model
         known = {signal.name: tuple(model.terms(signal.name))}  # its term sets a scale
-        return Embedded(self.estimator.smooth(record_of(signal)), (), known, self.noise_std)
+        run = self.estimator.smooth(record_of(signal))
+        return Embedded(self, run, (), known, self.noise_std)
 
 
-def embed_hidden(signal: Trace, found: Discovery, reason: str) -> Chosen:
+def embed_hidden(signal: Trace, found: Discovery, reason: str) -> Embedded:
     """The states that a model with hidden ones has along a signal."""
     assert found.estimate is not None  # a search of trajectories has one
     estimator = tune_estimator(found.model, record_of(signal))
-    own = HiddenStates(estimator, float(found.estimate.noise_std[0]))
-    return Chosen(own, reason, own.embed(signal))
+    states = HiddenStates(estimator, float(found.estimate.noise_std[0])).embed(signal)
+    return replace(states, reason=reason)
 
 
 def search_hidden(
@@ -94,26 +92,16 @@ def search_hidden(
     return found, explains
 
 
-@dataclass(frozen=True)
-class FittedOffset:
-    """What must be added to a signal for its growth rate to obey equations, in the signal's unit.
-
-    low, high: 95 % interval.
-    """
-
-    value: float
-    low: float
-    high: float
-
-
 def fit_offset(
     past: Trace,
     library: Library,
     method: TrajectorySearch,
     progress: Progress,
     once: Once = at_once,
-) -> FittedOffset:
+) -> tuple[float, float, float]:
     """The offset of a signal x, by the equations of x and of the growth rate g of x + offset.
+
+    Returns what must be added to the signal, in its unit, and the bounds of a 95 % interval.
 
     x' = (x + offset) g, so the offset is the coefficient of g where that of x g is one. library: of
     x and g. once: as of `search_hidden`.
@@ -140,7 +128,7 @@ def fit_offset(
         rest = found.model.terms(x).get(g, 0.0)
         if not found.misfit and is_positive(past.t, past.x + shift + rest):
             low, high = found.model.intervals(x).get(g, (rest, rest))
-            return FittedOffset(shift + rest, shift + low, shift + high)
+            return shift + rest, shift + low, shift + high
     raise ValueError(
         f"offset=fit asks for equations of {past.name} with an offset and of its growth rate that "
         "explain it to its noise: none of this library do; write offset=NUMBER, as the sensor's "
@@ -159,12 +147,6 @@ def _endures(estimate: Estimate, signal: str) -> bool:
         return free.run.verdict in ENDURING
     n_periods = float(record.t[-1] - record.t[0]) / free.cycle.period_s
     return free.multiplier**n_periods < SPIRALS
-
-
-def name_states(signal: Trace, n_states: int) -> tuple[str, ...]:
-    """Names of the signal and of hidden states: a growth rate or a rate, and others."""
-    natural = LogRate if signal.is_positive else Rate
-    return natural(n_states=n_states).names(signal.name)
 
 
 def record_of(signal: Trace) -> Trajectory:

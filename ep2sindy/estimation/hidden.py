@@ -27,7 +27,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, parse_relation
 from ep2sindy.library.units import unit_product
 from ep2sindy.model.model import SparseModel
-from ep2sindy.signals.kalman import KalmanSmoother
+from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.trace import is_positive
 
 # Share of a factor's mean square that weighs a hidden state's mean against what its rate tells:

@@ -41,7 +41,7 @@ from ep2sindy.estimation.problem import (
     ScaledRecord,
 )
 from ep2sindy.estimation.supports import alternatives, best_support, excess, penalise, term_prices
-from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
+from ep2sindy.signals.smoothers import KalmanEstimate, KalmanSmoother
 
 ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap
 # Smoother settings (log10 of process to measurement noise) to try if no other start fits.

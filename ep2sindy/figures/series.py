@@ -36,7 +36,7 @@ from ep2sindy.figures.style import (
     slope_label,
     unit_text,
 )
-from ep2sindy.forecasting.bands import LEVEL
+from ep2sindy.forecasting.forecast import LEVEL
 from ep2sindy.forecasting.skill import MODEL, ForecastSkill
 from ep2sindy.library.units import Clock, unit_product
 from ep2sindy.model.model import SparseModel

@@ -1,20 +1,132 @@
-"""Forecast of a model from the end of a record, with bands."""
+"""Forecasts of a model, from the end of a record or from many starts along it, with bands.
+
+Bands are calibrated where they can be seen: the likeliest pushes are those that explain single
+steps. What a model misses lasts, however, over many steps, so its forecasts scatter more than such
+pushes say; and where a record is pushed hard in a few places alone, less.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
+from ep2sindy.data.gaps import between_gaps
+from ep2sindy.data.numbers import band_of, quantiles
 from ep2sindy.data.runs import Run, trajectory_of
-from ep2sindy.forecasting.bands import Forecast, draw_forecasts
-from ep2sindy.forecasting.calibration import calibrate
-from ep2sindy.forecasting.state_estimation import tune_estimator
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.state_estimation import FittedState, StateEstimator, tune_estimator
+from ep2sindy.library.units import SECONDS, Clock
+from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
+from ep2sindy.model.inputs import driven
 from ep2sindy.model.model import SparseModel
+from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.runtime.values import check_count
+from ep2sindy.runtime.values import check_count, read_only
+from ep2sindy.signals.spectrum import is_uniform
+
+LEVEL = 0.9  # share of the samples that a band is to hold
+
+# Makes all states of a past, whose first columns are the measured ones.
+StatesOf = Callable[[Trajectory], Trajectory]
+
+# Starts of the forecasts whose bands are calibrated, draws of each, and how far they go.
+N_STARTS, N_DRAWS, PERIODS_AHEAD = 24, 60, 1.5
+TOLERANCE = 0.03  # deviation from the level at which a band counts as calibrated
+FACTORS = 10.0 ** np.arange(-2.0, 2.1, 0.25)  # of the likeliest pushes
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """States that a model expects after a record, with the uncertainty of what a sensor will show.
+
+    t: (samples,) in s, the first one after the record's end. states: (samples, n_states), the
+    median of the draws, in SI. draws: (draws, samples, n_states), runs from starts and with
+    coefficients drawn by their covariance, pushed at random as the record was; NaN where a run has
+    diverged. noise_std: (n_states,), of the sensor's noise; NaN for states that it does not show.
+    """
+
+    t: Float[np.ndarray, " samples"]
+    states: Float[np.ndarray, "samples n_states"]
+    draws: Float[np.ndarray, "draws samples n_states"] = field(repr=False)
+    noise_std: Float[np.ndarray, " n_states"]
+    state_names: tuple[str, ...]
+    units: Mapping[str, str]
+    clock: Clock = SECONDS
+    seed: int = field(default=0, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("t", "states", "draws", "noise_std"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def band(
+        self, level: float = LEVEL
+    ) -> tuple[Float[np.ndarray, "samples n_states"], Float[np.ndarray, "samples n_states"]]:
+        """Lower and upper bound that hold this share of the samples, the sensor's noise included.
+
+        Draws that diverged count neither way. Raises ValueError for a level that is no share.
+        """
+        rng = np.random.default_rng(self.seed)
+        noise = np.nan_to_num(self.noise_std) * rng.standard_normal(self.draws.shape)
+        low, high = band_of(self.draws + noise, level)
+        return low, high
+
+    @property
+    def diverged(self) -> float:
+        """Share of the draws that diverged."""
+        return float(np.isnan(self.draws[:, -1]).any(axis=1).mean())
+
+
+def draw_forecasts(
+    estimator: StateEstimator,
+    ends: Sequence[FittedState],
+    begins: Float[np.ndarray, " starts"],
+    times: Float[np.ndarray, "starts samples"],
+    *,
+    inputs: ArrayLike | Mapping[str, Any] | None = None,
+    n_draws: int,
+    seed: int,
+    clock: Clock = SECONDS,
+) -> list[Forecast]:
+    """Forecasts from several fitted states, at times that are alike when counted from each start.
+
+    begins: times of the fitted states, in s.
+    """
+    model, rng = estimator.model, np.random.default_rng(seed)
+    starts = np.concatenate([draw_normal(end.mean, end.covariance, n_draws, rng) for end in ends])
+    coef = draw_coef(model, model.covariance, len(starts), rng)
+    grid = np.append(begins[0], times[0])
+    drive, _ = driven(model.inputs, inputs, grid, model.courses)
+    runs = draw_runs(
+        model,
+        grid,
+        starts,
+        coef,
+        drive=drive,
+        push_std=estimator.noise.process,
+        push_step_s=estimator.problem.step_s,
+        reach=estimator.problem.scale,
+        rng=rng,
+    )[:, 1:].reshape(len(ends), n_draws, times.shape[1], -1)
+    return [
+        Forecast(
+            t=own,
+            states=quantiles(draws, [0.5])[0],
+            draws=draws,
+            noise_std=estimator.noise.samples,
+            state_names=tuple(model.states),
+            units=model.units,
+            clock=clock,
+            seed=seed,
+        )
+        for own, draws in zip(times, runs, strict=True)
+    ]
 
 
 @one_thread()
@@ -76,3 +188,117 @@ def _times(t: np.ndarray, step_s: float, horizon: float | ArrayLike) -> np.ndarr
             f"end at {t[-1]:.6g} s: {horizon!r} came"
         )
     return asked
+
+
+def spread_starts(
+    t: Float[np.ndarray, " samples"], first: int, longest: int, n: int
+) -> Int[np.ndarray, " starts"]:
+    """At most n starts of forecasts of `longest` samples, evenly spread from a first one on.
+
+    A forecast and the sample before it lie in one stretch without a gap, unless none of them does.
+    """
+    starts = np.arange(min(first, len(t) - longest), len(t) - longest + 1)
+    end = np.array(between_gaps(t))[:, 1]
+    piece = np.searchsorted(end, starts - 1, side="right")
+    inside = starts + longest <= end[piece]
+    starts = starts[inside] if inside.any() else starts
+    return starts[spread_evenly(len(starts), n)]
+
+
+def spread_evenly(n_all: int, n: int) -> Int[np.ndarray, " places"]:
+    """At most n places among n_all, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, n_all - 1, n).round().astype(np.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class RollingStarts:
+    """Starts of forecasts: numbers of the first samples that each forecasts, `longest` from it."""
+
+    estimator: StateEstimator
+    record: Trajectory
+    first: Int[np.ndarray, " starts"]
+    longest: int
+
+    @property
+    def steps_s(self) -> Float[np.ndarray, " ahead"]:
+        """Horizons, in s since the last sample of the past, as from the first start."""
+        k = int(self.first[0])
+        return self.record.t[k : k + self.longest] - self.record.t[k - 1]
+
+    @property
+    def truth(self) -> Float[np.ndarray, "starts ahead measured"]:
+        samples = self.record.columns(self.estimator.names)
+        return np.stack([samples[k : k + self.longest] for k in self.first])
+
+    def ends(self, states_of: StatesOf | None, advance: Advance = nothing) -> list[FittedState]:
+        """The state before every start, from its past alone."""
+        found = []
+        for k in self.first.tolist():
+            past = self.record.window(max(0, k - 2 * self.estimator.memory), k)
+            found.append(self.estimator.filter(past if states_of is None else states_of(past)))
+            advance(1)
+        return found
+
+    def forecast(self, ends: Sequence[FittedState], n_draws: int, seed: int) -> list[Forecast]:
+        """Forecasts from fitted states; at equal steps, all of them are drawn together."""
+        t, begins = self.record.t, self.record.t[self.first - 1]
+        draw = partial(draw_forecasts, self.estimator, n_draws=n_draws, clock=self.record.clock)
+        if is_uniform(t):
+            times = begins[:, None] + self.steps_s
+            return draw(ends, begins, times, seed=seed)
+        times = np.stack([t[k : k + self.longest] for k in self.first])
+        return [
+            draw([end], begin[None], own[None], seed=seed + k)[0]
+            for k, (end, begin, own) in enumerate(zip(ends, begins, times, strict=True))
+        ]
+
+    def measured(self, ahead: Sequence[Forecast]) -> Float[np.ndarray, "starts ahead measured"]:
+        return np.stack([each.states[:, self.estimator.measured] for each in ahead])
+
+    def coverage(self, ahead: Sequence[Forecast], level: float) -> float:
+        """Share of the samples that bands hold."""
+        low, high = (
+            np.stack(side)[:, :, self.estimator.measured]
+            for side in zip(*[each.band(level) for each in ahead], strict=True)
+        )
+        return float(((low <= self.truth) & (self.truth <= high)).mean())
+
+    def with_pushes(self, factor: float) -> RollingStarts:
+        """The same with pushes larger by a factor."""
+        noise = replace(self.estimator.noise, process=factor * self.estimator.noise.process)
+        return replace(self, estimator=replace(self.estimator, noise=noise))
+
+
+@one_thread()
+def calibrate(
+    estimator: StateEstimator,
+    run: Trajectory,
+    *,
+    states_of: StatesOf | None = None,
+    seed: int = 0,
+    progress: Progress = SILENT,
+) -> StateEstimator:
+    """The estimator with pushes whose bands hold 90 % of the record that the model was fitted to.
+
+    run: that record. states_of: as for `forecast_skill`. Forecasts of up to one and a half periods
+    from its later half are counted. A estimator that is calibrated already, a driven model, and a
+    record at unequal steps come back unchanged.
+    """
+    ahead = max(2, int(PERIODS_AHEAD * estimator.per_period))
+    first = np.arange(max(estimator.memory, run.n_samples // 3), run.n_samples - ahead)
+    if estimator.model.inputs or not is_uniform(run.t) or len(first) < N_STARTS:
+        return estimator
+    first = first[spread_evenly(len(first), N_STARTS)]
+    rolling = RollingStarts(estimator, run, first, ahead)
+
+    def coverage(factor: float) -> float:
+        pushed = rolling.with_pushes(factor)
+        return pushed.coverage(pushed.forecast(ends, N_DRAWS, seed), LEVEL)
+
+    with progress.stage(None, "", "width of the forecasts' bands"):
+        ends = rolling.ends(states_of)
+        if abs(coverage(1.0) - LEVEL) <= TOLERANCE:
+            return estimator
+        # More pushes make wider bands.
+        above = bisect_left(FACTORS[1:-1], LEVEL, key=coverage) + 1
+    return rolling.with_pushes(float(FACTORS[above])).estimator

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Protocol, runtime_checkable
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from jaxtyping import Float
@@ -12,18 +14,23 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.forecasting.bands import LEVEL, Forecast
-from ep2sindy.forecasting.baselines import Autoregression, Baseline, Harmonics, Persistence
-from ep2sindy.forecasting.calibration import calibrate
-from ep2sindy.forecasting.rolling import RollingStarts, StatesOf, spread_evenly, spread_starts
-from ep2sindy.forecasting.state_estimation import StateEstimator, measured_states, tune_estimator
+from ep2sindy.forecasting.forecast import (
+    LEVEL,
+    Forecast,
+    RollingStarts,
+    StatesOf,
+    calibrate,
+    spread_evenly,
+    spread_starts,
+)
+from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.units import Clock
 from ep2sindy.model.model import SparseModel
-from ep2sindy.runtime.progress import Advance, nothing
+from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count
-from ep2sindy.signals.attractor import find_cycle
-from ep2sindy.signals.spectrum import crossing_frequency
+from ep2sindy.signals.attractor import Cycle, find_cycle
+from ep2sindy.signals.spectrum import crossing_frequency, dominant_frequency, is_uniform
 
 N_STARTS = 40
 PERIODS_AHEAD = 4.0  # longest horizon
@@ -33,6 +40,11 @@ NEARER = 0.9  # share of the model's error below which a baseline is clearly nea
 MODEL, PERSISTENCE, HARMONICS, AUTOREGRESSION = (
     "model", "persistence", "harmonics", "autoregression",
 )  # fmt: skip
+
+# Largest order of an autoregression of one state, and the sum of orders of one of several; samples
+# that it is fitted to, from the end of the record.
+MAX_ORDER, MAX_ORDERS, MAX_FITTED = 120, 40, 4000
+SAMPLES_PER_COEFFICIENT = 5  # fewest, of an autoregression
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +121,8 @@ class ForecastSkill:
 
     def summary(self) -> dict[str, object]:
         """For `summary.json`: the errors at a few horizons."""
-        places = _pick_few(len(self.horizons_s))
+        last = len(self.horizons_s) - 1
+        places = sorted({round(k / 16 * last) for k in (0, 1, 2, 4, 8, 12, 16)})
         return {
             "horizons_periods": [self._in_unit(h) for h in self.horizons_s[places].tolist()],
             "nrmse": {name: values[places].tolist() for name, values in self.nrmse.items()},
@@ -136,7 +149,7 @@ def forecast_skill(
     n_draws: int = 100,
     estimator: StateEstimator | None = None,
     seed: int = 0,
-    advance: Advance = nothing,
+    progress: Progress | bool = False,
 ) -> ForecastSkill:
     """Forecast a held-out part again and again, each time from its own past, and count the errors.
 
@@ -147,21 +160,21 @@ def forecast_skill(
     (`ep.signals.embed`). estimator: calibrated on the fitted part. n_draws: of every forecast.
     Raises ValueError for a driven model, or a part that is too short.
     """
-    record = trajectory_of(run)
-    names = measured_states(model, record) if measured is None else list(measured)
-    _check_skill(model, record, n_fitted)
-    fitted = record.window(0, n_fitted)
+    record, watch = trajectory_of(run), as_progress(progress)
+    fitted = _fitted_part(model, record, n_fitted)
     if estimator is None:
-        estimator = tune_estimator(model, fitted, measured=names)
-        estimator = calibrate(estimator, fitted, states_of=states_of)
-    longest = _horizon_of(record, n_fitted, period_s := _period_of(fitted, names), horizon_s)
+        estimator = tune_estimator(model, fitted, measured=measured, progress=watch)
+        estimator = calibrate(estimator, fitted, states_of=states_of, progress=watch)
+    names, period_s = estimator.names, _period_of(fitted, estimator.names)
+    longest = _horizon_of(record, n_fitted, period_s, horizon_s)
     first = spread_starts(record.t, n_fitted, longest, check_count("starts", starts))
-    rolling = RollingStarts(estimator, record, names, first, longest)
-    ahead = rolling.forecast(states_of, check_count("n_draws", n_draws), seed, advance)
-    shown = spread_evenly(longest, N_HORIZONS)
-    baselines, order = _fit_baselines(fitted, names)
-    paths = {name: rolling.continued(baseline) for name, baseline in baselines.items()}
-    paths = {MODEL: rolling.measured(ahead), **paths}
+    rolling = RollingStarts(estimator, record, first, longest)
+    with watch.stage(len(first), "start", "forecasts") as advance:
+        ends = rolling.ends(states_of, advance)
+    ahead = rolling.forecast(ends, check_count("n_draws", n_draws), seed)
+    shown, (baselines, order) = spread_evenly(longest, N_HORIZONS), _fit_baselines(fitted, names)
+    paths = {MODEL: rolling.measured(ahead)}
+    paths |= {name: _go_on(each, rolling) for name, each in baselines.items()}
     scale = zero_to_one(record.columns(names)[n_fitted:].std(axis=0))
     errors = {n: horizon_errors(path, rolling.truth, scale)[shown] for n, path in paths.items()}
     return ForecastSkill(
@@ -176,7 +189,8 @@ def forecast_skill(
     )
 
 
-def _check_skill(model: SparseModel, record: Trajectory, n_fitted: int) -> None:
+def _fitted_part(model: SparseModel, record: Trajectory, n_fitted: int) -> Trajectory:
+    """The samples that were fitted. Raises ValueError for a driven model, or too few samples."""
     if model.inputs:
         raise ValueError(
             f"the skill of forecasts is counted for models without inputs: this one is driven by "
@@ -187,6 +201,7 @@ def _check_skill(model: SparseModel, record: Trajectory, n_fitted: int) -> None:
             "the fitted part must have eight samples or more, and leave four: "
             f"n_fitted={n_fitted} came for {record.n_samples} samples"
         )
+    return record.window(0, n_fitted)
 
 
 def _period_of(run: Trajectory, names: Sequence[str]) -> float:
@@ -227,6 +242,15 @@ def _fit_baselines(fitted: Trajectory, names: Sequence[str]) -> tuple[dict[str, 
     return found, 0 if linear is None else linear.order
 
 
+def _go_on(
+    baseline: Baseline, rolling: RollingStarts
+) -> Float[np.ndarray, "starts ahead measured"]:
+    """What a baseline forecasts from every start."""
+    record, n = rolling.record, rolling.longest
+    samples, t = record.columns(rolling.estimator.names), record.t
+    return np.stack([baseline.ahead(samples[:k], t[:k], t[k : k + n]) for k in rolling.first])
+
+
 def horizon_errors(
     forecast: Float[np.ndarray, "starts ahead measured"],
     truth: Float[np.ndarray, "starts ahead measured"],
@@ -237,6 +261,109 @@ def horizon_errors(
     return np.sqrt(np.square(np.minimum(off, WORST)).mean(axis=(0, 2)))
 
 
-def _pick_few(n: int) -> list[int]:
-    """A few places of n, closer at the beginning."""
-    return sorted({round(share * (n - 1)) for share in (0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1)})
+# Forecasts without a model of the system, which a model must beat to be worth anything.
+
+
+@runtime_checkable
+class Baseline(Protocol):
+    """Interface of the baselines: forecasts of the next samples from the past alone."""
+
+    def ahead(
+        self, past: Float[np.ndarray, "samples n_states"], t: Float[np.ndarray, " samples"],
+        times: Float[np.ndarray, " ahead"],
+    ) -> Float[np.ndarray, "ahead n_states"]: ...  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Persistence:
+    """The last sample stays."""
+
+    def ahead(self, past: np.ndarray, t: np.ndarray, times: np.ndarray) -> np.ndarray:
+        return np.repeat(past[-1:], len(times), axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Harmonics:
+    """The mean waveform of a record goes on, at the phase that the last period shows."""
+
+    cycle: Cycle
+
+    @staticmethod
+    def of(run: Trajectory) -> Harmonics | None:
+        """None for a record without a period."""
+        cycle = find_cycle(run.t, run.states)
+        return None if cycle is None else Harmonics(cycle)
+
+    def ahead(self, past: np.ndarray, t: np.ndarray, times: np.ndarray) -> np.ndarray:
+        turns = 2.0 * np.pi * self.cycle.frequency_Hz
+        late = t >= t[-1] - 1.0 / self.cycle.frequency_Hz
+        shifts = 2.0 * np.pi * np.arange(72) / 72.0
+        spread = np.where(self.cycle.std > 0.0, self.cycle.std, 1.0)
+        off = [
+            np.square((self.cycle.waveform(turns * t[late] + shift) - past[late]) / spread).sum()
+            for shift in shifts
+        ]
+        return self.cycle.waveform(turns * times + shifts[int(np.argmin(off))])
+
+
+@dataclass(frozen=True, eq=False)
+class Autoregression:
+    """A linear autoregression, of all states at once, whose order has the least AIC.
+
+    constant: (n_states,). coef: (order, n_states, n_states), of the last sample first.
+    """
+
+    constant: Float[np.ndarray, " n_states"]
+    coef: Float[np.ndarray, "order n_states n_states"]
+
+    @staticmethod
+    def of(run: Trajectory) -> Autoregression | None:
+        """None for steps that are not equal, or too few samples."""
+        d = run.states.shape[1]
+        most = _largest_order(run)
+        if most < 1 or not is_uniform(run.t):
+            return None
+        states = run.states[-MAX_FITTED:]
+        mean, scale = states.mean(axis=0), zero_to_one(states.std(axis=0))
+        x = (states - mean) / scale
+        if d == 1:
+            from statsmodels.tsa.ar_model import AutoReg, ar_select_order  # takes a second
+
+            with catch_warnings():  # of a record without noise, for which any solution is exact
+                simplefilter("ignore")
+                lags = ar_select_order(x[:, 0], maxlag=most, ic="aic").ar_lags or [1]
+                params = AutoReg(x[:, 0], lags=max(lags)).fit().params
+            constant, coef = params[:1], params[1:].reshape(-1, 1, 1)
+        else:
+            from statsmodels.tsa.vector_ar.var_model import VAR
+
+            fit = VAR(x).fit(maxlags=most, ic="aic")
+            if fit.k_ar == 0:
+                return None
+            constant, coef = fit.intercept, fit.coefs
+        coef = coef * scale[:, None] / scale
+        constant = scale * constant + mean - coef.sum(axis=0) @ mean
+        return Autoregression(constant, coef)
+
+    @property
+    def order(self) -> int:
+        return len(self.coef)
+
+    def ahead(self, past: np.ndarray, t: np.ndarray, times: np.ndarray) -> np.ndarray:
+        known = list(past[-self.order :])
+        if len(known) < self.order:
+            return np.full((len(times), past.shape[1]), np.nan)
+        for _ in range(len(times)):
+            last = np.array(known[: -self.order - 1 : -1])
+            known.append(self.constant + np.einsum("lij,lj->i", self.coef, last))
+        return np.array(known[self.order :])
+
+
+def _largest_order(run: Trajectory) -> int:
+    """Largest order that is tried: two periods, if there are samples enough."""
+    frequency_Hz = max(dominant_frequency(run.t, column) for column in run.states.T)
+    periods = frequency_Hz * float(run.t[-1] - run.t[0])
+    d = run.states.shape[1]
+    most = MAX_ORDER if d == 1 else MAX_ORDERS / d
+    wanted = 2.0 * run.n_samples / periods if periods >= 1.0 else most
+    return int(min(wanted, most, run.n_samples / (SAMPLES_PER_COEFFICIENT * d)))

@@ -100,6 +100,11 @@ class StateEstimator:
         return self.problem.measured
 
     @property
+    def names(self) -> list[str]:
+        """The measured states, in the model's order."""
+        return [name for name, own in zip(self.model.states, self.measured, strict=True) if own]
+
+    @property
     def memory(self) -> int:
         """Length in samples of the window that a start is fitted to."""
         return int(np.clip(MEMORY_PERIODS * self.per_period, MIN_MEMORY, MAX_MEMORY))
@@ -287,11 +292,8 @@ def _select_variables(model: SparseModel, run: Trajectory) -> Trajectory:
 
 
 def _free_of(model: SparseModel, problem: EstimationProblem) -> Float[np.ndarray, " free"]:
-    coef = [
-        model.terms(problem.states[equation])[problem.term_names[column]]
-        for equation, column in zip(problem.equation, problem.column, strict=True)
-    ]
-    return np.array(coef) / problem.to_SI
+    places = np.array([model.library.index(name) for name in problem.term_names])
+    return model.coef[places[problem.column], problem.equation] / problem.to_SI
 
 
 def _count_per_period(run: Trajectory, measured: Sequence[str]) -> float:

@@ -54,7 +54,7 @@ class Kind:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by name; a user's function is registered again in the receiving process."""
-        return _receive, (self.name, *((self.value, self.slope, self.domain) if self.own else ()))
+        return _receive, (self.name, (self.value, self.slope, self.domain) if self.own else None)
 
 
 @dataclass(frozen=True)
@@ -411,6 +411,6 @@ def number_sympy(value: float) -> sympy.Expr:
     return sympy.Integer(int(value)) if value.is_integer() else sympy.Float(value)
 
 
-def _receive(name: str, *own: Any) -> Kind:
+def _receive(name: str, own: tuple[Values, Values, tuple[Interval, ...]] | None = None) -> Kind:
     """A function by its name; a user's, from another process, is registered unless it is known."""
-    return _kinds.setdefault(name, Kind(name, *own, own=True)) if own else _kinds[name]
+    return _kinds[name] if own is None else _kinds.setdefault(name, Kind(name, *own, own=True))

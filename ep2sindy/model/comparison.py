@@ -20,8 +20,7 @@ from ep2sindy.signals.attractor import (
     waveform_errors,
     white_variance,
 )
-from ep2sindy.signals.oscillation import DIED_OUT, has_decayed
-from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency, has_decayed, power_spectrum
 
 LONG = 8.0  # fewest periods in a record whose first half may be left out as a transient
 REPEATS = 0.9  # least share of the variance that the waveform of a cycle explains; chaos: 0.5-0.75
@@ -190,7 +189,9 @@ class ComparedRecord:
             return False  # a transient from elsewhere
         first = self.t <= self.t[0] + 1.0 / self.cycle.frequency_Hz
         off = np.square((states - self.states)[first] / self.std).mean(axis=0)
-        noise = np.array([white_variance(self.t, x) for x in self.states.T]) / np.square(self.std)
+        noise = np.array(
+            [white_variance(*power_spectrum(self.t, x)) for x in self.states.T]
+        ) / np.square(self.std)
         is_quiet = np.sqrt(noise) <= TOO_NOISY
         return bool((np.maximum(off - noise, 0.0) > FIRST_PERIOD**2)[is_quiet].any())
 

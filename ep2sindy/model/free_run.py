@@ -25,9 +25,8 @@ from ep2sindy.model.stability import (
     share_reaching,
 )
 from ep2sindy.runtime.values import check_kind
-from ep2sindy.signals.attractor import phase_along
-from ep2sindy.signals.oscillation import DIED_OUT
-from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.signals.attractor import follow_phase
+from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,12 +233,13 @@ def _periods_kept(record: ComparedRecord, states: np.ndarray) -> float:
     if record.cycle is None:
         return float("nan")
     frequency_Hz, n = record.cycle.frequency_Hz, len(states)
+    straight = 2.0 * np.pi * frequency_Hz * (record.t[:n] - record.t[0])
     if n < 4 or not (states.std(axis=0) > 0.0).all():
         return 0.0
     shares = np.abs(record.cycle.harmonics[0]) / record.std
     leader = int(np.argmax(shares))
     ours, theirs = (
-        phase_along(record.t[:n], values[:n, leader], frequency_Hz)
+        follow_phase(record.t[:n], values[:n, leader], straight)
         for values in (record.states, states)
     )
     slip = theirs - ours

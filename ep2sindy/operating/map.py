@@ -17,7 +17,7 @@ from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import CycleStability, limit_cycle
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.records import OperatingRecord, read_points
-from ep2sindy.signals.oscillation import SIMULATED, relative_amplitude
+from ep2sindy.signals.spectrum import SIMULATED, relative_amplitude
 
 # Least decay rate per period of a fixed point at which a diverging run counts as resting: e-fold in
 # a hundred periods.

@@ -41,8 +41,13 @@ from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
-from ep2sindy.signals.spectrum import dominant_frequency, samples_in_periods
+from ep2sindy.signals.spectrum import (
+    Oscillation,
+    dominant_frequency,
+    oscillation,
+    relative_spread,
+    samples_in_periods,
+)
 
 MIN_BLOCKS = 5  # fewest blocks in a record: with fewer, draws differ too little from one another
 

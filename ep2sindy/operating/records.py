@@ -14,8 +14,7 @@ from ep2sindy.data.numbers import least_squares, zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.regression.pooled import Basis
 from ep2sindy.signals.attractor import Cycle, find_cycle
-from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
-from ep2sindy.signals.spectrum import steps_in
+from ep2sindy.signals.spectrum import Oscillation, relative_amplitude, steps_in
 from ep2sindy.signals.trace import MIN_PERIODS
 
 # Two cycles coexist if the relative amplitudes of the records, less a plane over the parameters,

@@ -24,8 +24,7 @@ from ep2sindy.regression.rows import MOST_ROWS, NoisyRows, RegressionRows, Terms
 from ep2sindy.regression.whitening import whiten_rows
 from ep2sindy.regression.windows import Boxes, Bumps, WindowFunctions, Windows
 from ep2sindy.runtime.values import check_kind, check_list, locked, set_counts
-from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
-from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
+from ep2sindy.signals.smoothers import KalmanEstimate, KalmanSmoother, SavitzkyGolay, Smoother
 
 
 @runtime_checkable

@@ -28,7 +28,7 @@ from ep2sindy.selection.criteria import (
     support_of,
 )
 from ep2sindy.signals.attractor import Cycle
-from ep2sindy.signals.kalman import KalmanSmoother
+from ep2sindy.signals.smoothers import KalmanSmoother
 
 # Most time steps, over windows and systems, of one refinement batch: more would not fit the cache.
 BATCH_STEPS = 6000

@@ -1,5 +1,5 @@
 # Signals
-from ep2sindy.signals.kalman import KalmanSmoother as KalmanSmoother  # for configs
+from ep2sindy.signals.smoothers import KalmanSmoother as KalmanSmoother  # for configs
 from ep2sindy.signals.log_smoother import LogSmoother as LogSmoother  # for configs
 from ep2sindy.signals.smoothers import SavitzkyGolay as SavitzkyGolay  # for configs
 from ep2sindy.signals.smoothers import NoSmoothing as NoSmoothing  # for configs

@@ -18,7 +18,6 @@ from ep2sindy.signals.spectrum import (
     noise_floor,
     peak,
     power_spectrum,
-    resample_evenly,
 )
 
 MIN_PERIODS = 3.0  # fewest periods in a record that counts as repeating
@@ -117,7 +116,7 @@ def find_cycle(
     whole = np.square(scaled).sum(axis=0)
     if not (whole - rest >= MIN_VISIBLE * whole).any():
         return None
-    noise = len(t) * np.array([_white_variance(*spectrum) for spectrum in spectra])
+    noise = len(t) * np.array([white_variance(*spectrum) for spectrum in spectra])
     known = np.maximum(whole - noise, 1e-12)
     share = 1.0 - float(np.maximum(rest - noise, 0.0).sum() / known.sum())
     if not (share >= MIN_SHARE and frequency_Hz > 0.0):
@@ -141,7 +140,7 @@ def _estimate_phase(
     tried = [phase]
     n_periods = rough_Hz * (t[-1] - t[0])
     if n_periods >= 2.0 * PERIODS_TRACKED:
-        tried.append(phase + _follow_phase(t, scaled[:, leader], phase))
+        tried.append(follow_phase(t, scaled[:, leader], phase))
     for _ in range(2):
         tried = [_sharpen(t, each, scaled, most) for each in tried]
     if len(tried) == 1:
@@ -164,9 +163,11 @@ def _find_line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
     return rough_Hz, float(power[near].sum() / power.sum())
 
 
-def white_variance(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
-    """Variance of the white noise in samples of x, from the upper half of the spectrum."""
-    return _white_variance(*power_spectrum(t, x))
+def white_variance(
+    frequency: Float[np.ndarray, " bins"], power: Float[np.ndarray, " bins"]
+) -> float:
+    """Variance of the white noise in a signal, from the upper half of its spectrum."""
+    return float(noise_floor(power) * frequency[-1]) if len(power) else 0.0
 
 
 def mean_cycle(run: Trajectory) -> Trajectory:
@@ -191,34 +192,25 @@ def mean_cycle(run: Trajectory) -> Trajectory:
     return replace(run, states=cycle.waveform(cycle.phase))
 
 
-def _white_variance(frequency: np.ndarray, power: np.ndarray) -> float:
-    return float(noise_floor(power) * frequency[-1]) if len(power) else 0.0
-
-
-def phase_along(
-    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], frequency_Hz: float
+def follow_phase(
+    t: Float[np.ndarray, " samples"],
+    x: Float[np.ndarray, " samples"],
+    straight: Float[np.ndarray, " samples"],
 ) -> Float[np.ndarray, " samples"]:
-    """Unwrapped phase in rad, at every sample, of the component of x near a frequency.
+    """Unwrapped phase in rad, at every sample, of the component of x near a phase linear in time.
 
     x is demodulated and averaged under a Hann window of eight periods, or of half the record if
-    that is shorter. Where the window reaches beyond an end of the record, the phase is continued
-    at the given frequency.
+    that is shorter. Where the window reaches beyond an end of the record, the phase goes on as the
+    linear one.
     """
-    straight = 2.0 * np.pi * frequency_Hz * (t - t[0])
-    return straight + _follow_phase(t, x, straight)
-
-
-def _follow_phase(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
-    """Phase of x minus a phase linear in time, smoothed over the averaging window."""
     slow = (x - x.mean()) * np.exp(-1j * straight)
-    even = t
-    if not is_uniform(t):
-        even, slow = resample_evenly(t, slow, degree=1)
+    even = t if is_uniform(t) else np.linspace(t[0], t[-1], len(t))
+    slow = np.interp(even, t, slow)
     per_period = len(t) * 2.0 * np.pi / (straight[-1] - straight[0])
     n = max(3, round(min(PERIODS_TRACKED * per_period, 0.5 * len(t))))
     drift = np.unwrap(np.angle(_moving_average(slow, np.hanning(n + 2)[1:-1])))
     whole = slice(n // 2, len(t) - n // 2)
-    return np.interp(t, even[whole], drift[whole])
+    return straight + np.interp(t, even[whole], drift[whole])
 
 
 def _moving_average(x: np.ndarray, window: np.ndarray) -> np.ndarray:
@@ -258,10 +250,7 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
 def _fourier_columns(phase: np.ndarray, order: int) -> np.ndarray:
     """Constant, then cosine and sine of each harmonic: (samples, 1 + 2 order)."""
     # Powers of one exponential: each costs a product instead of a sine and a cosine.
-    turns = np.empty((order, len(phase)), dtype=np.complex128)
-    turns[0] = turn = np.exp(1j * phase)
-    for k in range(1, order):
-        np.multiply(turns[k - 1], turn, out=turns[k])
+    turns = np.multiply.accumulate(np.tile(np.exp(1j * phase), (order, 1)))
     columns = np.empty((len(phase), 1 + 2 * order))
     columns[:, 0], columns[:, 1::2], columns[:, 2::2] = 1.0, turns.real.T, turns.imag.T
     return columns
@@ -363,11 +352,8 @@ def spectrum_distance(
 
     Both records have the same times. Bands are thirds of octaves. Returns the mean over the states.
     """
-    apart = []
-    for ours, theirs in zip(data.T, other.T, strict=True):
-        shares = [_power_by_band(t, column) for column in (ours, theirs)]
-        apart.append(0.5 * float(np.abs(shares[0] - shares[1]).sum()))
-    return float(np.mean(apart))
+    ours, theirs = ([_power_by_band(t, x) for x in states.T] for states in (data, other))
+    return float(0.5 * np.abs(np.subtract(ours, theirs)).sum(axis=1).mean())
 
 
 def quarter_distances(

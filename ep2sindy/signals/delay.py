@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -84,15 +84,11 @@ class Delay:
                 f"a run must last longer than three delays of {self.delay_s:g} s, after which the "
                 f"chain is filled: {run.t[-1] - run.t[0]:g} s came; shorten the delay"
             )
-        return Trajectory(
-            t=run.t[first:],
+        return replace(
+            run.window(first, run.n_samples),
             states=np.column_stack([run.states, stages])[first:],
             state_names=(*run.state_names, *self.names),
-            inputs=run.inputs[first:],
-            input_names=run.input_names,
             units={**run.units, **dict.fromkeys(self.names, run.units[self.state])},
-            label=run.label,
-            clock=run.clock,
         )
 
     def _stages(self, run: Trajectory) -> Float[np.ndarray, "samples stages"]:

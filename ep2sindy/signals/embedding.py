@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Protocol, runtime_checkable
@@ -15,8 +15,8 @@ from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.values import check_count
-from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.log_smoother import LogSmoother
+from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import signal_memory_s
 from ep2sindy.signals.trace import Trace
 
@@ -32,37 +32,19 @@ MAX_STATES = 5
 # Neighbours whose mean predicts the next state, samples at either end and most samples used.
 N_NEIGHBOURS, EDGE, MAX_POINTS = 4, 10, 5000
 
+DELAY = 0.25  # of a delayed value, as a share of the period
+
 CUBIC = 3  # degree of a spline, which needs more samples than that
 
 # Noise level, in standard deviations of the signal, above which no derivative is taken.
 DROWNED = 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class Embedded:
-    """A signal as a trajectory of states, with the equations that are known exactly.
-
-    relations, terms: in the form that `discover` takes. noise_std: standard deviation of the noise
-    in the signal, in its unit; it includes components faster than the smoother follows.
-    """
-
-    run: Trajectory
-    relations: Sequence[str]
-    terms: Mapping[str, Sequence[str]]
-    noise_std: float
-
-    @property
-    def searched(self) -> list[str]:
-        """States whose equations are not known."""
-        return [name for name in self.run.state_names if name not in self.terms]
-
-
 @runtime_checkable
 class Embedding(Protocol):
     """Interface of the embeddings.
 
-    says: description in words. names: names of the states made of a signal, the signal first.
-    n_states: their number.
+    n_states: number of states made of a signal, the signal first. says: description in words.
     """
 
     @property
@@ -71,9 +53,29 @@ class Embedding(Protocol):
     @property
     def says(self) -> str: ...
 
-    def names(self, signal: str) -> tuple[str, ...]: ...
-
     def embed(self, signal: Trace) -> Embedded: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Embedded:
+    """A signal as a trajectory of states, with the equations that are known exactly.
+
+    embedding: that made the states. relations, terms: in the form that `discover` takes. noise_std:
+    standard deviation of the noise in the signal, in its unit; it includes components faster than
+    the smoother follows. reason: why this embedding was taken, in words.
+    """
+
+    embedding: Embedding
+    run: Trajectory
+    relations: Sequence[str]
+    terms: Mapping[str, Sequence[str]]
+    noise_std: float
+    reason: str = "set"
+
+    @property
+    def searched(self) -> list[str]:
+        """States whose equations are not known."""
+        return [name for name in self.run.state_names if name not in self.terms]
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ class LogRate:
         found = smoother.estimate(signal.t, signal.x)
         states = [found.smoothed, *_differentiate(signal.t, found.log, self.n_states)[1:]]
         chain = {x: f"{x}*{g}"} | dict(pairwise([g, *higher]))
-        return _assemble(signal, [x, g, *higher], "s^-1", states, chain, found.noise_std)
+        return _assemble(self, signal, "s^-1", states, chain, found.noise_std)
 
 
 @dataclass(frozen=True)
@@ -141,39 +143,34 @@ class Rate:
         smoothed, derivative, noise_std = _smooth(signal, self.harmonics)
         states = [smoothed, derivative, *_differentiate(signal.t, smoothed, self.n_states)[2:]]
         unit = unit_product([(signal.unit, 1), ("s", -1)])
-        return _assemble(signal, names, unit, states, dict(pairwise(names)), noise_std)
+        return _assemble(self, signal, unit, states, dict(pairwise(names)), noise_std)
 
 
 @dataclass(frozen=True)
 class Delays:
     """A signal and its own delayed values.
 
-    This embedding needs no derivative, but no equation is known beforehand either.
-
-    share: delay as a fraction of the period. n_states: 3 adds the value two delays before, and so
-    on.
+    This embedding needs no derivative, but no equation is known beforehand either. The delay is a
+    quarter of the period. n_states: 3 adds the value two delays before, and so on.
     """
 
-    share: float = 0.25
     harmonics: float = HARMONICS
     n_states: int = 2
 
     def __post_init__(self) -> None:
         _check_settings(self)
-        if not 0.0 < self.share < 1.0:
-            raise ValueError(f"share of the period must lie between 0 and 1: {self.share} came")
 
     @property
     def says(self) -> str:
         more = "" if self.n_states == 2 else f", {self.n_states - 1} times"
-        return f"the signal and itself {self.share:g} of a period before{more}"
+        return f"the signal and itself {DELAY:g} of a period before{more}"
 
     def names(self, signal: str) -> tuple[str, ...]:
         return signal, *(f"{signal}_before{k}" for k in ("", *range(2, self.n_states)))
 
     def embed(self, signal: Trace) -> Embedded:
         smoothed, _, noise_std = _smooth(signal, self.harmonics)
-        lags_s = self.share * signal.period_s * np.arange(1, self.n_states)
+        lags_s = DELAY * signal.period_s * np.arange(1, self.n_states)
         parts = [
             _append_past(signal.t[a:b], smoothed[a:b], lags_s)
             for a, b in between_gaps(signal.t)
@@ -181,19 +178,10 @@ class Delays:
         ]
         t, states = (np.concatenate(each) for each in zip(*parts, strict=True))
         late = signal.with_samples(t, states[:, 0])
-        return _assemble(late, self.names(signal.name), "", list(states.T), {}, noise_std)
+        return _assemble(self, late, "", list(states.T), {}, noise_std)
 
 
 AnyEmbedding = LogRate | Rate | Delays
-
-
-@dataclass(frozen=True, eq=False)
-class Chosen:
-    """An embedding, its result, and the reason for choosing it, in words."""
-
-    embedding: Embedding
-    reason: str
-    embedded: Embedded = field(repr=False)
 
 
 # The embeddings by the names that settings give them.
@@ -202,31 +190,21 @@ EMBEDDINGS: Mapping[str, Callable[..., AnyEmbedding]] = MappingProxyType(
 )
 
 
-def embed(
-    signal: Trace,
-    embedding: AnyEmbedding | None = None,
-    *,
-    n_states: int = 2,
-    harmonics: float = HARMONICS,
-) -> Chosen:
-    """Embed a signal as states; None chooses the embedding by the signal's sign and noise.
+def embed(signal: Trace, *, n_states: int = 2, harmonics: float = HARMONICS) -> Embedded:
+    """Embed a signal as states by the embedding that its sign and its noise ask for.
 
-    n_states: number of states, and harmonics: that are followed, if the embedding is chosen.
-    Raises ValueError if the given embedding does not suit the signal.
+    n_states, harmonics: of the embedding, see `LogRate`.
     """
-    if embedding is not None:
-        return Chosen(embedding, "set", embedding.embed(signal))
     if signal.is_positive:
-        positive = LogRate(harmonics, n_states)
-        return Chosen(positive, f"{signal.name} is positive", positive.embed(signal))
-    rate = Rate(harmonics, n_states)
-    found = rate.embed(signal)
-    share = found.noise_std / float(signal.x.std())
+        positive = LogRate(harmonics, n_states).embed(signal)
+        return replace(positive, reason=f"{signal.name} is positive")
+    either, rate = f"{signal.name} takes either sign", Rate(harmonics, n_states).embed(signal)
+    share = rate.noise_std / float(signal.x.std())
     if share <= DROWNED:
-        return Chosen(rate, f"{signal.name} takes either sign", found)
-    delays = Delays(harmonics=harmonics, n_states=n_states)
-    why = f"{signal.name} takes either sign, and noise is {share:.2f} of its standard deviation"
-    return Chosen(delays, why, delays.embed(signal))
+        return replace(rate, reason=either)
+    delays = Delays(harmonics, n_states).embed(signal)
+    reason = f"{either}, and noise is {share:.2f} of its standard deviation"
+    return replace(delays, reason=reason)
 
 
 def _smooth(signal: Trace, harmonics: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -247,7 +225,7 @@ def _memory_bounds(signal: Trace, harmonics: float) -> dict[str, float]:
 
 
 def _assemble(
-    signal: Trace, names: Sequence[str], rate_unit: str, states: Sequence[np.ndarray],
+    embedding: AnyEmbedding, signal: Trace, rate_unit: str, states: Sequence[np.ndarray],
     chain: Mapping[str, str], noise_std: float,
 ) -> Embedded:  # fmt: skip
     """States of a signal, with the equations that are known.
@@ -255,18 +233,20 @@ def _assemble(
     rate_unit: unit of the second state, of which those after it are derivatives; empty if all have
     the signal's. chain: state -> the only term of its equation, whose coefficient is one.
     """
+    names = embedding.names(signal.name)
     rates = [unit_product([(rate_unit or signal.unit, 1), ("s", -k)]) for k in range(len(names))]
     units = [signal.unit, *rates] if rate_unit else [signal.unit] * len(names)
     run = Trajectory(
         t=signal.t,
         states=np.column_stack(states),
-        state_names=tuple(names),
+        state_names=names,
         units=dict(zip(names, units, strict=False)),
         label=signal.name,
         clock=signal.clock,
     )
     relations = tuple(f"{state}: {term} == 1" for state, term in chain.items())
-    return Embedded(run, relations, {state: (term,) for state, term in chain.items()}, noise_std)
+    terms = {state: (term,) for state, term in chain.items()}
+    return Embedded(embedding, run, relations, terms, noise_std)
 
 
 def _name_chain(signal: str, letters: str) -> tuple[str, ...]:

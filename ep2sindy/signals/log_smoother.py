@@ -11,7 +11,7 @@ from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.runtime.values import read_only
-from ep2sindy.signals.kalman import WienerProcess, check_memory_bounds, ratio_bounds, scale_steps
+from ep2sindy.signals.smoothers import WienerProcess, check_memory_bounds, ratio_bounds, scale_steps
 
 # Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
 # time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.
@@ -98,29 +98,21 @@ class LogSmoother:
             )
         y, process = x / mean, WienerProcess.at(steps, lumped=True)
         limits = (LOG10_RATIO_MIN, LOG10_RATIO_MAX)
-        ratio, found = _find_likeliest_mode(
+        ratio, (_, log, squares) = _find_likeliest_mode(
             y, process, *ratio_bounds(self.finest_s, self.coarsest_s, step_s, limits)
         )
-        log = found.log + np.log(mean)
+        log = log + np.log(mean)
         return LogEstimate(
             log=log,
             rate=make_interp_spline(t, log, k=5).derivative()(t),
-            noise_std=mean * float(np.sqrt(found.squares / (len(y) - 3))),
+            noise_std=mean * float(np.sqrt(squares / (len(y) - 3))),
             log10_ratio=ratio,
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Mode:
-    """Mode of the posterior for one ratio.
-
-    log: (samples,). squares: residual sum of squares plus roughness penalty. misfit: -2 log
-    likelihood.
-    """
-
-    log: np.ndarray
-    squares: float
-    misfit: float
+# Mode of the posterior for one ratio: -2 log likelihood, the logarithm at every sample, and the sum
+# of squared residuals and roughness penalty.
+_Mode = tuple[float, np.ndarray, float]
 
 
 def _find_likeliest_mode(
@@ -135,11 +127,11 @@ def _find_likeliest_mode(
     modes, log = [], np.log(np.maximum(y, FLOOR))
     for decade in decades:
         modes.append(_find_mode(y, process, decade, log))
-        log = modes[-1].log
-    misfits = np.array([mode.misfit for mode in modes])
-    start = modes[int(misfits.argmin())].log
+        log = modes[-1][1]
+    misfits = np.array([misfit for misfit, *_ in modes])
+    start = modes[int(misfits.argmin())][1]
     ratio = least_beside_grid(
-        lambda ratio: _find_mode(y, process, ratio, start).misfit,
+        lambda ratio: _find_mode(y, process, ratio, start)[0],
         decades,
         misfits,
         tolerance=LOG10_RATIO_TOLERANCE,
@@ -166,7 +158,7 @@ def _find_mode(y: np.ndarray, process: WienerProcess, log10_ratio: float, log: n
             break
     _, _, logs = process.solve(log[:, None], ratio, weights=np.exp(2.0 * log))
     squares = max(squares, n * ROUNDING)
-    return _Mode(log, squares, float(n * np.log(squares) + logs))
+    return float(n * np.log(squares) + logs), log, squares
 
 
 def _sum_squares(y: np.ndarray, process: WienerProcess, ratio: float, log: np.ndarray) -> float:

@@ -1,17 +1,28 @@
-"""Power spectrum and dominant frequency of a sampled signal."""
+"""Power spectrum and dominant frequency of a sampled signal, and whether it oscillates.
+
+Two related questions have their own measures. `attractor.find_cycle` tests whether a record
+repeats one waveform; chaos oscillates but does not repeat. `operating.map` classifies the run of a
+model from a start, and can also use its fixed point and the stability of its cycle.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import fft
 
 from ep2sindy.data.gaps import between_gaps
-from ep2sindy.data.numbers import rounding_s
+from ep2sindy.data.numbers import rounding_s, zero_to_one
 
 STEP_TOLERANCE = 1e-6  # largest relative spread of steps in uniform sampling
+
+PEAK_WIDTH = 0.05  # half-width of a peak, as a share of its frequency; two bins at least
+
+DIED_OUT = 0.1  # a run has died out if its late spread is below this share of the data's
 
 
 def is_uniform(t: Float[np.ndarray, " samples"]) -> bool:
@@ -21,9 +32,9 @@ def is_uniform(t: Float[np.ndarray, " samples"]) -> bool:
 
 
 def resample_evenly(
-    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], *, degree: int = 3
-) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
-    """Samples at equal steps, the mean of the given ones, by splines of a degree between gaps.
+    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
+) -> Float[np.ndarray, " samples"]:
+    """Samples at equal steps, the mean of the given ones, by cubic splines between gaps.
 
     A gap is bridged by a straight line: a spline would overshoot there.
     """
@@ -31,12 +42,12 @@ def resample_evenly(
 
     even = np.linspace(t[0], t[-1], len(t))
     values = np.interp(even, t, x)
-    for start, stop in between_gaps(t) if degree > 1 else ():
-        own, degree_here = t[start:stop], min(degree, stop - start - 1)
+    for start, stop in between_gaps(t):
+        own, degree = t[start:stop], min(3, stop - start - 1)
         inside = (even >= own[0]) & (even <= own[-1])
-        if degree_here > 1:
-            values[inside] = make_interp_spline(own, x[start:stop], k=degree_here)(even[inside])
-    return even, values
+        if degree > 1:
+            values[inside] = make_interp_spline(own, x[start:stop], k=degree)(even[inside])
+    return values
 
 
 def power_spectrum(
@@ -49,13 +60,9 @@ def power_spectrum(
     Returns frequencies in Hz and power density in u^2/Hz.
     """
     if not is_uniform(t):
-        x = resample_evenly(t, x)[1]
+        x = resample_evenly(t, x)
     rate_Hz = (len(t) - 1) / (t[-1] - t[0])
-    return _periodogram(x, rate_Hz)
-
-
-def _periodogram(x: np.ndarray, rate_Hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """Same as `scipy.signal.periodogram` with a Hann window, whose import takes half a second."""
+    # As scipy.signal.periodogram has it, whose import takes half a second.
     window = 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, len(x) + 1)[:-1])
     strength = np.cumsum(window**2)[-1]  # summed in order, to match SciPy to the last digit
     transform = fft.rfft((x - x.mean()) * (window * (1.0 / np.sqrt(strength * rate_Hz))))
@@ -152,3 +159,97 @@ def signal_memory_s(
     step_s = (t[-1] - t[0]) / (len(t) - 1)
     low, high = np.log(1e-3 * step_s), np.log(t[-1] - t[0])
     return float(np.exp(brentq(too_long, low, high) if too_long(high) > 0.0 else high))
+
+
+# Tests whether a record oscillates, with bounds that depend on the use.
+
+
+class Oscillation(StrEnum):
+    """Behaviour of a record, as tables and summaries name it.
+
+    Either `oscillating`, or the reason why the record does not count as such. steady: it hardly
+    varies. decaying: it varied much more before. no dominant frequency: its spectrum has no peak,
+    or it is too short. transit: it oscillates faster than the mode of interest. no period: it
+    oscillates without repeating a waveform. diverged: the run ended early.
+    """
+
+    OSCILLATING = "oscillating"
+    STEADY = "steady"
+    DECAYING = "decaying"
+    NO_FREQUENCY = "no dominant frequency"
+    TRANSIT = "transit"
+    NO_PERIOD = "no period"
+    DIVERGED = "diverged"
+
+
+@dataclass(frozen=True)
+class OscillationBounds:
+    """Bounds that a record must satisfy to count as oscillating.
+
+    The record is cut into `n_blocks` of time, and the last one is tested. spread: least standard
+    deviation of every state, in units of its mean. lasting: least ratio of the last block's
+    standard deviation to the first block's. min_periods: least number of periods in the whole
+    record. min_peak: least share of the first state's power at its dominant frequency. max_Hz:
+    highest dominant frequency.
+    """
+
+    spread: float
+    lasting: float
+    n_blocks: int = 2
+    min_periods: float = 0.0
+    min_peak: float = 0.0
+    max_Hz: float = np.inf
+
+
+# Bounds for any record. Fewer than four periods may be a drift. White noise has at most a tenth of
+# its power near the highest peak, the thruster's breathing mode two thirds.
+RECORDED = OscillationBounds(spread=0.01, lasting=0.5, min_periods=4.0, min_peak=0.2)
+# Bounds for a simulated current after its transient. It has no noise, so no peak is required, but
+# with some parameters it oscillates for a long time and finally decays.
+SIMULATED = OscillationBounds(spread=0.02, lasting=0.7, n_blocks=4)
+
+
+def oscillation(
+    t: Float[np.ndarray, " samples"],
+    states: Float[np.ndarray, "samples n_states"],
+    bounds: OscillationBounds = RECORDED,
+) -> Oscillation:
+    """Classify a record by the first bound that it violates; `oscillating` if it violates none."""
+    blocks = np.array_split(states, bounds.n_blocks)
+    if (relative_spread(blocks[-1]) < bounds.spread).any():
+        return Oscillation.STEADY
+    if has_decayed(blocks[-1], blocks[0], bounds.lasting).any():
+        return Oscillation.DECAYING
+    frequency, power = power_spectrum(t, states[:, 0])
+    peak_Hz = peak(frequency, power)
+    if peak_Hz * (t[-1] - t[0]) < bounds.min_periods:
+        return Oscillation.NO_FREQUENCY
+    if bounds.min_peak > 0.0:
+        near = np.abs(frequency - peak_Hz) <= max(PEAK_WIDTH * peak_Hz, 2.0 * frequency[1])
+        if power[near].sum() < bounds.min_peak * power.sum():
+            return Oscillation.NO_FREQUENCY
+    return Oscillation.TRANSIT if peak_Hz > bounds.max_Hz else Oscillation.OSCILLATING
+
+
+def relative_spread(
+    states: Float[np.ndarray, "samples n_states"],
+) -> Float[np.ndarray, " n_states"]:
+    """Standard deviation of every state divided by the absolute value of its mean."""
+    return states.std(axis=0) / np.maximum(np.abs(states.mean(axis=0)), np.finfo(float).tiny)
+
+
+def has_decayed(
+    states: Float[np.ndarray, "samples n_states"],
+    earlier: Float[np.ndarray, "_ n_states"],
+    share: float,
+) -> Bool[np.ndarray, " n_states"]:
+    """True for each state whose standard deviation is below `share` times that of `earlier`."""
+    below: np.ndarray = states.std(axis=0) < share * earlier.std(axis=0)
+    return below
+
+
+def relative_amplitude(
+    mean: Float[np.ndarray, " n_states"], std: Float[np.ndarray, " n_states"]
+) -> float:
+    """Root mean square over the states of standard deviation divided by absolute mean."""
+    return float(np.sqrt(np.square(std / zero_to_one(np.abs(mean))).mean()))

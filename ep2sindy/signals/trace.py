@@ -12,7 +12,12 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
-from ep2sindy.signals.spectrum import crossing_frequency, dominant_frequency, is_uniform
+from ep2sindy.signals.spectrum import (
+    crossing_frequency,
+    dominant_frequency,
+    is_uniform,
+    power_spectrum,
+)
 
 MIN_PERIODS = 6.0  # fewest periods in a record on which a free run can be judged
 
@@ -162,7 +167,7 @@ def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples
     lowest = float(x.min())
     if lowest > 0.0:
         return True
-    noise = float(np.sqrt(white_variance(t, x)))
+    noise = float(np.sqrt(white_variance(*power_spectrum(t, x))))
     explained = noise > 1e-3 * x.std() and lowest > -NOISE_BELOW * noise
     return bool(explained and x.mean() > 0.0 and (x <= 0.0).mean() <= SHARE_BELOW)
 
@@ -222,7 +227,7 @@ def _check_oscillation(signal: Trace) -> None:
             f"a trace must hold {MIN_PERIODS:g} periods or more: {name} holds about "
             f"{n_periods:.1f} in {duration}{doubt}; record longer, or crop less"
         )
-    is_noise = white_variance(signal.t, signal.x) > ALL_NOISE * signal.x.var()
+    is_noise = white_variance(*power_spectrum(signal.t, signal.x)) > ALL_NOISE * signal.x.var()
     if n_periods < MIN_PERIODS or (signal.cycle is None and is_noise):
         raise ValueError(
             f"a trace must oscillate: no period explains a quarter of the variance of {name} over "

@@ -11,9 +11,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.series import forecast_figure
-from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
-from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -50,14 +48,7 @@ def skill_of(
     """Skill of a model of measured states; None for a driven or empty model, or a short record."""
     if not starts or model.inputs or is_short(run, n_fitted) or not model.coef.any():
         return None
-    fitted = run.window(0, n_fitted)
-    estimator = tune_estimator(model, fitted, progress=progress)
-    with progress.stage(None, "", "width of the forecasts' bands"):
-        estimator = calibrate(estimator, fitted)
-    with progress.stage(starts, "start", "forecasts") as advance:
-        return forecast_skill(
-            model, run, n_fitted=n_fitted, starts=starts, estimator=estimator, advance=advance
-        )
+    return forecast_skill(model, run, n_fitted=n_fitted, starts=starts, progress=progress)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from ep2sindy.operating.records import OperatingRecord, point_label
 from ep2sindy.report.document import Equation, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
-from ep2sindy.signals.oscillation import Oscillation
+from ep2sindy.signals.spectrum import Oscillation
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.forecasts import skill_of
 from ep2sindy.studies.views import terms_text, with_error

@@ -36,8 +36,8 @@ from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, p
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.criteria import OtherSystem, Selection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
-from ep2sindy.signals.kalman import KalmanSmoother
-from ep2sindy.signals.spectrum import samples_in_periods
+from ep2sindy.signals.smoothers import KalmanSmoother
+from ep2sindy.signals.spectrum import power_spectrum, samples_in_periods
 from ep2sindy.studies.source import NO_ZONES, TELLING, Zones, told_roles
 from ep2sindy.studies.study import Count, Positive
 from ep2sindy.studies.views import (
@@ -139,7 +139,7 @@ class LivingSearch:
         """What the search sees of a record, and why, if that is its mean cycle."""
         if self.noise_limit is None or (cycle := find_cycle(train.t, train.states)) is None:
             return train, ""
-        white = np.sqrt([white_variance(train.t, x) for x in train.states.T])
+        white = np.sqrt([white_variance(*power_spectrum(train.t, x)) for x in train.states.T])
         noise = white / zero_to_one(cycle.std)
         if noise.max() <= self.noise_limit:
             return train, ""

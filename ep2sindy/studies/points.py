@@ -14,7 +14,7 @@ from ep2sindy.operating.file_names import FilePattern
 from ep2sindy.operating.records import OperatingRecord, name_point, point_label
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, collect
-from ep2sindy.signals.oscillation import Oscillation
+from ep2sindy.signals.spectrum import Oscillation
 from ep2sindy.studies.source import DivergedError, Source, amiss, is_simulation, quiet
 from ep2sindy.studies.study import Check, Deferred
 

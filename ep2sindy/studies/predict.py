@@ -23,7 +23,7 @@ from ep2sindy.report.document import Block, Captioned, Picture, Result, Section,
 from ep2sindy.report.results import ResultTable
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
-from ep2sindy.signals.oscillation import Oscillation
+from ep2sindy.signals.spectrum import Oscillation
 from ep2sindy.studies.forecasts import TypicalSkill
 from ep2sindy.studies.law_tables import (
     LawModel,

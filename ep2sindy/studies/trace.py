@@ -18,13 +18,7 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
 from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.discovery.one_signal import (
-    SignalDiscovery,
-    SignalSearch,
-    choose_attempt,
-    count_fitted,
-    evaluate,
-)
+from ep2sindy.discovery.one_signal import SignalDiscovery, SignalSearch
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.discovery.signal_unknowns import HiddenStates, fit_offset
 from ep2sindy.figures.fronts import front_figure
@@ -48,7 +42,7 @@ from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, p
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Once
 from ep2sindy.signals.attractor import find_cycle
-from ep2sindy.signals.embedding import Chosen, Delays, LogRate, Rate
+from ep2sindy.signals.embedding import Delays, Embedded, LogRate, Rate
 from ep2sindy.signals.trace import Trace, prepare_signal
 from ep2sindy.studies.forecasts import forecast_errors, forecast_picture, forecast_section
 from ep2sindy.studies.library_result import (
@@ -69,6 +63,11 @@ from ep2sindy.studies.views import (
     interval_table,
     intervals,
     rollout_tables,
+)
+
+NOT_EXPLAINED = (
+    "no equations of the signal and states that nobody measured explain it to its noise and live: "
+    "states are made by smoothing"
 )
 
 PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
@@ -117,7 +116,7 @@ class Study:
     def _search(self) -> SignalSearch:
         return SignalSearch(
             self.method, self.embedding, self.n_states, self.harmonics, self.degree,
-            self.functions, self.function_degree,
+            self.functions, self.function_degree, self.held_out,
         )  # fmt: skip
 
     def compute(self, run: Run) -> Outcome:
@@ -131,15 +130,13 @@ class Study:
             run.say(f"{signal.name}: {text}")
         for text in signal.advice:
             run.warn(text)
-        n_fitted = count_fitted(signal, self.held_out)
-        past = signal.window(0, n_fitted)
-        attempts = self._search.attempts(
-            past, signal, seed=run.seed, progress=run.watch, say=run.say, once=once
-        )
-        best = choose_attempt(attempts)
-        if isinstance(best.chosen.embedding, Rate | Delays) and (hint := lost_mean(signal)):
+        tested = self._search.find(signal, seed=run.seed, progress=run.watch, once=once)
+        embedding = tested.best.states.embedding
+        if self.embedding == "auto" and not isinstance(embedding, HiddenStates):
+            run.say(NOT_EXPLAINED)
+        if isinstance(embedding, Rate | Delays) and (hint := lost_mean(signal)):
             run.warn(hint)
-        return Outcome(evaluate(signal, n_fitted, attempts, progress=run.watch))
+        return Outcome(tested)
 
     def _signal(self, data: Trajectory) -> Trace:
         return prepare_signal(data, decimate=self.decimate, detrend=self.detrend)
@@ -150,12 +147,11 @@ class Study:
             return signal
         names = LogRate().names(signal.name)
         library = self._search.library(names, (), max(2, self.degree))
-        past = signal.window(0, count_fitted(signal, self.held_out))
-        found = fit_offset(past, library, self._search.by_trajectories, run.watch, once)
-        moved = self._signal(replace(data, states=data.states + found.value))
+        past, method = self._search.fitted_part(signal), self._search.by_trajectories
+        value, low, high = fit_offset(past, library, method, run.watch, once)
+        moved = self._signal(replace(data, states=data.states + value))
         words = (
-            f"offset of {found.value:.4g} {signal.unit} fitted and added (95 %: {found.low:.4g} to "
-            f"{found.high:.4g})"
+            f"offset of {value:.4g} {signal.unit} fitted and added (95 %: {low:.4g} to {high:.4g})"
         )
         return replace(moved, done=(*moved.done, words))
 
@@ -210,8 +206,8 @@ class Outcome:
     tested: SignalDiscovery
 
     @property
-    def chosen(self) -> Chosen:
-        return self.tested.best.chosen
+    def chosen(self) -> Embedded:
+        return self.tested.best.states
 
     @property
     def found(self) -> Discovery:
@@ -240,47 +236,22 @@ class Outcome:
         return self.found.model
 
     @property
-    def is_held_out(self) -> bool:
-        return self.tested.skill is not None
-
-    @property
-    def where(self) -> str:
-        """What the model was run over, in words."""
-        return "held-out record" if self.is_held_out else "whole record, too short to hold out"
-
-    @property
-    def words(self) -> str:
-        return self.run.words(seen=not self.is_held_out, misfit=self.found.misfit)
-
-    @property
     def searched(self) -> list[str]:
-        return self.chosen.embedded.searched
-
-    @property
-    def data_frequency(self) -> str:
-        cycle = find_cycle(self.tested.measured.t, self.tested.measured.states[:, :1])
-        frequency_Hz = cycle.frequency_Hz if cycle else float("nan")
-        return self.run.rollout.clock.frequency_text(frequency_Hz)
+        return self.chosen.searched
 
     def models(self) -> dict[str, SparseModel]:
         return {"trace": self.model}
 
     def tables(self) -> dict[str, pd.DataFrame]:
         fronts = {f"front_{state}": self._front(state).csv() for state in self.searched}
-        samples = dict(
-            zip(self.tested.states.state_names, self.tested.states.states.T, strict=True)
-        )
+        run, skill = self.tested.states, self.tested.skill
+        samples = dict(zip(run.state_names, run.states.T, strict=True))
         return {
             **fronts,
             **rollout_tables(self.tested.measured, {"trace": self.run}),
-            "states": pd.DataFrame({"t_s": self.tested.states.t, **samples}),
+            "states": pd.DataFrame({"t_s": run.t, **samples}),
             "coefficients": coefficients(self.models(), heading="model"),
-            **(
-                {}
-                if self.tested.skill is None
-                else {"forecasts": forecast_errors(self.tested.skill)}
-            ),
-        }
+        } | ({} if skill is None else {"forecasts": forecast_errors(skill)})
 
     def _front(self, state: str) -> ResultTable[CandidateRow]:
         front = self.found.fronts[state]
@@ -313,25 +284,21 @@ class Outcome:
             file="trace",
             picture="free_run",
             more=[Text(caution, warning=True)] if caution else [],
-            where=f"the {self.where}",
-            seen=not self.is_held_out,
+            where=self.tested.where,
+            seen=not self.tested.is_held_out,
             misfit=self.found.misfit,
         )
 
     def sections(self) -> list[Section]:
         forecasts = [] if self.tested.skill is None else [forecast_section(self.tested.skill)]
-        said = [self._search_section()]
+        search, name = [self._search_section()], self.tested.signal.name
         if (estimate := self.found.estimate) is not None:
-            tested = self.found.noise_test.tested
-            said.append(
-                estimate_section(
-                    self.tested.signal.name, estimate, self.tested.states, of_model=tested
-                )
-            )
-        return [self._signal_section(), *said, self._living_section(), *forecasts]
+            of_model = self.found.noise_test.tested
+            search.append(estimate_section(name, estimate, self.tested.states, of_model=of_model))
+        return [self._signal_section(), *search, self._living_section(), *forecasts]
 
     def _signal_section(self) -> Section:
-        signal, embedded = self.tested.signal, self.chosen.embedded
+        signal, embedded = self.tested.signal, self.chosen
         names = self.tested.states.state_names
         made = f"{self.chosen.embedding.says}, {', '.join(names[:-1])} and {names[-1]}"
         per_period = signal.period_s / self.tested.states.dt_s
@@ -379,7 +346,7 @@ class Outcome:
             blocks.append(display_equation(model, state, clock, lead=exact))
         blocks += interval_table(model, self.searched, clock)
         rows = ResultTable({"model": self}, FREE_RUN).upright("")
-        blocks.append(Table(rows, title=f"run freely from one sample over the {self.where}"))
+        blocks.append(Table(rows, title=f"run freely from one sample over {self.tested.where}"))
         blocks += [Text(text, warning=warn) for text, warn in self._stability()]
         return Section("Living model", [*blocks, *pictures(["free_run", "plane", "waveform"])])
 
@@ -404,7 +371,7 @@ class Outcome:
                 "embedding": type(self.chosen.embedding).__name__,
                 "n_states": self.tested.best.n_states,
                 "reason": self.chosen.reason,
-                "noise_std": self.chosen.embedded.noise_std,
+                "noise_std": self.chosen.noise_std,
                 "period_s": self.tested.signal.period_s,
             },
             "model": facts(self.model, MODEL) | {"intervals": intervals(self.model)},
@@ -421,13 +388,18 @@ class Outcome:
         return ResultTable([self], FREE_RUN).headline()
 
 
+def _data_frequency(tested: SignalDiscovery) -> str:
+    cycle = find_cycle(tested.measured.t, tested.measured.states[:, :1])
+    return tested.signal.clock.frequency_text(cycle.frequency_Hz if cycle else float("nan"))
+
+
 COMPARED = View.JSON | View.HEADLINE
 FREE_RUN: Metrics[Outcome] = [
     Metric("verdict", lambda o: o.run.text, View.JSON),
-    Metric("verdict", lambda o: o.words, View.SCREEN),
+    Metric("verdict", lambda o: o.tested.words, View.SCREEN),
     Metric("note", lambda o: o.found.note, View.JSON),
-    Metric("held_out", lambda o: o.is_held_out, View.JSON),
-    Metric("frequency of the data", lambda o: o.data_frequency, View.SCREEN),
+    Metric("held_out", lambda o: o.tested.is_held_out, View.JSON),
+    Metric("frequency of the data", lambda o: _data_frequency(o.tested), View.SCREEN),
     Metric("f_error", lambda o: o.run.f_error, View.ALL, "frequency error", percent(2)),
     Metric("amplitude_ratio", lambda o: o.run.amplitude_ratio[o.tested.signal.name], COMPARED),
     Metric(

@@ -16,13 +16,13 @@ from ep2sindy.runtime.files import fingerprint, sweep, writing
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import in_line, on_screen
 from ep2sindy.runtime.user_cache import cache_folder
-from ep2sindy.signals import oscillation, spectrum
+from ep2sindy.signals import spectrum
 from ep2sindy.thruster.axial.settings import to_json
 
 MADE_OF = "kept_for"  # attribute: the parameters of a kept result
 
 # Source text on which a kept result depends: this room, and what sets the status of a record.
-SOURCES = [Path(__file__).parent, *(Path(str(each.__file__)) for each in (oscillation, spectrum))]
+SOURCES = [Path(__file__).parent, Path(str(spectrum.__file__))]
 
 
 def read_or_run(

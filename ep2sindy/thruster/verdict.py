@@ -11,8 +11,7 @@ import xarray as xr
 from jaxtyping import Float
 from scipy.signal import find_peaks
 
-from ep2sindy.signals.oscillation import SIMULATED, oscillation
-from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.signals.spectrum import SIMULATED, dominant_frequency, oscillation
 from ep2sindy.thruster.constants import E_CHARGE
 from ep2sindy.thruster.parameters import OperatingPoint
 
