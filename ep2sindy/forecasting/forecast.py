@@ -1,8 +1,8 @@
 """Forecasts of a model, from the end of a record or from many starts along it, with bands.
 
-Bands are calibrated where they can be seen: the likeliest pushes are those that explain single
-steps. What a model misses lasts, however, over many steps, so its forecasts scatter more than such
-pushes say; and where a record is pushed hard in a few places alone, less.
+Bands are calibrated where they can be seen: the likeliest process noise is that which explains
+single steps. What a model misses lasts, however, over many steps, so its forecasts scatter more
+than such noise says; and where a record is moved hard in a few places alone, less.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ StatesOf = Callable[[Trajectory], Trajectory]
 # Starts of the forecasts whose bands are calibrated, draws of each, and how far they go.
 N_STARTS, N_DRAWS, PERIODS_AHEAD = 24, 60, 1.5
 TOLERANCE = 0.03  # deviation from the level at which a band counts as calibrated
-FACTORS = 10.0 ** np.arange(-2.0, 2.1, 0.25)  # of the likeliest pushes
+FACTORS = 10.0 ** np.arange(-2.0, 2.1, 0.25)  # of the likeliest process noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Forecast:
 
     t: (samples,) in s, the first one after the record's end. states: (samples, n_states), the
     median of the draws, in SI. draws: (draws, samples, n_states), runs from starts and with
-    coefficients drawn by their covariance, pushed at random as the record was; NaN where a run has
+    coefficients drawn by their covariance, under the record's process noise; NaN where a run has
     diverged. noise_std: (n_states,), of the sensor's noise; NaN for states that it does not show.
     """
 
@@ -109,8 +109,8 @@ def draw_forecasts(
         starts,
         coef,
         drive=drive,
-        push_std=estimator.noise.process,
-        push_step_s=estimator.problem.step_s,
+        process_std=estimator.noise.process,
+        process_step_s=estimator.problem.step_s,
         reach=estimator.problem.scale,
         rng=rng,
     )[:, 1:].reshape(len(ends), n_draws, times.shape[1], -1)
@@ -263,8 +263,8 @@ class RollingStarts:
         )
         return float(((low <= self.truth) & (self.truth <= high)).mean())
 
-    def with_pushes(self, factor: float) -> RollingStarts:
-        """The same with pushes larger by a factor."""
+    def scale_process(self, factor: float) -> RollingStarts:
+        """The same with process noise larger by a factor."""
         noise = replace(self.estimator.noise, process=factor * self.estimator.noise.process)
         return replace(self, estimator=replace(self.estimator, noise=noise))
 
@@ -278,10 +278,10 @@ def calibrate(
     seed: int = 0,
     progress: Progress = SILENT,
 ) -> StateEstimator:
-    """The estimator with pushes whose bands hold 90 % of the record that the model was fitted to.
+    """The estimator with process noise whose bands hold 90 % of the record that it was tuned on.
 
     run: that record. states_of: as for `forecast_skill`. Forecasts of up to one and a half periods
-    from its later half are counted. A estimator that is calibrated already, a driven model, and a
+    from its later half are counted. An estimator that is calibrated already, a driven model, and a
     record at unequal steps come back unchanged.
     """
     ahead = max(2, int(PERIODS_AHEAD * estimator.per_period))
@@ -292,13 +292,13 @@ def calibrate(
     rolling = RollingStarts(estimator, run, first, ahead)
 
     def coverage(factor: float) -> float:
-        pushed = rolling.with_pushes(factor)
-        return pushed.coverage(pushed.forecast(ends, N_DRAWS, seed), LEVEL)
+        scaled = rolling.scale_process(factor)
+        return scaled.coverage(scaled.forecast(ends, N_DRAWS, seed), LEVEL)
 
     with progress.stage(None, "", "width of the forecasts' bands"):
         ends = rolling.ends(states_of)
         if abs(coverage(1.0) - LEVEL) <= TOLERANCE:
             return estimator
-        # More pushes make wider bands.
+        # More process noise makes wider bands.
         above = bisect_left(FACTORS[1:-1], LEVEL, key=coverage) + 1
-    return rolling.with_pushes(float(FACTORS[above])).estimator
+    return rolling.scale_process(float(FACTORS[above])).estimator

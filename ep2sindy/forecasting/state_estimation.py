@@ -1,7 +1,7 @@
 """State estimation: states of a model along a record, from its samples and under process noise.
 
 A model follows a record apart from two errors: the noise of the samples, and process noise, a
-random push of every state at every step, which stands for all that the model does not describe.
+random move of every state at every step, which stands for all that the model does not describe.
 Their sizes are the most likely ones for the record that the model was fitted to. States are then
 fitted to samples by the model and under these errors: those of a window before a moment (filtering)
 or those of a whole record (smoothing).
@@ -55,7 +55,7 @@ class ModelNoise:
     """Standard deviations of the errors with which a model follows a record, in SI.
 
     samples: (n_states,), of the samples' noise; NaN for a state that is not measured.
-    process: (n_states,), of the push of every state in a mean step.
+    process: (n_states,), of the process noise of every state in a mean step.
     """
 
     samples: Float[np.ndarray, " n_states"]
@@ -137,7 +137,7 @@ class StateEstimator:
         return replace(own, t=own.t[kept], states=states, inputs=own.inputs[kept])
 
     def scaled_noise(self) -> tuple[np.ndarray, np.ndarray]:
-        """Noise of samples and pushes, scaled; states that are not measured get the mean of others.
+        """Both kinds of noise, scaled; states that are not measured get the mean of the others.
 
         The noise of the latter only sets how freely the first fits may leave the flow.
         """
@@ -167,8 +167,8 @@ def tune_estimator(
     """Estimate with what errors a model follows a record, usually the one that it was fitted to.
 
     run: has the measured states and the inputs of the model. measured: states whose samples count;
-    others that the run has were made from them. None means all that it has. Every state may be
-    pushed, also one whose equation is known to hold, such as x' = v: the others' errors come in
+    others that the run has were made from them. None means all that it has. Every state may have
+    process noise, also one whose equation is known to hold, such as x' = v: the others' errors come in
     through it. progress: True shows a bar.
     Raises ValueError for a run without an input or of under five samples, or measured states that
     the model lacks.

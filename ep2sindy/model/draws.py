@@ -1,4 +1,4 @@
-"""Many runs of one model that differ by chance: in start, in coefficients, and by random pushes."""
+"""Many runs of one model that differ by chance: in start, in coefficients, and by process noise."""
 
 from __future__ import annotations
 
@@ -59,15 +59,15 @@ def draw_runs(
     coef: Float[np.ndarray, "draws terms n_states"],
     *,
     drive: Curve | None = None,
-    push_std: Float[np.ndarray, " n_states"] | None = None,
-    push_step_s: float = 1.0,
+    process_std: Float[np.ndarray, " n_states"] | None = None,
+    process_step_s: float = 1.0,
     reach: Float[np.ndarray, " n_states"],
     rng: np.random.Generator | None = None,
 ) -> Float[np.ndarray, "draws samples n_states"]:
     """Integrate a model once for every draw, by classical Runge-Kutta steps between the samples.
 
-    drive: the inputs between these samples. push_std: standard deviation of the random push that
-    every state receives in push_step_s; None for none. reach: largest states expected, in SI. A run
+    drive: the inputs between these samples. process_std: standard deviation of the process noise of
+    every state in process_step_s; None for none. reach: largest states expected, in SI. A run
     that goes a hundred times farther has diverged, and is NaN from there on.
     """
     if len(t) < 2:  # of a run that ended at its start
@@ -77,13 +77,13 @@ def draw_runs(
         drive = None
     centre = VectorField.of(model, coef.mean(axis=0)[None])
     steps = _fine_enough(centre, starts.mean(axis=0), t, drive, bound)
-    pushes = None
-    if rng is not None and push_std is not None and push_std.any():
-        size = push_std * np.sqrt(np.diff(t) / push_step_s)[:, None]
+    moves = None
+    if rng is not None and process_std is not None and process_std.any():
+        size = process_std * np.sqrt(np.diff(t) / process_step_s)[:, None]
         drawn = size[:, None] * rng.standard_normal((len(size), *starts.shape))
-        pushes = np.ascontiguousarray(drawn.transpose(1, 0, 2)[:, None])
+        moves = np.ascontiguousarray(drawn.transpose(1, 0, 2)[:, None])
     fields, still = VectorField.of(model, coef), np.zeros(len(bound))
-    return run_many(fields, starts[:, None], steps, centre=still, reach=bound, pushes=pushes)[:, 0]
+    return run_many(fields, starts[:, None], steps, centre=still, reach=bound, moves=moves)[:, 0]
 
 
 def _fine_enough(

@@ -242,13 +242,13 @@ def _runge_kutta(table, product, target, weight, leads, weights, drive, h, x, sl
 
 @compiled(error_model="numpy")
 def run_many(
-    table, product, target, weight, first, leads, weights, starts, steps_s, drive, pushes,
+    table, product, target, weight, first, leads, weights, starts, steps_s, drive, moves,
     n_substeps, centre, reach,
 ):  # fmt: skip
     """Integrate many models from many starts by classical Runge-Kutta steps.
 
     first: (models + 1,), the entries of model m are those from first[m] to first[m + 1]. starts:
-    (models, windows, n); steps_s: (windows, steps); drive: (windows, steps, inputs, 3); pushes:
+    (models, windows, n); steps_s: (windows, steps); drive: (windows, steps, inputs, 3); moves:
     (models, windows, samples, n), added at every sample, or without samples. Returns the states
     (models, windows, samples, n) after every n_substeps steps; NaN from where a state is farther
     than reach (n,) from the centre (n,).
@@ -269,8 +269,8 @@ def run_many(
                     at, h = drive[w, step], steps_s[w, step]
                     _runge_kutta(*entries, leads, weights, at, h, x, slopes, columns)
                 for i in range(n):
-                    if pushes.shape[2]:
-                        x[i] += pushes[m, w, k, i]
+                    if moves.shape[2]:
+                        x[i] += moves[m, w, k, i]
                     bounded = bounded and abs(x[i] - centre[i]) <= reach[i]
                 if not bounded:
                     break

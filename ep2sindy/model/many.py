@@ -53,19 +53,19 @@ def run_many(
     *,
     centre: Float[np.ndarray, " d"],
     reach: Float[np.ndarray, " d"],
-    pushes: Float[np.ndarray, "models windows segments d"] | None = None,
+    moves: Float[np.ndarray, "models windows segments d"] | None = None,
 ) -> Float[np.ndarray, "models windows samples d"]:
     """States of every model from every start, the start included, at the samples.
 
     field: of several models. starts: of the windows, (windows, d), or for each model its own.
-    pushes: added at every sample after the start. A run has diverged once a state is farther than
+    moves: of process noise, added at every sample after the start. A run has diverged once a state is farther than
     `reach` from the centre, and is NaN from there on.
     """
     starts = np.array(np.broadcast_to(starts, (len(field.coef), *starts.shape[-2:])), order="C")
     route = _in_arrays if field.library.functions else _compiled
-    if pushes is None:
-        pushes = np.empty((*starts.shape[:2], 0, starts.shape[2]))
-    later = route(field, starts, steps, centre, reach, pushes)
+    if moves is None:
+        moves = np.empty((*starts.shape[:2], 0, starts.shape[2]))
+    later = route(field, starts, steps, centre, reach, moves)
     return np.concatenate([starts[:, :, None], later], axis=2)
 
 
@@ -75,7 +75,7 @@ def _compiled(
     steps: WindowSteps,
     centre: np.ndarray,
     reach: np.ndarray,
-    pushes: np.ndarray,
+    moves: np.ndarray,
 ) -> np.ndarray:
     from ep2sindy.model import kernels
 
@@ -84,7 +84,7 @@ def _compiled(
     paths: np.ndarray = kernels.run_many(
         np.array(table), product, target, weight, np.append(0, by_model.cumsum()),
         CLASSICAL.leads, CLASSICAL.weights, starts, np.array(steps.h, order="C"), steps.inputs,
-        pushes, steps.n_substeps, np.array(centre), np.array(reach),
+        moves, steps.n_substeps, np.array(centre), np.array(reach),
     )  # fmt: skip
     return paths
 
@@ -95,7 +95,7 @@ def _in_arrays(
     steps: WindowSteps,
     centre: np.ndarray,
     reach: np.ndarray,
-    pushes: np.ndarray,
+    moves: np.ndarray,
 ) -> np.ndarray:
     """`_compiled` for libraries with functions, which are evaluated for all runs at once."""
 
@@ -110,8 +110,8 @@ def _in_arrays(
             h = steps.h[:, k, None]
             x = step(rates, x, tuple(np.moveaxis(steps.inputs[:, k], 2, 0)), h)
             if (k + 1) % steps.n_substeps == 0:
-                if pushes.shape[2]:
-                    x = x + pushes[:, :, len(found)]
+                if moves.shape[2]:
+                    x = x + moves[:, :, len(found)]
                 inside = (np.abs(x - centre) <= reach).all(axis=2, keepdims=True)
                 x = np.where(inside, x, np.nan)
                 found.append(x)
