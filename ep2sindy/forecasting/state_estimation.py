@@ -168,8 +168,8 @@ def tune_estimator(
 
     run: has the measured states and the inputs of the model. measured: states whose samples count;
     others that the run has were made from them. None means all that it has. Every state may have
-    process noise, also one whose equation is known to hold, such as x' = v: the others' errors come in
-    through it. progress: True shows a bar.
+    process noise, also one whose equation is known to hold, such as x' = v: the others' errors come
+    in through it. progress: True shows a bar.
     Raises ValueError for a run without an input or of under five samples, or measured states that
     the model lacks.
     """

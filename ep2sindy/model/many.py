@@ -58,8 +58,8 @@ def run_many(
     """States of every model from every start, the start included, at the samples.
 
     field: of several models. starts: of the windows, (windows, d), or for each model its own.
-    moves: of process noise, added at every sample after the start. A run has diverged once a state is farther than
-    `reach` from the centre, and is NaN from there on.
+    moves: of process noise, added at every sample after the start. A run has diverged once a state
+    is farther than `reach` from the centre, and is NaN from there on.
     """
     starts = np.array(np.broadcast_to(starts, (len(field.coef), *starts.shape[-2:])), order="C")
     route = _in_arrays if field.library.functions else _compiled
