@@ -126,7 +126,7 @@ def test_a_delay_competes_with_products_of_one_degree_more(draw: str, lacks: boo
     )
     problem = replace(problem, widen=lambda: wider)
     found = from_smooth(problem, None)
-    late = explanation._align(found, 7)
+    late = explanation._align(found)
     if lacks:  # whatever delay its false equations may have
         late = found
     assert late is not None

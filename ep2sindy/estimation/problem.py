@@ -366,12 +366,10 @@ def scale_problem(
     """
     states = runs[0].state_names
     inputs = [name for name in runs[0].input_names if name in library.variables]
-    told = {name: (course,) for name, course in check_courses(courses or {}, inputs).items()}
-    allowed = {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | told
+    allowed = _allow_courses(runs, inputs, courses or {})
     names, known = [*states, *inputs], terms or {}
     over = (roles.with_known_terms(library, states) if roles else library).over(names)
-    samples = np.concatenate([run.columns(names) for run in runs])
-    size = zero_to_one(np.sqrt(np.square(samples).mean(axis=0)))
+    size = _rms(runs, names)
     step_s = mean_step(*(run.t for run in runs))
     scaled, numbers = over.scaled(size)
     processes = roles.processes(library, states) if roles else []
@@ -403,6 +401,19 @@ def scale_problem(
         monitor=monitor or SearchMonitor(),
     )
     return problem.of(runs)
+
+
+def _rms(runs: Sequence[Trajectory], names: Sequence[str]) -> Float[np.ndarray, " variables"]:
+    samples = np.concatenate([run.columns(names) for run in runs])
+    return zero_to_one(np.sqrt(np.square(samples).mean(axis=0)))
+
+
+def _allow_courses(
+    runs: Sequence[Trajectory], inputs: Sequence[str], courses: Mapping[str, str]
+) -> dict[str, tuple[str, ...]]:
+    """Courses of every input that its samples allow, or the one that is told."""
+    told = {name: (course,) for name, course in check_courses(courses, inputs).items()}
+    return {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | told
 
 
 def by_run(
