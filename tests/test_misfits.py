@@ -130,7 +130,7 @@ def test_a_delay_competes_with_products_of_one_degree_more(draw: str, lacks: boo
     if lacks:  # whatever delay its false equations may have
         late = found
     assert late is not None
-    assert ("up to degree 3" in explanation._lacks_terms(late, 7)) == lacks
+    assert ("up to degree 3" in explanation._lacks_terms(late)) == lacks
 
 
 def test_a_delay_at_three_standard_errors_is_none() -> None:
