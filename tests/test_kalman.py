@@ -3,7 +3,7 @@ import pytest
 from scipy.linalg import cho_factor, cho_solve, null_space
 
 from ep2sindy.signals import smoothers
-from ep2sindy.signals.smoothers import KalmanSmoother, Smoother, WienerProcess, most_likely_ratio
+from ep2sindy.signals.smoothers import KalmanSmoother, Smoother, WienerProcess, most_likely_ratios
 from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 
 SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
@@ -170,7 +170,7 @@ def test_smoother_protocol_returns_the_parts_of_the_estimate() -> None:
 def test_the_ratio_found_is_the_most_likely() -> None:
     run = lorenz().trajectory(noise=0.05, rng=np.random.default_rng(2))
     process, values = WienerProcess.at(np.ones(499)), run.states[:500, :1]
-    found = most_likely_ratio(process, values)
+    (found,) = most_likely_ratios(process, values)
     fine = np.arange(-14.0, 4.0, 0.02)
     best = fine[np.argmax([process.likelihood(values, 10.0**r)[0][0] for r in fine])]
     assert found == pytest.approx(best, abs=0.02)

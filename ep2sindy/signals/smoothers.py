@@ -8,7 +8,7 @@ one. The start is diffuse: of the samples only the third differences count, whic
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -350,12 +350,15 @@ class KalmanSmoother:
         steps, step_s = scale_steps(t, values, MIN_SAMPLES)
         process, spread = WienerProcess.at(steps), values.max(axis=0) - values.min(axis=0)
         columns = (values - values[0]) / zero_to_one(spread)
-        signal, (noise_std, ratios) = np.empty(values.shape), np.empty((2, len(spread)))
-        limits, given = (LOG10_RATIO_MIN, LOG10_RATIO_MAX), self.log10_ratio
-        bounds = ratio_bounds(self.finest_s, self.coarsest_s, step_s, limits)
+        signal, noise_std = np.empty(values.shape), np.empty(len(spread))
+        if self.log10_ratio is None:
+            limits = (LOG10_RATIO_MIN, LOG10_RATIO_MAX)
+            bounds = ratio_bounds(self.finest_s, self.coarsest_s, step_s, limits)
+            ratios = most_likely_ratios(process, columns, *bounds)
+        else:
+            ratios = np.full(len(spread), self.log10_ratio)
         for j in range(len(spread)):
             column = columns[:, [j]]
-            ratios[j] = most_likely_ratio(process, column, *bounds) if given is None else given
             signal[:, [j]] = process.signal(column, 10.0 ** ratios[j])
             noise_std[j] = np.sqrt(process.likelihood(column, 10.0 ** ratios[j])[1][0])
         return KalmanEstimate(
@@ -393,20 +396,24 @@ def ratio_bounds(
     return lowest, max(lowest, highest)
 
 
-def most_likely_ratio(
+def most_likely_ratios(
     process: WienerProcess,
-    column: Float[np.ndarray, "samples one"],
+    columns: Float[np.ndarray, "samples columns"],
     lowest: float = LOG10_RATIO_MIN,
     highest: float = LOG10_RATIO_MAX,
-) -> float:
-    """log10 of the noise ratio of greatest likelihood, within bounds."""
+) -> Float[np.ndarray, " columns"]:
+    """log10 of the noise ratio of greatest likelihood for each column, within bounds."""
+    if not columns.shape[1]:
+        return np.empty(0)  # LAPACK takes no empty right-hand sides
 
-    def misfit(log10_ratio: float) -> float:
-        return -float(process.likelihood(column, 10.0**log10_ratio)[0][0])
+    def misfit(j: int, log10_ratio: float) -> float:
+        return -float(process.likelihood(columns[:, [j]], 10.0**log10_ratio)[0][0])
 
     decades = np.append(np.arange(lowest, highest, 1.0), highest)
-    on_grid = np.array([misfit(decade) for decade in decades])
-    return least_beside_grid(misfit, decades, on_grid, tolerance=LOG10_RATIO_TOLERANCE)
+    # One factorisation of a decade serves all columns.
+    on_grid = np.array([-process.likelihood(columns, 10.0**decade)[0] for decade in decades])
+    beside = partial(least_beside_grid, tolerance=LOG10_RATIO_TOLERANCE)
+    return np.array([beside(partial(misfit, j), decades, own) for j, own in enumerate(on_grid.T)])
 
 
 def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> None:
