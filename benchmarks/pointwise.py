@@ -93,7 +93,7 @@ def study(field: xr.Dataset, workers: Workers = ONE_BY_ONE) -> xr.Dataset:
 def read_all(field: xr.Dataset) -> None:
     """What reading costs without any search."""
     for block in blocks_of(field, BLOCK_POINTS):
-        field.isel(block.slices).load()
+        field.isel(block).load()
 
 
 def rows_at(field: xr.Dataset, iz: int, ir: int) -> RegressionRows:
