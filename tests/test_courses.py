@@ -106,7 +106,7 @@ def test_many_models_at_once_take_set_inputs_as_held() -> None:
     run = lag("held", hold=20, seed=5)
     starts, curve = np.array([0, 150]), curve_through(run.t, run.inputs, [None])
     steps = WindowSteps.along(run.t, curve, starts, 201, n_substeps=2)
-    field = VectorField.of(LAG, LAG.coef[None])
+    field = VectorField.of(LAG.library, ["x", "u"], LAG.coef[None])
     paths = run_many(field, run.states[starts], steps, centre=np.zeros(1), reach=np.full(1, 20.0))
     np.testing.assert_allclose(paths[0, 0], run.states[:201], atol=1e-6)
 

@@ -20,7 +20,7 @@ def paths_from(
     curve = curve_through(run.t, run.inputs, [None]) if model.inputs else None
     steps = WindowSteps.along(run.t, curve, starts, n_samples, n_substeps=2)
     centre, reach = run.states.mean(axis=0), 20.0 * run.states.std(axis=0)
-    field = VectorField.of(model, coefs)
+    field = VectorField.of(model.library, [*model.states, *model.inputs], coefs)
     return run_many(field, run.states[starts], steps, centre=centre, reach=reach)
 
 

@@ -175,7 +175,7 @@ def test_many_compiled_runs_are_runge_kutta_steps_to_the_last_digit() -> None:
     coef = system.model.coef[..., None] * (1.0 + 0.1 * rng.standard_normal((1, 1, 5)))
     start = np.array([[1.0, 0.5, 40.0], [0.5, 1.0, 3.0]])
     steps = WindowSteps(np.full((3, 158), 0.05), np.empty((3, 158, 0, 3)), n_substeps=2)
-    field = VectorField.of(system.model, coef.transpose(2, 0, 1))
+    field = VectorField.of(system.model.library, system.model.states, coef.transpose(2, 0, 1))
     paths = run_many(field, start.T, steps, centre=np.zeros(2), reach=np.full(2, 20.0))
     for m in range(5):
 

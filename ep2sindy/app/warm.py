@@ -123,7 +123,8 @@ def _refinement() -> None:
         method = ep.refinement.MultipleShooting(step=step)
         ep.refine(system.model, system.trajectory(), window=20, n_windows=2, method=method)
     steps = WindowSteps.along(np.array([0.0, 0.1]), None, np.zeros(1, np.int64), 2, 1)
-    field = VectorField.of(system.model, system.model.coef[None])
+    model = system.model
+    field = VectorField.of(model.library, model.states, model.coef[None])
     run_many(field, np.ones((1, 2)), steps, centre=np.ones(2), reach=np.ones(2))
 
 

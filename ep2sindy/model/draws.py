@@ -75,14 +75,16 @@ def draw_runs(
     bound = BLOW_UP * zero_to_one(reach)
     if drive is not None and not model.inputs:
         drive = None
-    centre = VectorField.of(model, coef.mean(axis=0)[None])
+    variables = [*model.states, *model.inputs]
+    centre = VectorField.of(model.library, variables, coef.mean(axis=0)[None])
     steps = _fine_enough(centre, starts.mean(axis=0), t, drive, bound)
     moves = None
     if rng is not None and process_std is not None and process_std.any():
         size = process_std * np.sqrt(np.diff(t) / process_step_s)[:, None]
         drawn = size[:, None] * rng.standard_normal((len(size), *starts.shape))
         moves = np.ascontiguousarray(drawn.transpose(1, 0, 2)[:, None])
-    fields, still = VectorField.of(model, coef), np.zeros(len(bound))
+    fields = VectorField.of(model.library, variables, coef)
+    still = np.zeros(len(bound))
     return run_many(fields, starts[:, None], steps, centre=still, reach=bound, moves=moves)[:, 0]
 
 

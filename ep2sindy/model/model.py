@@ -348,7 +348,7 @@ class SparseModel:
     @cached_property
     def field(self) -> VectorField:
         """The right-hand side over the states, then the inputs, and its derivatives, in SI."""
-        return VectorField.of(self)
+        return VectorField.of(self.library, [*self.states, *self.inputs], self.coef)
 
 
 def _smooth_samples(

@@ -72,18 +72,15 @@ class VectorField:
 
     @staticmethod
     def of(
-        model: Equations, coefs: Float[np.ndarray, "models terms d"] | None = None
+        library: Library, variables: Sequence[str], coef: Float[np.ndarray, "*models terms d"]
     ) -> VectorField:
-        """Equations of a model over its states, then its inputs, with the terms in use alone.
+        """Equations over their variables (states, then inputs), with the terms in use alone.
 
-        Functions of other terms may be undefined at the states of the model. coefs: other
-        coefficients of these terms; None takes the model's.
+        Functions of other terms may be undefined at the states of the model.
         """
-        coef = model.coef if coefs is None else coefs
         used = np.asarray(coef.reshape(-1, *coef.shape[-2:]).any(axis=(0, 2)))
         used[0] |= not used.any()  # a library needs a term
-        library = model.library.take(used).over([*model.states, *model.inputs])
-        return VectorField(library, coef[..., used, :])
+        return VectorField(library.take(used).over(variables), coef[..., used, :])
 
     @property
     def n_states(self) -> int:

@@ -287,7 +287,9 @@ class FreeRunScore:
                 points_per_batch=together,
                 advance=advance,
             )
-        fields = VectorField.of(first, np.stack([model.coef for model in refined.models]))
+        variables = [*first.states, *first.inputs]
+        coefs = np.stack([model.coef for model in refined.models])
+        fields = VectorField.of(first.library, variables, coefs)
         judged, densities = [], densities_of(records.runs[0], first.states)
         with progress.stage(None, "run", "free runs over the fold") as advance:
             for t, paths, cycle in run_over(fields, fold.held, records, self.n_starts):
