@@ -119,7 +119,7 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     samples, off = (problem.split(each) for each in (record.values, record.values - fit.path))
     # Slow residuals of a signal's size tell that the model ignores the signal.
     ignored = (memory > SLOW) & (std > LARGE * record.samples.std(axis=0))
-    lasts = _lasts_as_noise(unit, samples, off, std, memory, problem.n_samples)
+    lasts = _lasts_as_noise(unit, samples, off, std, memory, float(problem.n_samples))
     believed = shows & lasts & ~ignored & ~patterned
     std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
