@@ -105,7 +105,7 @@ def choose(
     combinations that have the terms of the relations count. The one of least summed score wins,
     and all equations are fitted at once.
     Raises ValueError for relations that no combination has the terms for, or that tie so many
-    states to each other that their combinations exceed a million.
+    states to each other that their combinations exceed a hundred thousand.
     """
     decision = rule.decide(fronts, task, progress=progress)
     if decision.model is not None:

@@ -130,7 +130,6 @@ class ODE(nn.Module):
 
     basis: torch.Tensor
     offset: torch.Tensor
-    of_rates: torch.Tensor
     drive: Drive
 
     def __init__(
@@ -145,9 +144,6 @@ class ODE(nn.Module):
         self.library, self.n_states = library, n_states
         self.register_buffer("basis", basis)
         self.register_buffer("offset", offset)
-        rows = slice(n_states)  # the products that rates alone need
-        used = (basis[:, rows] != 0.0).any(dim=-1) | (offset[:, rows] != 0.0)
-        self.register_buffer("of_rates", torch.nonzero(used.any(dim=0).any(dim=0))[:, 0])
         self.scaling = nn.Parameter(basis.new_ones((len(basis), basis.shape[-1])))
         self.correction = correction
 
@@ -177,8 +173,18 @@ class ODE(nn.Module):
         return 1 + self.n_states + self.n_free
 
     @cached_property
-    def _library_of_rates(self) -> Library:
-        return self.library.take(self.of_rates.cpu().numpy())
+    def _factors(self) -> torch.Tensor:
+        """Columns that every product multiplies, (degree, products), on the module's device."""
+        return torch.tensor(self.library.table.T, device=self.basis.device)
+
+    @cached_property
+    def _of_rates(self) -> tuple[Library, torch.Tensor, torch.Tensor]:
+        """The products that the rates alone need: library, factors, and places among all."""
+        rows = slice(self.n_states)
+        used = (self.basis[:, rows] != 0.0).any(dim=-1) | (self.offset[:, rows] != 0.0)
+        places = torch.nonzero(used.any(dim=0).any(dim=0))[:, 0]
+        library = self.library.take(places.cpu().numpy())
+        return library, torch.tensor(library.table.T, device=self.basis.device), places
 
     def take(self, points: torch.Tensor) -> ODE:
         """Module of some of the points, with scalings of one, without drive or correction."""
@@ -202,14 +208,14 @@ class ODE(nn.Module):
         x: (points, n_states, batch). One gather and product evaluates every distinct product that
         is needed, one matmul all columns.
         """
-        library, weights = self.library, self.weights(n_columns)
+        library, factors, weights = self.library, self._factors, self.weights(n_columns)
         if n_columns == 1:
-            library, weights = self._library_of_rates, weights[:, :, self.of_rates]
+            library, factors, places = self._of_rates
+            weights = weights[:, :, places]
         columns = torch.cat([x, inputs, torch.ones_like(x[:, :1])], dim=1)
         columns = library.with_functions(columns, axis=1)
-        first, *others = torch.tensor(library.table.T, device=x.device)
-        products = columns.index_select(1, first)
-        for rows in others:
+        products = columns.index_select(1, factors[0])
+        for rows in factors[1:]:
             products = products * columns.index_select(1, rows)
         found = torch.bmm(weights, products)
         return found.view(len(x), n_columns, self.n_states, x.shape[-1])
@@ -233,11 +239,11 @@ class ODE(nn.Module):
             tangents[:, n:] += found[:, 1 + n :]
             found = whole
         if self.correction is not None:
+            assert z.shape[1] == 1, "a correction has no tangents, which only autograd could give"
             found = found + self._correct(x, inputs)
         return found if steps is None else found * steps[:, None]
 
     def _correct(self, x: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
-        """Rates of the correction; it has no tangents, which only autograd could give."""
         assert self.correction is not None
         rates: torch.Tensor = self.correction(torch.cat([x, inputs], dim=1)[0].T)
         return rates.T[None, None]

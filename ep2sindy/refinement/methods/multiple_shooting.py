@@ -202,14 +202,15 @@ class _Walk:
     def join(self, points: np.ndarray) -> None:
         """Close the gaps that are left, by the nodes alone; where it fails, all stays as it was."""
         self.damping[:] = 0.0
+        n, width = self.maps.shape[-2:]
         for _ in range(JOINING_STEPS):
             _, defect = gap_sizes(self._maps_of(points), self.nodes[points])
             is_open = self.finite[points] & ~self.finished[points] & (defect > JOINED)
             is_open = self.problem.agree(is_open, np.any)
             if not is_open.any():
                 break
-            n = self.maps.shape[-2]  # derivatives by the scalings are not needed any more
-            self.maps = np.concatenate([self.maps[..., :n], self.maps[..., -1:]], axis=-1)
+            if self.maps.shape[-1] == width:  # derivatives by the scalings are not needed any more
+                self.maps = np.concatenate([self.maps[..., :n], self.maps[..., -1:]], axis=-1)
             self.iterate(points[is_open], self.window, 0.0, hold=True)
 
     def iterate(
