@@ -24,8 +24,6 @@ from ep2sindy.signals.delay import Delay as Delay
 # Discover
 from ep2sindy.discovery.discover import discover as discover
 from ep2sindy.discovery.result import Discovery as Discovery
-from ep2sindy.operating.shared_support import discover_shared as discover_shared
-from ep2sindy.operating.shared_support import SharedDiscovery as SharedDiscovery
 from ep2sindy.discovery.pointwise import pointwise as pointwise
 from ep2sindy.estimation.estimate import estimate as estimate
 from ep2sindy.discovery.one_signal import from_one_signal as from_one_signal

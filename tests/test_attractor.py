@@ -178,7 +178,7 @@ def test_what_does_not_repeat_has_no_mean_cycle() -> None:
 
 @pytest.mark.parametrize("reach", [40.0, 3.0])  # in rad: over periods, and over half of one
 def test_triangles_are_those_of_reflections_also_where_samples_cluster(reach: float) -> None:
-    columns = _fourier_columns(np.linspace(0.0, reach, 400), 4)
+    columns, triangle = _fourier_columns(np.linspace(0.0, reach, 400), 4)
     plain = np.linalg.qr(columns, mode="r")
     signs = np.sign(np.diagonal(plain) * np.diagonal(_factorise(columns)))
     np.testing.assert_allclose(_factorise(columns), signs[:, None] * plain, rtol=1e-11, atol=1e-11)

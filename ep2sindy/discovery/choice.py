@@ -234,6 +234,12 @@ def fit_last(front: ParetoFront, candidate: Candidate) -> Candidate:
     return candidate if front.rows.noisy is None else reweight(front.rows, candidate)
 
 
+def as_in(model: SparseModel, candidate: Candidate) -> Candidate:
+    """A candidate with the coefficients that it has in a model."""
+    terms = model.terms(candidate.equation)
+    return replace(candidate, coef=np.array([terms.get(name, 0.0) for name in candidate.terms]))
+
+
 def assemble_model(
     library: Library,
     fits: Sequence[Candidate],

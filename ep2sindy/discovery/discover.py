@@ -4,23 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import IdentifiedEquations, judge_noise
+from ep2sindy.discovery.choice import IdentifiedEquations, as_in, judge_noise
 from ep2sindy.discovery.method import DiscoveryMethod, TrajectorySearch
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.library.roles import Roles
-from ep2sindy.model.model import SparseModel
-from ep2sindy.regression.front import Candidate
-from ep2sindy.runtime.progress import Progress, as_progress
+from ep2sindy.operating.law import NOTHING, Known
+from ep2sindy.operating.records import group_by_point, most_central, read_points
+from ep2sindy.runtime.parallel import Serial, Workers, collect
+from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_kind
+
+LawFunctions = int | Library  # the degree of polynomials of the parameters, or functions of them
 
 
 @one_thread()
@@ -29,6 +33,8 @@ def discover(
     library: Library | None = None,
     method: DiscoveryMethod | None = None,
     *,
+    law: LawFunctions | Sequence[LawFunctions] | None = None,
+    shared: bool = False,
     t: object = None,
     inputs: Sequence[str] = (),
     relations: Sequence[Relation | str] = (),
@@ -36,7 +42,9 @@ def discover(
     roles: Roles | None = None,
     hidden: Sequence[str] = (),
     exclude: Mapping[str, Sequence[str]] | None = None,
+    known: Known = NOTHING,
     seed: int | np.random.Generator = 0,
+    workers: Workers | None = None,
     progress: Progress | bool = False,
 ) -> Discovery:
     """Find sparse equations for every state of the runs.
@@ -54,8 +62,26 @@ def discover(
     states that nobody measured; they and their equations are found with the others', by a
     `TrajectorySearch`. exclude: for each state that is named, terms of the library that its
     equation may not have, such as {"x": ["x^2"]}. progress: True shows bars.
+
+    Runs whose `parameters` differ are of several operating points, and each point is searched
+    alone, by the workers; `points` of the result holds what was found there. shared: True finds one
+    support for all points, with coefficients of each. law: finds one support whose coefficients are
+    functions of the parameters: polynomials of this degree, or those of a library such as
+    ep.named_terms(["V"], ["1", "1/V"]); of a list, the functions whose law errs least at points
+    left out. Supports of several points are found by rows (`search_shared`), or under roles at the
+    most central point; a TrajectorySearch then refines the coefficients of every point on its
+    trajectories. known: coefficients that are known functions of the parameters, in SI, such as
+    {"n_n": {"1": {"mdot_mg_s": 4.6e22}}}.
     Raises ValueError for a relation, term or role that the library or the states do not have, roles
-    that the method cannot keep, runs whose states or units differ, states or samples that repeat.
+    that the method cannot keep, runs whose states or units differ, states or samples that repeat,
+    runs that lack parameters, or points that do not suffice for the law.
+
+    >>> growth = (0.5, 0.7, 0.9, 1.1)
+    >>> runs = [ep.lotka_volterra(a=a).trajectory(noise=0.02, rng=0) for a in growth]
+    >>> runs = [replace(run, parameters={"a": a}) for run, a in zip(runs, growth)]
+    >>> found = ep.discover(runs, method=ep.Regression(), law=1)
+    >>> found.law.at(a=0.8).terms("x")
+    {'x': 0.79..., 'x*y': -0.99...}
     """
     method = method or TrajectorySearch()
     trajectories = trajectories_of(runs, t=t, inputs=inputs, partial=True)
@@ -64,8 +90,52 @@ def discover(
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")
     terms, exclude = ({} if given is None else given for given in (terms, exclude))
     task = Task(trajectories, library, relations_of(relations), terms, roles, hidden, exclude)
+    points = group_by_point(task.runs, [v for v in library.variables if v not in hidden])
     rng, watch = np.random.default_rng(seed), as_progress(progress)
-    return _discovery(method.identify(task, rng=rng, progress=watch), method, trajectories)
+    together = shared or law is not None
+    if known and not together:
+        raise ValueError(
+            "known coefficients are functions of the parameters of several operating points: give "
+            "law=1 or shared=True as well, or relations=['x: y == 1'] for runs of one point"
+        )
+    if not together and len(points) == 1:
+        return _discover_point((task, rng), method=method, progress=watch)
+    if not trajectories[0].parameters:
+        raise ValueError(
+            "a law or a shared support needs runs of several operating points, which carry their "
+            "parameters: Trajectory(..., parameters={'V_D_V': 300.0}), or ep.read_runs("
+            "'runs/V{V_D_V}.csv'); runs without parameters came"
+        )
+    # This loads torch, only for several operating points.
+    from ep2sindy.discovery.several_points import PointsTask, join_points
+
+    values = read_points(
+        [own[0].parameters for own in points.values()], list(trajectories[0].parameters)
+    )
+    tasks = [replace(task, runs=own) for own in points.values()]
+    if not together:
+        pieces = list(zip(tasks, rng.spawn(len(tasks)), strict=True))
+        stage = watch.stage(len(pieces), "point", "discovery")
+        found = collect(workers or Serial(), partial(_discover_point, method=method), pieces, stage)
+        return join_points(dict(zip(points, found, strict=True)), values)
+    structure = None
+    if roles is not None:
+        structure = _discover_point((tasks[most_central(values)], rng), method=method).constraint
+        assert structure is not None
+        terms = {s: [t for state, t in structure.coefficients if state == s] for s in task.states}
+        task = replace(task, roles=None, terms=terms)
+    several = PointsTask(task, points, known, method, structure)
+    return several.discover(law, rng=rng, progress=watch)
+
+
+def _discover_point(
+    piece: tuple[Task, np.random.Generator],
+    *,
+    method: DiscoveryMethod,
+    progress: Progress = SILENT,
+) -> Discovery:
+    task, rng = piece
+    return _discovery(method.identify(task, rng=rng, progress=progress), method, task.runs)
 
 
 def _discovery(
@@ -76,7 +146,7 @@ def _discovery(
     model = replace(found.model, clock=runs[0].clock)
     return Discovery(
         fronts={front.equation: front for front in found.fronts},
-        chosen={each.equation: _as_in(found.model, each) for each in found.chosen},
+        chosen={each.equation: as_in(found.model, each) for each in found.chosen},
         model=replace(model, covariance=None) if test.misfit else model,
         method=method,
         ambiguities=found.ambiguities,
@@ -87,9 +157,3 @@ def _discovery(
         constraint=found.constraint,
         others=found.others,
     )
-
-
-def _as_in(model: SparseModel, candidate: Candidate) -> Candidate:
-    """A candidate with the coefficients that it has in a model."""
-    terms = model.terms(candidate.equation)
-    return replace(candidate, coef=np.array([terms.get(name, 0.0) for name in candidate.terms]))

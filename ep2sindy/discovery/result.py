@@ -24,6 +24,7 @@ from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.storage import read_as, read_stored
+from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.front import Candidate, Cloud, LeftOver, ParetoFront
 from ep2sindy.runtime.files import read_json, write_text
@@ -65,7 +66,9 @@ class Discovery:
     the assumptions (`Estimate.remarks`). estimate: of states and coefficients together, after a
     trajectory search. constraint: that the model's coefficients obey under relations or roles, to
     be handed to `refine`; None without. others: of a rule that runs whole systems, those of as many
-    free coefficients that live as well.
+    free coefficients that live as well. points: of runs at several operating points, the discovery
+    at each, by its label, such as "V_D_V=300, mdot_mg_s=5"; model and all else are then those of
+    the most central point. law: of all coefficients over the operating points, if it was asked for.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.discover(run)
@@ -86,6 +89,8 @@ class Discovery:
     estimate: Estimate | None = field(default=None, repr=False)
     constraint: Constraint | None = field(default=None, repr=False)
     others: Sequence[OtherSystem] = field(default=(), repr=False)
+    points: Mapping[str, Discovery] = field(default_factory=dict, repr=False)
+    law: OperatingLaw | None = field(default=None, repr=False)
 
     @property
     def scores(self) -> dict[str, Float[np.ndarray, " _candidates"]]:
@@ -147,6 +152,8 @@ class Discovery:
         parts = replace(self, fronts=without_rows)
         content = {"format": FORMAT, "model": json.loads(self.model.to_json())}
         content |= {name: _encode(getattr(parts, name)) for name in _PARTS}
+        content["points"] = {label: json.loads(own.to_json()) for label, own in self.points.items()}
+        content["law"] = None if self.law is None else json.loads(self.law.to_json())
         return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
     @staticmethod
@@ -161,7 +168,13 @@ class Discovery:
             if content["format"] != FORMAT:
                 raise ValueError(f"format {content['format']!r}")
             model = SparseModel.from_json(json.dumps(content["model"]))
-            found = Discovery(model=model, **{name: _decode(content[name]) for name in _PARTS})
+            law, points = content["law"], content["points"]
+            found = Discovery(
+                model=model,
+                **{name: _decode(content[name]) for name in _PARTS},
+                points={p: Discovery.from_json(json.dumps(own)) for p, own in points.items()},
+                law=None if law is None else OperatingLaw.from_json(json.dumps(law)),
+            )
             _check_parts(found)
             return found
 
@@ -180,13 +193,29 @@ class Discovery:
         left = len(self._notes()) - len(shown)
         tail = [*notes, *([f"... {left} more notes"] if left else [])]
         head = [self._headline(), *(sentences(self.note) if self.note else [])]
-        body = model_lines(self.model, self.constraint, n_lines=N_LINES - len(head) - len(tail))
+        n_lines = N_LINES - len(head) - len(tail)
+        body = model_lines(self.model, self.constraint, n_lines=n_lines)
+        if self.points:
+            body = self._lines_of_points()[:n_lines]
         return one_screen([*head, *body, *tail])
+
+    def _lines_of_points(self) -> list[str]:
+        if self.law is not None:
+            return self.law.text().splitlines()
+        return [
+            f"{label}: {line}"
+            for label, own in self.points.items()
+            for line in own.model.text().splitlines()
+        ]
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<li>{html.escape(each)}</li>" for each in self._notes())
         lines = [self._headline(), *([self.note] if self.note else [])]
+        if self.points:
+            lines += self._lines_of_points()
         head = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
+        if self.points:
+            return head
         return (
             head + model_html(self.model, self.constraint) + (f"<ul>{notes}</ul>" if notes else "")
         )
@@ -195,7 +224,22 @@ class Discovery:
         return [*self.remarks, *(each.message for each in self.ambiguities)]
 
     def _headline(self) -> str:
-        return f"Discovery of {len(self.chosen)} equations, chosen by {self.method.selection!r}"
+        where = ""
+        if self.points:
+            how = "one law" if self.law else "one support" if self._is_shared else "each alone"
+            where = f" at {len(self.points)} operating points, {how}"
+        n = len(self.model.states)
+        return f"Discovery of {n} equations{where}, chosen by {self.method.selection!r}"
+
+    @property
+    def _is_shared(self) -> bool:
+        """True if the supports of all points were compared together: their scores are one."""
+        first, *others = self.points.values()
+        return all(
+            np.array_equal(first.scores[state], own.scores.get(state))
+            for own in others
+            for state in first.scores
+        )
 
 
 # Fields of a Discovery that are stored beside the model, and the kind of each or of its values.

@@ -18,12 +18,13 @@ from scipy.optimize import nnls
 from scipy.special import ndtri
 
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.trajectory import point_label
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.relations import Constraint, Relation, constraint, relations_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_as, read_stored, texts_in
-from ep2sindy.operating.records import check_varying, point_label, read_point
+from ep2sindy.operating.records import check_varying, read_points
 from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.values import read_only
@@ -41,21 +42,22 @@ INSIDE = 1e-6  # tolerance of the hull, in ranges of the parameters
 class OperatingLaw:
     """One structure whose coefficients are functions of the operating point p: c(p) = W f(p).
 
-    It is fitted by rows of all points (`fit_law`: minimises the sum over p of |theta_p W f(p) -
-    x'_p|^2), by coefficients that were refined at each point (`OperatingFit.fit_law`), or by the
-    trajectories of all points (`refine_law`). Under relations c(p) = C W f(p) + D g(p), with C and
-    D of a `LawConstraint`; `coef` holds the whole, by the functions f and g.
+    `ep.discover(runs, law=1).law` is one; `PointFits.law` says how it is fitted. Under relations
+    c(p) = C W f(p) + D g(p), with C and D of a `LawConstraint`; `coef` holds the whole, by the
+    functions f and g.
     Assumes that the same terms act at every point, and coefficients smooth enough for f.
     functions: of the parameters. library: of the states. coefficients: (state, term) of each row of
     coef, in SI. covariance: of coef.ravel(), None if unknown. points: the operating points of the
-    fit, columns in the order of the functions' variables.
+    fit, columns in the order of the functions' variables. left_out: for each point, the error of
+    the rates that the law of the other points gives it, as a share of its rates; None if the points
+    do not suffice for a law without each of them.
     Source: Rudy et al. 2019, doi:10.1137/18M1191944, for coefficients that depend on a parameter.
 
     >>> functions, library = ep.polynomial(["a"], degree=1), ep.polynomial(["x"], degree=1)
     >>> pairs, points = (("x", "x"),), np.array([[0.0], [2.0]])
     >>> coef = np.array([[0.0, -1.0]])  # x' = -a x
     >>> law = ep.operating.OperatingLaw(functions, library, ("x",), pairs, coef, points)
-    >>> law.model_at({"a": 0.5}).text()
+    >>> law.at(a=0.5).text()
     "x' = -0.5 x"
     """
 
@@ -68,10 +70,18 @@ class OperatingLaw:
     covariance: Float[np.ndarray, "_ _"] | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
+    left_out: Float[np.ndarray, " points"] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "coef", read_only(self.coef))
         object.__setattr__(self, "points", read_only(self.points))
+        if self.left_out is not None:
+            object.__setattr__(self, "left_out", read_only(self.left_out))
+            if self.left_out.shape != (len(self.points),):
+                raise ValueError(
+                    f"left_out must have an error for each of {len(self.points)} points: shape "
+                    f"{self.left_out.shape} came"
+                )
         object.__setattr__(self, "units", MappingProxyType(dict(self.units)))
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
         shape = (len(self.coefficients), len(self.functions))
@@ -113,20 +123,21 @@ class OperatingLaw:
             found[state][term] = dict(zip(self.functions.names, row, strict=True))
         return found
 
-    def model_at(
-        self, parameters: Mapping[str, float], *, extrapolate: bool = False
-    ) -> SparseModel:
+    def at(self, *, extrapolate: bool = False, **parameters: float) -> SparseModel:
         """The model at an operating point, which need not be one of the fitted points.
 
-        Raises ValueError unless `parameters` has a finite value for each parameter of the law. Also
-        raises ValueError outside the convex hull of the fitted points, unless extrapolate=True.
+        parameters: a value for each parameter of the law, as in `at(V_D_V=330, mdot_mg_s=4.6)`.
+        Raises ValueError for other parameters, or values that are not finite. Also raises
+        ValueError outside the convex hull of the fitted points, unless extrapolate=True; the
+        model's provenance then says that it is extrapolated.
         """
-        values = read_point(self.parameters, parameters)
-        if not extrapolate and not in_hull(self.points, values):
+        (values,) = read_points([parameters], self.parameters)
+        label, inside = point_label(parameters), in_hull(self.points, values)
+        if not extrapolate and not inside:
             ends = self.points.min(axis=0), self.points.max(axis=0)
             ranges = zip(self.parameters, *ends, strict=True)
             raise ValueError(
-                f"{point_label(parameters)} lies outside the points that this law was fitted to, "
+                f"{label} lies outside the points that this law was fitted to, "
                 f"{', '.join(f'{name} {low:g} to {high:g}' for name, low, high in ranges)}: pass "
                 "extrapolate=True to read it off the law all the same"
             )
@@ -141,12 +152,13 @@ class OperatingLaw:
             used = order[at_point[order] != 0.0]
             spread = np.kron(np.eye(len(at_point)), functions)[used]
             covariance = spread @ self.covariance @ spread.T
-        provenance = {**self.provenance, "point": point_label(parameters)}
+        where = label if inside else f"{label}, extrapolated"
+        provenance = {**self.provenance, "point": where}
         return SparseModel(self.library, self.states, coef, self.units, provenance, covariance)
 
     def is_inside(self, parameters: Mapping[str, float]) -> bool:
         """True if a point lies in the convex hull of the fitted points."""
-        return in_hull(self.points, read_point(self.parameters, parameters))
+        return in_hull(self.points, read_points([parameters], self.parameters)[0])
 
     def intervals(self, *, level: float = 0.95) -> dict[tuple[str, str], dict[str, Any]]:
         """(state, term) -> function -> lower and upper bound of its factor, for Gaussian errors.
@@ -155,7 +167,8 @@ class OperatingLaw:
         """
         if self.covariance is None:
             raise ValueError(
-                "intervals need a covariance: this law has none; refine it over all trajectories"
+                "intervals need a covariance: this law has none, since its points do not suffice "
+                "for a law without each of them; add points, or take a law of fewer functions"
             )
         std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(self.coef.shape)
         reach = ndtri(0.5 + 0.5 * level) * std
@@ -168,7 +181,8 @@ class OperatingLaw:
     def text(self, *, digits: int = 3) -> str:
         """One line per coefficient: `n_i: n_n = 4.83e+03 + 12.1 V_d`.
 
-        The relations that the coefficients obey follow, each in full: `exact: n_n: 1 == 2.0 * V_d`.
+        The relations that the coefficients obey follow, each in full: `exact: n_n: 1 == 2.0 * V_d`,
+        and the errors at points left out.
         """
         numbers = self.numbers
         lines = []
@@ -177,7 +191,14 @@ class OperatingLaw:
             right = equation_text("c", factors, digits=digits).partition("= ")[2]
             lines.append(f"{state}: {term} = {right}")
         exact = self.provenance.get("exact", "")
-        return "\n".join([*lines, *(f"exact: {each}" for each in exact.split("; ") if each)])
+        lines += [f"exact: {each}" for each in exact.split("; ") if each]
+        if self.left_out is not None:
+            lines.append(
+                "points left out one at a time: the rates err by "
+                f"{100.0 * np.median(self.left_out):.2g} % in the median, "
+                f"{100.0 * self.left_out.max():.2g} % at most"
+            )
+        return "\n".join(lines)
 
     def __repr__(self) -> str:
         head = (
@@ -201,6 +222,7 @@ class OperatingLaw:
             "covariance": None if self.covariance is None else self.covariance.tolist(),
             "units": dict(self.units),
             "provenance": dict(self.provenance),
+            "left_out": None if self.left_out is None else self.left_out.tolist(),
         }
         return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
@@ -211,7 +233,7 @@ class OperatingLaw:
             content = read_json(text)
             if content["format"] != FORMAT:
                 raise ValueError(f"format {content['format']!r}")
-            known = content["covariance"]
+            known, left_out = content["covariance"], content["left_out"]
             return OperatingLaw(
                 functions=named_terms(*(names_in(content[k]) for k in ("parameters", "functions"))),
                 library=named_terms(*(names_in(content[k]) for k in ("variables", "library"))),
@@ -222,6 +244,7 @@ class OperatingLaw:
                 covariance=None if known is None else covariance_in(known),
                 units=texts_in(content["units"], "units"),
                 provenance=texts_in(content["provenance"], "provenance"),
+                left_out=None if left_out is None else np.array(left_out, dtype=np.float64),
             )
 
     def save(self, path: str | Path) -> None:
@@ -311,6 +334,7 @@ class LawConstraint:
         free: Float[np.ndarray, "free functions"],
         covariance: Float[np.ndarray, "_ _"] | None,
         how: str,
+        left_out: Float[np.ndarray, " points"] | None = None,
     ) -> OperatingLaw:
         """The law of all coefficients from that of the free ones, which obeys the relations.
 
@@ -336,6 +360,7 @@ class LawConstraint:
             covariance=None if covariance is None else spread @ covariance @ spread.T,
             units=model.units,
             provenance=provenance,
+            left_out=left_out,
         )
 
 
@@ -376,6 +401,16 @@ def constrain_law(
     if texts and not len(common.free):
         raise ValueError(f"a law needs a free coefficient: {texts} leave none; drop one of them")
     return LawConstraint(common, functions, np.column_stack([c.d for c in columns]), tuple(texts))
+
+
+def law_of_constraint(relations: Constraint, parameters: Sequence[str]) -> LawConstraint:
+    """The same relations, and the same known coefficients, at every operating point."""
+    return LawConstraint(
+        common=replace(relations, d=np.zeros(len(relations.d))),
+        functions=named_terms(list(parameters), ["1"]),
+        D=relations.d[:, None],
+        texts=(),
+    )
 
 
 def read_coefficients(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:

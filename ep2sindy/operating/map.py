@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import product
@@ -16,7 +16,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import CycleStability, limit_cycle
 from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.operating.records import OperatingRecord, read_points
+from ep2sindy.operating.records import OperatingRecord, Point, read_points
 from ep2sindy.signals.spectrum import SIMULATED, relative_amplitude
 
 # Least decay rate per period of a fixed point at which a diverging run counts as resting: e-fold in
@@ -51,7 +51,7 @@ class MapPoint:
     NaN without a cycle.
     """
 
-    parameters: Mapping[str, float]
+    parameters: Point
     inside: bool
     fate: Fate
     frequency_Hz: float
@@ -73,7 +73,7 @@ class MapPoint:
         }
 
 
-def map_points(points: Sequence[Mapping[str, float]], n: int) -> list[dict[str, float]]:
+def map_points(points: Sequence[Point], n: int) -> list[dict[str, float]]:
     """A grid over the ranges of the points, the last parameter varying fastest."""
     names = list(points[0])
     if len(names) > MAX_PARAMETERS:
@@ -87,21 +87,21 @@ def map_points(points: Sequence[Mapping[str, float]], n: int) -> list[dict[str, 
 
 
 def law_map(
-    law: OperatingLaw, records: Sequence[OperatingRecord], points: Sequence[Mapping[str, float]]
+    law: OperatingLaw, records: Sequence[OperatingRecord], points: Sequence[Point]
 ) -> list[MapPoint]:
     """The law's models at given operating points, each started from the nearest record."""
-    values = read_points(records)
+    values = read_points([record.parameters for record in records], law.parameters)
     scale = zero_to_one(np.ptp(values, axis=0))
     found = []
     for point in points:
-        at = np.array([point[name] for name in records[0].parameters])
+        at = np.array([point[name] for name in law.parameters])
         nearest = int(np.argmin(np.linalg.norm((values - at) / scale, axis=1)))
         found.append(_map_point(law, records[nearest], point))
     return found
 
 
-def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, float]) -> MapPoint:
-    model = law.model_at(point, extrapolate=True)
+def _map_point(law: OperatingLaw, record: OperatingRecord, point: Point) -> MapPoint:
+    model = law.at(extrapolate=True, **point)
     period_s = 1.0 / record.cycle.frequency_Hz
     start = record.run.states[record.slowest]
     mean, frequency_Hz, amplitude, second = record.cycle.mean, np.nan, np.nan, np.nan

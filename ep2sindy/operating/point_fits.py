@@ -1,381 +1,224 @@
-"""Fits at several operating points: quantities with intervals for each, and searches of terms."""
+"""One structure fitted to every operating point alone, and the law through these fits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.numbers import column_norms
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import AnyMethod, Regression
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.fit_rows import LawFit, fit_law, score_rows
-from ep2sindy.operating.law import read_coefficients
-from ep2sindy.operating.quantities import (
-    FITTED,
-    REFINED,
-    SEARCHED,
-    Fitted,
-    PointResult,
-    Quantity,
-    estimate_from_covariance,
-    estimate_from_draws,
-)
-from ep2sindy.operating.records import OperatingRecord, check_alike, name_point
-from ep2sindy.operating.shared_support import SharedDiscovery, discover_shared
-from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.operating.law import LawConstraint, OperatingLaw, make_basis, read_coefficients
 from ep2sindy.refinement.problem import RefinementSettings
-from ep2sindy.refinement.refine import refine
-from ep2sindy.refinement.windows import MIN_SAMPLES
-from ep2sindy.regression.bootstraps import Bootstraps, count_block_draws
-from ep2sindy.regression.constrained import WeightedEquation, constrained_fit, weigh_equations
-from ep2sindy.regression.gram_kernels import invert_gram
-from ep2sindy.regression.rows import Formulation, RegressionRows
-from ep2sindy.regression.searches import BestSubset
-from ep2sindy.runtime.parallel import Workers, collect
+from ep2sindy.refinement.refine import Refinement, refine
+from ep2sindy.regression.constrained import solve_constrained
+from ep2sindy.regression.pooled import Basis, invert_covariance, pool_coefficients
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.signals.spectrum import (
-    Oscillation,
-    dominant_frequency,
-    oscillation,
-    relative_spread,
-    samples_in_periods,
-)
 
-MIN_BLOCKS = 5  # fewest blocks in a record: with fewer, draws differ too little from one another
+Problems = Sequence[Sequence[RegressionRows]]  # for each point, the rows of every equation
 
-
-@dataclass(frozen=True)
-class Refining:
-    """Settings of the refinement: number of windows, periods of each, and most iterations."""
-
-    n_windows: int
-    periods: float
-    max_iter: int
-
-    def __post_init__(self) -> None:
-        if min(self.n_windows, self.max_iter) < 2 or self.periods <= 0.0:
-            raise ValueError(
-                "refinement needs two windows and iterations or more, and windows some length: "
-                f"n_windows={self.n_windows}, periods={self.periods}, max_iter={self.max_iter} came"
-            )
+LawFunctions = int | Library  # the degree of polynomials of the parameters, or functions of them
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
-    """One way to fit the terms: relations of the coefficients, and quantities read from them."""
+class PointFits:
+    """One structure fitted to every operating point alone, by rows or by trajectories.
 
-    constraint: Constraint
-    quantities: Mapping[str, Quantity]
+    A law z(p) = W f(p) of the free coefficients minimises the sum over the points p of
 
+        d_p^T I_p d_p  with  d_p = W f(p) - z_p
 
-@dataclass(frozen=True, eq=False)
-class PointStudy:
-    """Settings of the fits and searches at every operating point.
-
-    library: holds the terms of all cases, which are fitted to the rows of the formulation.
-    searched: the library in which the method searches for terms.
-    Raises ValueError for a quantity whose coefficient a case does not have.
+    where z_p are the point's own coefficients and I_p is their information: of rows it is
+    theta_p^T theta_p, so that this is least squares over the rows of all points, and of
+    trajectories the inverse covariance of the refinement. Directions that a point does not
+    determine leave the law free there. Every I_p is scaled so that all points weigh alike, whatever
+    the noise of their records.
+    Assumes that one law holds at all points.
+    points: (points, parameters). relations: that hold at every point. models: one per point.
+    information: of the free coefficients, in SI. how: "rows" or "trajectories".
     """
 
-    library: Library
-    cases: Mapping[str, Case]
-    bootstrap: TimeBootstrap
-    refining: Refining
-    searched: Library
-    method: AnyMethod
-    formulation: Formulation
-
-    def __post_init__(self) -> None:
-        for case in self.cases.values():
-            for quantity in case.quantities.values():
-                quantity.place(case.constraint, self.library)
+    parameters: tuple[str, ...]
+    points: Float[np.ndarray, "points parameters"]
+    relations: LawConstraint
+    models: Sequence[SparseModel]
+    information: Float[np.ndarray, "points free free"]
+    how: str
 
     @property
-    def fits(self) -> dict[str, Case]:
-        """All fits of a point by name: every case, and its refinement."""
-        return {name + end: case for name, case in self.cases.items() for end in ("", REFINED)}
+    def n_free(self) -> int:
+        """Number of coefficients that the relations leave free."""
+        return len(self.relations.common.free)
 
+    @cached_property
+    def coefficients(self) -> Float[np.ndarray, "points free"]:
+        """The free coefficients of each point."""
+        common = self.relations.common
+        return np.array([read_coefficients(model, common) for model in self.models])[:, common.free]
 
-def fit_points(
-    points: Sequence[OperatingRecord],
-    study: PointStudy,
-    *,
-    workers: Workers,
-    rng: np.random.Generator,
-    tell: Callable[[int, PointResult], None] = lambda number, result: None,
-    progress: Progress = SILENT,
-) -> list[PointResult]:
-    """Fit and refine all cases at every point, each on its own samples, and search for terms.
+    @property
+    def usable(self) -> PointFits:
+        """The points whose fit tells something of the coefficients."""
+        return self.take(np.flatnonzero(self.information.any(axis=(1, 2))).tolist())
 
-    The result of a point depends on its data and its place in the list, not on the workers or on
-    the other points. tell: called with the number of a point and its result as soon as it is known.
-    Raises ValueError, naming the point, for one that lacks a state or a variable, has another unit,
-    or has too short a record.
-    """
-    variables = [*study.library.variables, *study.searched.variables]
-    check_alike(points, list(dict.fromkeys(variables)))
-    pieces = list(zip(points, rng.spawn(len(points)), strict=True))
-    stage = progress.stage(len(points), "point fitted")
-    return collect(workers, partial(_fit_point, study=study), pieces, stage, tell=tell)
-
-
-def _fit_point(
-    piece: tuple[OperatingRecord, np.random.Generator], *, study: PointStudy
-) -> PointResult:
-    point, rng = piece
-    with name_point(point.parameters):
-        return _point_result(point, study, rng=rng)
-
-
-def _point_result(
-    point: OperatingRecord, study: PointStudy, *, rng: np.random.Generator
-) -> PointResult:
-    run, status = point.trajectory, point.status
-    if run is None:
-        return PointResult(point.parameters, status)
-    if status == Oscillation.OSCILLATING:
-        status = oscillation(run.t, run.states)
-    result = PointResult(
-        parameters=point.parameters,
-        status=status,
-        n_samples=run.n_samples,
-        dt_s=run.dt_s,
-        f_Hz=dominant_frequency(run.t, run.states[:, 0]),
-        spread=dict(zip(run.state_names, relative_spread(run.states).tolist(), strict=True)),
-    )
-    if status != Oscillation.OSCILLATING:
-        return result
-    rows, *streams, last = rng.spawn(2 * len(study.cases) + 2)
-    problems = study.formulation.assemble([run], study.library, rng=rows)
-    record, fits = _FittedRecord(run, problems, study, 1.0 / result.f_Hz), {}
-    for k, (name, case) in enumerate(study.cases.items()):
-        fits[name] = record.fit(case, rng=streams[2 * k])
-        start = fits[name].model
-        fits[name + REFINED] = record.refine(case, start, rng=streams[2 * k + 1])
-    return replace(result, fits=fits, searched=record.search(rng=last))
-
-
-@dataclass(frozen=True, eq=False)
-class _FittedRecord:
-    """The record of one point with its rows and its period, to which every case is fitted."""
-
-    run: Trajectory
-    problems: Sequence[RegressionRows]
-    study: PointStudy
-    period_s: float
-
-    def fit(self, case: Case, *, rng: np.random.Generator) -> Fitted:
-        """Least squares, with intervals and covariance from a bootstrap in blocks of time."""
-        run, problems, bootstrap = self.run, self.problems, self.study.bootstrap
-        provenance = {"formulation": repr(self.study.formulation), "trajectories": run.label}
-        model = constrained_fit(problems, case.constraint, units=run.units, provenance=provenance)
-        n_groups = len(np.unique(np.concatenate([p.groups[~p.test] for p in problems])))
-        group_s = (run.t[-1] - run.t[0]) / n_groups
-        draws = resample_coefficients(
-            problems,
-            case.constraint,
-            model,
-            block=max(1, round(bootstrap.periods * self.period_s / group_s)),
-            n_draws=bootstrap.n_draws,
-            rng=rng,
+    def take(self, numbers: Sequence[int]) -> PointFits:
+        """The same for some of the points."""
+        return replace(
+            self,
+            points=self.points[list(numbers)],
+            models=[self.models[k] for k in numbers],
+            information=self.information[list(numbers)],
         )
-        coef = read_coefficients(model, case.constraint)
-        covariance = np.atleast_2d(np.cov(draws[:, coef != 0.0], rowvar=False))
-        estimates, drawn = estimate_from_draws(
-            coef, draws, case.quantities, case.constraint, self.study.library
-        )
-        model, r2 = replace(model, covariance=covariance), _r2(problems, model)
-        return Fitted(model, FITTED, r2, estimates=estimates, draws=drawn)
 
-    def refine(self, case: Case, start: SparseModel, *, rng: np.random.Generator) -> Fitted:
-        """The case's coefficients, refined so that integrated windows follow the data."""
-        run, how = self.run, self.study.refining
-        samples = samples_in_periods(how.periods, frequency_Hz=1.0 / self.period_s, dt_s=run.dt_s)
-        settings = RefinementSettings(
-            n_windows=how.n_windows,
-            window=int(np.clip(samples, MIN_SAMPLES, run.n_samples)),
-            method=MultipleShooting(max_iter=how.max_iter),
-            constraint=case.constraint,
-        )
-        found = refine(start, [run], settings, seed=rng)
-        estimates = {}
-        if found.model.covariance is not None:
-            estimates = estimate_from_covariance(
-                found.model, case.quantities, case.constraint, self.study.library
-            )
-        r2 = _r2(self.problems, found.model)
-        return Fitted(found.model, found.status, r2, loss=found.loss, estimates=estimates)
+    def functions(self, law: LawFunctions) -> Library:
+        """Functions of the parameters that a law is made of: polynomials, if a degree is given."""
+        return polynomial(list(self.parameters), degree=law) if isinstance(law, int) else law
 
-    def search(self, *, rng: np.random.Generator) -> Fitted:
-        """The model that the study's method chooses."""
-        found = discover(self.run, self.study.searched, self.study.method, seed=rng)
-        fronts = found.fronts.values()
-        problems = list(dict.fromkeys(f.problem for f in fronts if f.problem is not None))
-        no_rows = dict.fromkeys(found.model.states, float("nan"))  # of a search of trajectories
-        return Fitted(found.model, SEARCHED, no_rows | _r2(problems, found.model))
+    def basis(self, functions: Library) -> Basis:
+        """The functions at the points. Raises ValueError if the points do not suffice for them."""
+        return make_basis(functions, self.columns(functions))
 
-
-def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, float]:
-    """R2 of the derivative, by state, on the unweighted training rows."""
-    return {
-        state: score_rows(problem, model, state)
-        for problem in problems
-        for state in problem.equations
-    }
-
-
-@dataclass(frozen=True)
-class TimeBootstrap:
-    """Settings of the bootstrap in time: number of draws, and length of a block in periods."""
-
-    n_draws: int
-    periods: float
-
-    def __post_init__(self) -> None:
-        if self.n_draws < 40 or self.periods <= 0.0:
+    def columns(self, functions: Library) -> Float[np.ndarray, "points variables"]:
+        """The parameters of the points in the order of the functions' variables."""
+        if unknown := [v for v in functions.variables if v not in self.parameters]:
             raise ValueError(
-                "a 95 % interval needs 40 draws or more, and blocks some length: "
-                f"n_draws={self.n_draws}, periods={self.periods} came"
+                f"a law's functions must be of {list(self.parameters)}: {unknown} came"
             )
+        return self.points[:, [self.parameters.index(v) for v in functions.variables]]
 
+    def law(self, functions: Library) -> OperatingLaw:
+        """The law of all points, with its errors at points left out one at a time.
 
-def resample_coefficients(
-    problems: Sequence[RegressionRows],
-    constraint: Constraint,
-    model: SparseModel,
-    *,
-    block: int,
-    n_draws: int,
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "draws coefs"]:
-    """Coefficients of `constrained_fit` on training rows redrawn in blocks of time, in SI.
-
-    A draw counts groups of rows, the same for all equations. Each equation keeps the weight that it
-    has on all rows, and rows of known noise stay whitened as under `model`. model: result of
-    `constrained_fit` on these problems. block: number of consecutive groups in a block.
-    Returns one column per coefficient of the constraint. The draws are shifted so that their mean
-    is the fit: blocks seldom reach the ends of the record, which would bias them. Before the shift,
-    a coefficient whose terms are zero on all rows of a draw is zero in this draw.
-    Raises ValueError for blocks that leave fewer than five to draw from, or several trajectories.
-    Source: Kuensch 1989, doi:10.1214/aos/1176347265; Lahiri 2003, Resampling Methods for Dependent
-    Data, 2.5, for the centre.
-    """
-    if len(problems[0].trajectories) > 1:
-        raise ValueError(
-            "a bootstrap over time needs one trajectory, or blocks would cross from one to the "
-            f"next: {len(problems[0].trajectories)} came"
-        )
-    equations = weigh_equations(problems, constraint)
-    coef = read_coefficients(model, constraint)
-    rows = [_free_rows(equation, constraint, coef) for equation in equations]
-    groups = [e.problem.groups[~e.problem.test] for e in equations]
-    numbers = np.unique(np.concatenate(groups))
-    _check_blocks(len(numbers), block)
-    scale = column_norms(np.concatenate(rows))
-    sums = np.zeros((len(numbers), len(scale), len(scale)))
-    for own, group in zip(rows, groups, strict=True):
-        unit = own / scale
-        np.add.at(sums, np.searchsorted(numbers, group), unit[:, :, None] * unit[:, None, :])
-    counts = np.array(
-        [
-            count_block_draws(len(numbers), n_drawn=len(numbers), block=block, rng=rng)
-            for _ in range(n_draws)
-        ],
-        dtype=np.float64,
-    )
-    grams = np.tensordot(counts, sums, axes=1)
-    z = (invert_gram(grams[:, :-1, :-1]) @ grams[:, :-1, -1:])[:, :, 0]
-    z *= scale[-1] / scale[:-1]
-    return (z - z.mean(axis=0) + coef[constraint.free]) @ constraint.C.T + constraint.d
-
-
-def _check_blocks(n_groups: int, block: int) -> None:
-    if n_groups < MIN_BLOCKS * block:
-        raise ValueError(
-            f"a bootstrap over time needs {MIN_BLOCKS} blocks or more: blocks of {block} were "
-            f"asked of {n_groups} groups of rows; use fewer periods per block "
-            "(bootstrap.periods), or a longer record"
+        Its covariance is the jackknife's: how far the law moves if a point is left out. It holds
+        the noise of the records, and that coefficients are not exactly of this form. Both are None
+        if the points do not suffice for a law without each of them.
+        Source: Efron & Stein 1981, doi:10.1214/aos/1176345462, for the jackknife.
+        """
+        free, columns = self._pool(functions), self.columns(functions)
+        covariance, errors = None, None
+        laws = self._laws_without_each(functions)
+        if laws is not None:
+            apart = (laws - laws.mean(axis=0)).reshape(len(laws), -1)
+            covariance = (len(laws) - 1) / len(laws) * apart.T @ apart
+            errors = self._rate_errors(laws, functions)
+        return self.relations.make_law(
+            self.models[0], functions, columns, free, covariance, self.how, errors
         )
 
+    def law_without(self, number: int, functions: Library) -> OperatingLaw:
+        """The law of all points but one, without covariance."""
+        others = self.take([k for k in range(len(self.models)) if k != number])
+        columns, free = others.columns(functions), others._pool(functions)
+        return self.relations.make_law(
+            self.models[0], functions, columns, free, None, self.how, None
+        )
 
-def _free_rows(
-    equation: WeightedEquation, constraint: Constraint, coef: Float[np.ndarray, " coefs"]
-) -> Float[np.ndarray, "rows columns"]:
-    """One equation's rows by free coefficient, the target last; residual variance 1."""
-    at = equation.at
-    theta, target = equation.rows(coef[at])
-    return np.column_stack([theta @ constraint.C[at], target - theta @ constraint.d[at]])
+    def rate_errors(self, functions: Library) -> Float[np.ndarray, " points"]:
+        """Error at each point of the law of the others, as a share of the point's rates.
+
+        With z_p and I_p of the point, and d_p what the law of the others misses z_p by, it is
+        sqrt(d_p^T I_p d_p / z_p^T I_p z_p): for rows, the root mean square error of the rates by
+        that of the rates. It counts only what the record determines.
+        Raises ValueError if the points do not suffice for a law without each of them.
+        """
+        laws = self._laws_without_each(functions)
+        if laws is None:
+            raise ValueError(
+                f"a law of {len(functions)} functions of {list(functions.variables)} needs more "
+                f"points than these, since each is left out in turn: {len(self.models)} came"
+            )
+        return self._rate_errors(laws, functions)
+
+    def _rate_errors(
+        self, laws: Float[np.ndarray, "points free functions"], functions: Library
+    ) -> Float[np.ndarray, " points"]:
+        at_points = np.einsum("pcf,pf->pc", laws, functions.evaluate(self.columns(functions)))
+        off, own = at_points - self.coefficients, self.coefficients
+        missed = np.einsum("pc,pcd,pd->p", off, self.information, off)
+        whole = np.einsum("pc,pcd,pd->p", own, self.information, own)
+        return np.sqrt(np.maximum(missed, 0.0) / zero_to_one(whole))
+
+    def _laws_without_each(
+        self, functions: Library
+    ) -> Float[np.ndarray, "points free functions"] | None:
+        """The factors of the law without each point; None if the points do not suffice."""
+        numbers = range(len(self.models))
+        try:
+            return np.stack(
+                [self.take([k for k in numbers if k != j])._pool(functions) for j in numbers]
+            )
+        except ValueError:
+            return None
+
+    def _pool(self, functions: Library) -> Float[np.ndarray, "free functions"]:
+        return pool_coefficients(self.coefficients, self.information, self.basis(functions))
 
 
-@dataclass(frozen=True, eq=False)
-class SharedResult:
-    """Result of one search over all points that oscillate.
-
-    fitted: for each point that oscillates, the support with the point's own coefficients; None at
-    the others. fit: the coefficients as polynomials of the parameters; None if the points do not
-    suffice, for the reason in `why_no_law`.
-    """
-
-    found: SharedDiscovery
-    fitted: Sequence[Fitted | None]
-    fit: LawFit | None
-    why_no_law: str = ""
-
-
-def search_shared(
-    points: Sequence[OperatingRecord],
-    results: Sequence[PointResult],
-    study: PointStudy,
-    law: Library,
+def fit_rows(
+    parameters: Sequence[str],
+    points: Float[np.ndarray, "points parameters"],
+    problems: Problems,
+    relations: LawConstraint,
     *,
-    rng: np.random.Generator,
+    provenance: Mapping[str, str],
+) -> PointFits:
+    """Fit the coefficients to the rows of each point.
+
+    Terms that a point's rows do not tell apart are as small there as the rows allow, and the other
+    points decide.
+    """
+    models, information = [], []
+    for parts, constraint in zip(problems, relations.at(points), strict=True):
+        solution = solve_constrained(parts, constraint)
+        library, units = parts[0].library, parts[0].trajectories[0].units
+        models.append(solution.model(library, units=units, provenance=provenance))
+        information.append(solution.information)
+    return PointFits(tuple(parameters), points, relations, models, np.array(information), "rows")
+
+
+def fit_trajectories(
+    start: PointFits,
+    runs: Sequence[Sequence[Trajectory]],
+    settings: RefinementSettings,
+    *,
+    seed: int | np.random.Generator = 0,
     progress: Progress = SILENT,
-) -> SharedResult | None:
-    """Search all points that oscillate at once; None for fewer than two of them.
-
-    law: functions of the points' parameters that give the coefficients. Also None for a search
-    that cannot weigh several points: only BestSubset can.
-    """
-    used = {
-        point.label: point
-        for point, result in zip(points, results, strict=True)
-        if result.fits and point.trajectory is not None
-    }
-    method = study.method
-    if len(used) < 2 or not isinstance(method, Regression):
-        return None
-    if not isinstance(method.search, BestSubset):
-        return None
-    found = discover_shared(
-        {label: [point.run] for label, point in used.items()},
-        study.searched,
-        replace(method, bootstraps=Bootstraps(n=0)),
-        seed=rng,
-        progress=progress,
+) -> PointFits:
+    """Refine the coefficients of each point until integrated windows follow its runs."""
+    constraints = start.relations.at(start.points)
+    fits = refine(
+        start.models, runs, settings, constraints=constraints, seed=seed, progress=progress
     )
-    fit, reason = None, ""
-    try:
-        parameters = {label: point.parameters for label, point in used.items()}
-        with progress.stage(None, "", "one law of all coefficients"):
-            fit = fit_law(found, law, parameters=parameters)
-    except ValueError as error:
-        reason = str(error)
-    labels = [point.label for point in points]
-    fitted = [_fitted(found, label) if label in used else None for label in labels]
-    return SharedResult(found, fitted, fit, reason)
+    return of_refinements(start.parameters, start.points, start.relations, fits)
 
 
-def _fitted(found: SharedDiscovery, label: str) -> Fitted:
-    scores = {
-        state: front.points[label].candidates[front.supports.index(found.chosen[state])].r2_train
-        for state, front in found.fronts.items()
-    }
-    return Fitted(model=found.models[label], status=SEARCHED, r2=scores)
+def of_refinements(
+    parameters: Sequence[str],
+    points: Float[np.ndarray, "points parameters"],
+    relations: LawConstraint,
+    fits: Sequence[Refinement],
+) -> PointFits:
+    """Refinements of all points; one that failed tells nothing of the coefficients."""
+    information = [information_of(fit, relations.common) for fit in fits]
+    models = [fit.model for fit in fits]
+    return PointFits(
+        tuple(parameters), points, relations, models, np.array(information), "trajectories"
+    )
+
+
+def information_of(fit: Refinement, common: Constraint) -> Float[np.ndarray, "free free"]:
+    """Inverse covariance of the free coefficients; zero if the refinement failed."""
+    free = common.free
+    if fit.covariance_naive is None:
+        return np.zeros((len(free), len(free)))
+    covariance = np.zeros((len(common.coefficients), len(common.coefficients)))
+    moved = np.flatnonzero(read_coefficients(fit.model, common))
+    covariance[np.ix_(moved, moved)] = fit.covariance_naive
+    return invert_covariance(covariance[np.ix_(free, free)])

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Float
+from scipy.special import ndtri
 
 from ep2sindy.data.numbers import least_squares
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.relations import Constraint, place_of
 from ep2sindy.library.units import unit_product
 from ep2sindy.model.model import SparseModel
@@ -22,11 +23,11 @@ from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.values import check_count, read_only
 
 LEVEL = 0.95  # level of all intervals in this file
-FITTED, SEARCHED, CONVERGED = "fitted", "searched", "converged"
-REFINED = "_refined"  # suffix of the name of a case's refinement
 
 # Share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
 ROUNDING = 1e-10
+
+POINTS_PER_TERM = 3  # points for each term of a control law: with fewer, a search fits their errors
 
 
 @dataclass(frozen=True)
@@ -63,10 +64,6 @@ class Quantity:
         """Values of the quantity for an array of values of the coefficient."""
         return self.factor * coef**self.power
 
-    def slope(self, coef: float) -> float:
-        """Derivative of the quantity by the coefficient."""
-        return self.factor * self.power * coef ** (self.power - 1)
-
     def place(self, constraint: Constraint, library: Library) -> int:
         """Index of its coefficient in the constraint. Raises ValueError if it is not there."""
         who = f"the quantity of {self.coefficient!r}"
@@ -88,90 +85,40 @@ class QuantityEstimate:
     high: float
 
 
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A model of one operating point.
-
-    The model's covariance is that of the draws, or of the refinement.
-    status: fitted (by least squares), searched, or the status of a refinement. r2: for each state,
-    of the derivative, on training rows. loss: of a refinement, else NaN. draws: for each quantity,
-    (draws,), the bootstrap draws behind the intervals of least squares.
-    """
-
-    model: SparseModel
-    status: str
-    r2: Mapping[str, float]
-    loss: float = float("nan")
-    estimates: Mapping[str, QuantityEstimate] = field(default_factory=dict)
-    draws: Mapping[str, Float[np.ndarray, " draws"]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class PointResult:
-    """Results at one operating point; without fits unless its status is "oscillating".
-
-    f_Hz: dominant frequency of the first state. spread: for each state, standard deviation over
-    mean. fits: by the name of the case, and of the case + "_refined". searched: the model that the
-    search chose.
-    """
-
-    parameters: Mapping[str, float]
-    status: str
-    n_samples: int = 0
-    dt_s: float = float("nan")
-    f_Hz: float = float("nan")
-    spread: Mapping[str, float] = field(default_factory=dict)
-    fits: Mapping[str, Fitted] = field(default_factory=dict)
-    searched: Fitted | None = None
-
-    def usable(self, fit: str) -> bool:
-        """True if this fit exists and finished."""
-        return fit in self.fits and self.fits[fit].status in (FITTED, CONVERGED)
-
-
-def estimate_from_draws(
-    coef: Float[np.ndarray, " coefs"],
-    draws: Float[np.ndarray, "draws coefs"],
-    quantities: Mapping[str, Quantity],
-    constraint: Constraint,
-    library: Library,
-) -> tuple[dict[str, QuantityEstimate], dict[str, Float[np.ndarray, " draws"]]]:
-    """Estimates with intervals from percentiles of draws, and the draws of every quantity.
+def estimate_quantities(
+    model: SparseModel, quantities: Mapping[str, Quantity]
+) -> dict[str, QuantityEstimate]:
+    """Quantities of a model with intervals, the ends those of the coefficient's.
 
     The reciprocal of a coefficient has an infinite interval if the coefficient's interval holds
-    zero.
-    coef, draws: in the order of the constraint's coefficients.
+    zero. A model without covariance gives ends that are not a number.
     """
-    estimates, drawn = {}, {}
-    for name, quantity in quantities.items():
-        k = quantity.place(constraint, library)
-        drawn[name] = quantity.evaluate(draws[:, k])
-        ends = (50 * (1 - LEVEL), 50 * (1 + LEVEL))
-        low, high = np.percentile(drawn[name], ends)
-        if quantity.power < 0 and np.prod(np.sign(np.percentile(draws[:, k], ends))) <= 0:
-            low, high = -np.inf, np.inf
-        estimates[name] = QuantityEstimate(
-            float(quantity.evaluate(coef[k : k + 1])[0]), float(low), float(high)
-        )
-    return estimates, drawn
-
-
-def estimate_from_covariance(
-    model: SparseModel,
-    quantities: Mapping[str, Quantity],
-    constraint: Constraint,
-    library: Library,
-) -> dict[str, QuantityEstimate]:
-    """Estimates with intervals from the model's covariance, linearised in the coefficient."""
     estimates = {}
     for name, quantity in quantities.items():
-        state, term = constraint.coefficients[quantity.place(constraint, library)]
-        coef = model.terms(state)[term]
-        low, _ = model.intervals(state, level=LEVEL)[term]
-        reach = abs(quantity.slope(coef)) * (coef - low)
-        value = float(quantity.evaluate(np.array([coef]))[0])
-        estimates[name] = QuantityEstimate(value, value - reach, value + reach)
+        coef = model.terms(quantity.state).get(quantity.term, 0.0)
+        ends = np.array([np.nan, np.nan])
+        if model.covariance is not None:
+            known = model.intervals(quantity.state, level=LEVEL)
+            ends = np.array(known.get(quantity.term, (coef, coef)))
+        if quantity.power < 0 and np.prod(np.sign(ends)) <= 0.0:
+            low, high = -np.inf, np.inf
+        else:
+            low, high = np.sort(quantity.evaluate(ends)).tolist()
+        with np.errstate(divide="ignore"):
+            value = float(quantity.evaluate(np.array([coef]))[0])
+        estimates[name] = QuantityEstimate(value, low, high)
     return estimates
+
+
+def control_functions(names: Sequence[str], points: np.ndarray) -> Library:
+    """Functions that a control law may hold: products up to degree 2, and reciprocals.
+
+    A parameter that is zero somewhere, or changes its sign, has no reciprocal.
+    """
+    library = polynomial(list(names), degree=2)
+    one_sign = (points > 0.0).all(axis=0) | (points < 0.0).all(axis=0)
+    over = [f"1/{name}" for name, keeps in zip(names, one_sign, strict=True) if keeps]
+    return library + named_terms(list(names), over) if over else library
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,8 +164,8 @@ def fit_control_law(
     r_p the residual of the point p in a least-squares fit, h_p its diagonal of the hat matrix, and
     so r_p / (1 - h_p) its residual in the fit to the other points.
     Assumes errors of equal variance at all points.
-    max_terms: None allows as many terms as leave two points over; never more than that, nor more
-    than the library has. A support to which one point is indispensable is left out.
+    max_terms: None allows one term for every three points; never more than leave two points over,
+    nor more than the library has. A support to which one point is indispensable is left out.
     Raises ValueError for under three points, another number of parameters than variables, values
     that are not finite, or a parameter that never varies.
     Source: Allen 1974, doi:10.1080/00401706.1974.10489157.
@@ -266,7 +213,7 @@ def _search(
     Of supports that are equal up to rounding, the one of fewest columns is taken.
     """
     n_points, n_terms = theta.shape
-    largest = max(1, min(n_terms, n_points - 2, max_terms or n_terms))
+    largest = max(1, min(n_terms, n_points - 2, max_terms or n_points // POINTS_PER_TERM))
     floor = ROUNDING * np.sqrt(np.square(values).mean())
     best, lowest = ([0], np.full_like(values, np.inf)), np.inf
     for size in range(1, largest + 1):
@@ -288,79 +235,63 @@ def _relative(errors: np.ndarray, values: np.ndarray) -> float:
     return _rms(errors) / mean if mean else float("nan")
 
 
-def fit_names(results: Sequence[PointResult]) -> list[str]:
-    """Names of all fits, in the order of the study."""
-    return list(dict.fromkeys(name for result in results for name in result.fits))
+@dataclass(frozen=True)
+class Trend:
+    """Exponent p of |quantity| ~ parameter^p along one parameter, the others held.
 
-
-def fit_control_laws(
-    results: Sequence[PointResult], library: Library, *, max_terms: int | None = None
-) -> dict[str, dict[str, ControlLaw]]:
-    """A control law per fit and quantity, from the points at which the fit finished.
-
-    Fits with under three such points, or with a parameter that does not vary over them, are left
-    out.
+    r2: of the line through the logarithms; it tells whether the points follow a power law at all,
+    and is also near zero without a trend. low and high: 95 % interval of the exponent by the
+    intervals of the values, points independent: how well the slope is known, not whether the points
+    lie on a line. Of two points, which are always on a line, these are NaN.
     """
-    found = {}
-    for fit in fit_names(results):
-        usable = [result for result in results if result.usable(fit)]
-        values = np.array([[each.parameters[v] for v in library.variables] for each in usable])
-        if len(usable) < 3 or not np.ptp(values, axis=0).all():
-            continue
-        found[fit] = {
-            name: fit_control_law(_values(usable, fit, name), values, library, max_terms=max_terms)
-            for name in usable[0].fits[fit].estimates
-        }
-    return found
+
+    exponent: float
+    r2: float
+    low: float
+    high: float
+    n_points: int
 
 
-def fit_trends(
-    results: Sequence[PointResult], *, along: str, at: Mapping[str, float]
-) -> pd.DataFrame:
-    """Exponents p of |quantity| ~ parameter^p along one parameter, the others held.
+def fit_trend(
+    x: Float[np.ndarray, " points"],
+    values: Float[np.ndarray, " points"],
+    std: Float[np.ndarray, " points"] | None = None,
+) -> Trend:
+    """Slope of log |values| against log x by least squares.
 
-    One row per fit and quantity: the slope of logarithms, by least squares over the points. r2: of
-    that line; it tells whether the points follow a power law at all, and is also near zero without
-    a trend. low and high: 95 % interval of the slope by the bootstraps of least-squares fits,
-    points independent. It says how well the slope is known, not whether the points lie on a line.
-    With two points, which are always on a line, r2, low and high are NaN; low and high are also NaN
-    for refined fits.
+    std: standard deviations of the values; None if they are unknown. The exponent is NaN unless x
+    is positive and has two different values; r2 also for under three points or equal values.
     """
-    held = [each for each in results if all(each.parameters[k] == v for k, v in at.items())]
-    rows = []
-    for fit in fit_names(results):
-        usable = [each for each in held if each.usable(fit)]
-        x = np.array([each.parameters[along] for each in usable])
-        for name in usable[0].fits[fit].estimates if usable else ():
-            low, high = np.nan, np.nan
-            if len(usable) > 2 and all(each.fits[fit].draws for each in usable):
-                draws = np.stack([each.fits[fit].draws[name] for each in usable], axis=1)
-                slopes = [fit_power_law(x, draw)[0] for draw in draws]
-                low, high = np.percentile(slopes, (2.5, 97.5))
-            row = {"fit": fit, "quantity": name, "along": along, "n_points": len(usable)}
-            slope, share = fit_power_law(x, _values(usable, fit, name))
-            row |= {"exponent": slope, "r2": share}
-            rows.append(row | {"low": low, "high": high})
-    return pd.DataFrame(rows)
-
-
-def fit_power_law(
-    x: Float[np.ndarray, " points"], values: Float[np.ndarray, " points"]
-) -> tuple[float, float]:
-    """Slope of log |values| against log x by least squares, and the R2 of this line.
-
-    Both are NaN unless x is positive and has two different values; R2 also for under three points
-    or for equal values.
-    """
-    if len(x) < 2 or np.ptp(x) == 0.0 or x.min() <= 0.0:
-        return float("nan"), float("nan")
+    n, nothing = len(x), float("nan")
+    if n < 2 or np.ptp(x) == 0.0 or x.min() <= 0.0:
+        return Trend(nothing, nothing, nothing, nothing, n)
     logs, centred = np.log(np.abs(values)), np.log(x) - np.log(x).mean()
-    slope = float(centred @ logs / np.square(centred).sum())
-    if len(x) < 3 or np.ptp(logs) == 0.0:
-        return slope, float("nan")
+    weights = centred / np.square(centred).sum()
+    slope = float(weights @ logs)
+    if n < 3:
+        return Trend(slope, nothing, nothing, nothing, n)
+    reach = nothing
+    if std is not None:
+        reach = float(ndtri(0.5 + 0.5 * LEVEL) * np.linalg.norm(weights * std / values))
     line = logs.mean() + slope * centred
-    return slope, float(r2(truth=logs, prediction=line[None])[0])
+    share = float(r2(truth=logs, prediction=line[None])[0]) if np.ptp(logs) > 0.0 else nothing
+    return Trend(slope, share, slope - reach, slope + reach, n)
 
 
-def _values(usable: Sequence[PointResult], fit: str, name: str) -> np.ndarray:
-    return np.array([each.fits[fit].estimates[name].value for each in usable])
+def lines_of(
+    points: Sequence[Mapping[str, float]], *, least: int = 2
+) -> list[tuple[str, dict[str, float]]]:
+    """The lines of points along one parameter with the others held: (parameter, the others).
+
+    Of every parameter, the line with most points, of at least as many.
+    """
+    found = []
+    for along in points[0]:
+        counts = Counter(
+            tuple((name, value) for name, value in point.items() if name != along)
+            for point in points
+        )
+        held, n = counts.most_common(1)[0]
+        if n >= least:
+            found.append((along, dict(held)))
+    return found

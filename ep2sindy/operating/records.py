@@ -1,4 +1,4 @@
-"""Operating points: their parameters, the record taken at each, and the cycle it is on."""
+"""Runs at their operating points: how they are grouped and checked, and the cycle each repeats."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.data.numbers import least_squares, zero_to_one
-from ep2sindy.data.trajectory import Trajectory, check_agreement
-from ep2sindy.regression.pooled import Basis
+from ep2sindy.data.trajectory import Trajectory, check_agreement, point_label
 from ep2sindy.signals.attractor import Cycle, find_cycle
-from ep2sindy.signals.spectrum import Oscillation, relative_amplitude, steps_in
+from ep2sindy.signals.spectrum import relative_amplitude, steps_in
 from ep2sindy.signals.trace import MIN_PERIODS
+
+Point = Mapping[str, float]  # parameter -> value
 
 # Two cycles coexist if the relative amplitudes of the records, less a plane over the parameters,
 # form two groups. The gap between these must exceed the spread in a group by the factor APART, and
@@ -30,50 +31,27 @@ FEW = 4
 
 @dataclass(frozen=True, eq=False)
 class OperatingRecord:
-    """One operating point, and the record that was taken there.
+    """A run at an operating point (`run.parameters`), and the cycle that it repeats.
 
-    trajectory: None if the source says that nothing oscillates. status: as the source says; only
-    "oscillating" is checked, other values are taken as given. notes: remarks on problems of the
-    data. used: description of the data.
-    Raises ValueError for parameters that are not finite, or for a status that is not text.
+    Raises ValueError for a run without parameters.
     """
 
-    parameters: Mapping[str, float]
-    trajectory: Trajectory | None
-    status: str = Oscillation.OSCILLATING
-    notes: Sequence[str] = ()
-    used: str = ""
+    run: Trajectory
 
     def __post_init__(self) -> None:
-        values = {name: float(value) for name, value in self.parameters.items()}
-        object.__setattr__(self, "parameters", values)
-        if not values or not np.isfinite(list(values.values())).all():
-            raise ValueError(f"operating point {self.label} must have parameters, all finite")
-        if not isinstance(self.status, str):
+        if not self.run.parameters:
             raise ValueError(
-                "status must be text, such as 'oscillating': "
-                f"a {type(self.status).__name__} came; OperatingRecord.of(parameters, run) finds "
-                "the cycle of a record itself"
+                f"a record needs its operating point: {self.run.label or 'a run'} has no "
+                "parameters; make it with Trajectory(..., parameters={'V_D_V': 300.0})"
             )
-        if self.trajectory is None and self.status == Oscillation.OSCILLATING:
-            raise ValueError(f"{self.label} oscillates: it needs its trajectory")
 
-    @staticmethod
-    def of(parameters: Mapping[str, float], run: Trajectory) -> OperatingRecord:
-        """A record that laws can be made of. Raises ValueError for one without a `cycle`."""
-        record = OperatingRecord(parameters, run)
-        _ = record.cycle
-        return record
+    @property
+    def parameters(self) -> Point:
+        return self.run.parameters
 
     @property
     def label(self) -> str:
         return point_label(self.parameters)
-
-    @property
-    def run(self) -> Trajectory:
-        if self.trajectory is None:
-            raise ValueError(f"operating point {self.label} has no record: it is {self.status}")
-        return self.trajectory
 
     @cached_property
     def cycle(self) -> Cycle:
@@ -115,13 +93,8 @@ class OperatingRecord:
         return self.run.window(self.slowest, self.run.n_samples)
 
 
-def point_label(parameters: Mapping[str, float]) -> str:
-    """Label of an operating point, such as `V_D_V=300, mdot_mg_s=5`."""
-    return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
-
-
 @contextmanager
-def name_point(parameters: Mapping[str, float]) -> Iterator[None]:
+def name_point(parameters: Point) -> Iterator[None]:
     """Put the name of the operating point before errors raised inside."""
     try:
         yield
@@ -129,12 +102,28 @@ def name_point(parameters: Mapping[str, float]) -> Iterator[None]:
         raise ValueError(f"operating point {point_label(parameters)}: {error}") from error
 
 
-def check_alike(records: Sequence[OperatingRecord], variables: Sequence[str]) -> None:
-    """Raise ValueError, naming the point, unless all have the same states, variables and units."""
-    known = [record for record in records if record.trajectory is not None]
-    for record in known:
-        with name_point(record.parameters):
-            check_agreement([known[0].run, record.run], variables)
+def group_by_point(
+    runs: Sequence[Trajectory], variables: Sequence[str]
+) -> dict[str, list[Trajectory]]:
+    """The runs of every operating point, by its label; runs of one point need not be neighbours.
+
+    Raises ValueError, naming the point, for runs whose parameters have other names, or whose
+    states, variables or units differ.
+    """
+    points: dict[str, list[Trajectory]] = {}
+    for run in runs:
+        first = runs[0]
+        if set(run.parameters) != set(first.parameters):
+            raise ValueError(
+                "runs of several operating points need the same parameters: "
+                f"{list(first.parameters)} came, and {list(run.parameters)} in "
+                f"{run.label or 'another run'}; name them alike in all, or give runs of one point"
+            )
+        with name_point(run.parameters):
+            check_agreement([first, run], variables)
+        in_order = {name: run.parameters[name] for name in first.parameters}
+        points.setdefault(point_label(in_order), []).append(run)
+    return points
 
 
 def check_varying(
@@ -155,64 +144,26 @@ def check_varying(
             )
 
 
-def check_records(records: Sequence[OperatingRecord]) -> None:
-    """Raise ValueError unless all have the same states, units and parameters, and these vary."""
-    if not records:
-        raise ValueError("a law needs operating points that oscillate: none came")
-    names = list(records[0].parameters)
-    for record in records:
-        if set(record.parameters) != set(names):
-            raise ValueError(
-                f"every operating point must have {names}: {dict(record.parameters)} came"
-            )
-    if len(records) == 1:
-        raise ValueError(
-            f"a law needs more than one operating point: {records[0].label} came alone; add "
-            "points near it"
-        )
-    check_varying(read_points(records), names)
-    check_alike(records, records[0].run.state_names)
+def read_points(
+    points: Sequence[Point], names: Sequence[str]
+) -> Float[np.ndarray, "points parameters"]:
+    """Values of the parameters at every point, a column for each name.
 
-
-def read_points(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records parameters"]:
-    """Parameters of the records, columns in the order of the first record's."""
-    names = list(records[0].parameters)
-    return np.array([[record.parameters[name] for name in names] for record in records])
-
-
-def read_point(
-    names: Sequence[str], parameters: Mapping[str, float]
-) -> Float[np.ndarray, " parameters"]:
-    """Values of the parameters of these names at a point; ValueError unless they are finite."""
-    if set(parameters) != set(names) or not np.isfinite(list(parameters.values())).all():
-        raise ValueError(
-            f"an operating point must have one finite value for each of {list(names)}, and no "
-            f"other: {dict(parameters)} came"
-        )
-    return np.array([float(parameters[name]) for name in names])
-
-
-def most_central(records: Sequence[OperatingRecord]) -> OperatingRecord:
-    """The record whose parameters are nearest to the mean of all."""
-    values = read_points(records)
-    off = (values - values.mean(axis=0)) / zero_to_one(np.ptp(values, axis=0))
-    return records[int(np.argmin(np.linalg.norm(off, axis=1)))]
-
-
-def interpolation_errors(
-    records: Sequence[OperatingRecord], basis: Basis
-) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:
-    """Leave-one-out errors of interpolating frequency and amplitude by functions of the parameters.
-
-    Both are interpolated directly, in logarithms.
-    Returns the relative error of the frequency, and the largest relative error of the standard
-    deviation over the states. They show how smoothly the records vary: no law of these functions
-    can be much better.
+    Raises ValueError for a point that lacks one, has another, or has a value that is not finite.
     """
-    f = np.log([[record.cycle.frequency_Hz] for record in records])
-    logs = np.hstack([f, np.log([record.cycle.std for record in records])])
-    off = np.abs(np.expm1(basis.predict_left_out(logs) - logs))
-    return off[:, 0], off[:, 1:].max(axis=1)
+    for point in points:
+        if set(point) != set(names) or not np.isfinite(list(point.values())).all():
+            raise ValueError(
+                f"an operating point must have one finite value for each of {list(names)}, and no "
+                f"other: {dict(point)} came"
+            )
+    return np.array([[float(point[name]) for name in names] for point in points])
+
+
+def most_central(points: Float[np.ndarray, "points parameters"]) -> int:
+    """Index of the point that is nearest to the mean of all."""
+    off = (points - points.mean(axis=0)) / zero_to_one(np.ptp(points, axis=0))
+    return int(np.argmin(np.linalg.norm(off, axis=1)))
 
 
 def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records"]:
@@ -223,7 +174,8 @@ def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records
     with the spread on either side of it.
     """
     amplitude = np.log([record.relative_amplitude for record in records])
-    left = _off_plane(read_points(records), amplitude)
+    values = read_points([r.parameters for r in records], list(records[0].parameters))
+    left = _off_plane(values, amplitude)
     order = np.argsort(left)
     gaps = np.diff(left[order])
     nothing = np.zeros(len(records), dtype=np.int64)

@@ -9,6 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float, Int
 
+from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.bootstraps import Resamples
@@ -20,6 +21,8 @@ from ep2sindy.regression.whitening import WhitenedRows, whiten_rows
 # Lower bound on the residual, as a share of the target's RMS; it limits the weight of an equation
 # with an exact fit.
 MIN_RESIDUAL = 1e-6
+
+MIN_BLOCKS = 5  # fewest blocks of time in a record: fewer say too little about how these differ
 
 # Number of reweighting passes. A fifth changes no coefficient by 1e-6 of its error at 20 % noise.
 N_PASSES = 4
@@ -47,23 +50,88 @@ def constrained_fit(
     problems: as a formulation assembles them. The model has the constraint's states.
     Raises ValueError for a state without rows, or coefficients that these rows cannot tell apart.
     """
-    library = problems[0].library
-    names, states = constraint.coefficients, constraint.states
-    coef, covariance = _solve(weigh_equations(problems, constraint), constraint)
-    values = [
-        {term: c for (s, term), c in zip(names, coef.tolist(), strict=True) if s == state}
-        for state in states
-    ]
-    order = np.lexsort([[library.index(t) for _, t in names], [states.index(s) for s, _ in names]])
-    used = order[coef[order] != 0.0]
-    return SparseModel(
-        library=library,
-        states=states,
-        coef=coef_matrix(library, values),
-        units=units,
-        provenance=provenance,
-        covariance=covariance[np.ix_(used, used)],
-    )
+    solution = solve_constrained(problems, constraint)
+    if not solution.fit.is_determined:
+        names = [constraint.coefficients[k] for k in constraint.free[solution.fit.dependent]]
+        raise ValueError(f"coefficients must be independent to be fitted: {names} are not")
+    return solution.model(problems[0].library, units=units, provenance=provenance)
+
+
+@dataclass(frozen=True, eq=False)
+class ConstrainedSolution:
+    """Least squares over the weighted rows of all equations; see `constrained_fit`.
+
+    fit: of the free coefficients. theta, left: the weighted terms of these, and the residuals.
+    groups: (rows,), number of the group of samples that each row belongs to.
+    variance: of the residuals; 1 if all rows are whitened.
+    """
+
+    constraint: Constraint
+    fit: LeastSquares
+    theta: Float[np.ndarray, "rows free"]
+    left: Float[np.ndarray, " rows"]
+    groups: Int[np.ndarray, " rows"]
+    variance: float
+
+    @property
+    def information(self) -> Float[np.ndarray, "free free"]:
+        """Inverse of the covariance of the free coefficients, for independent rows."""
+        return self.theta.T @ self.theta / (self.variance or 1.0)
+
+    @property
+    def root(self) -> Float[np.ndarray, "coefs free"]:
+        """A root of the covariance of all coefficients, for independent rows."""
+        return self.constraint.C @ self.fit.root * np.sqrt(self.variance)
+
+    def clustered_root(self, block: int) -> Float[np.ndarray, "coefs clusters"]:
+        """The same for rows that depend on each other within blocks of time.
+
+        block: number of consecutive groups in a block. The covariance is a sandwich with the blocks
+        as clusters: how far other stretches of the record would move the coefficients.
+        Raises ValueError for fewer than five blocks.
+        Source: Liang & Zeger 1986, doi:10.1093/biomet/73.1.13.
+        """
+        numbers = np.unique(self.groups)
+        n_blocks = len(numbers) // block
+        if n_blocks < MIN_BLOCKS:
+            raise ValueError(
+                f"intervals need {MIN_BLOCKS} blocks of time or more: blocks of {block} were asked "
+                f"of {len(numbers)} groups of rows; record for longer"
+            )
+        # Blocks of one length: what is left of a cycle at the end of the record is no cluster.
+        cluster = np.searchsorted(numbers, self.groups) * n_blocks // len(numbers)
+        scores = np.zeros((n_blocks, self.theta.shape[1]))
+        np.add.at(scores, cluster, self.theta * self.left[:, None])
+        inverse = self.fit.root @ self.fit.root.T
+        factor = np.sqrt(n_blocks / (n_blocks - 1))
+        return self.constraint.C @ inverse @ scores.T * factor
+
+    def model(
+        self,
+        library: Library,
+        *,
+        units: Mapping[str, str],
+        provenance: Mapping[str, str],
+        root: Float[np.ndarray, "coefs _"] | None = None,
+    ) -> SparseModel:
+        """The model of these coefficients. root: of their covariance; None takes `root`."""
+        names, states = self.constraint.coefficients, self.constraint.states
+        coef = self.constraint.coef(self.fit.coef)
+        values = [
+            {term: c for (s, term), c in zip(names, coef.tolist(), strict=True) if s == state}
+            for state in states
+        ]
+        columns = [states.index(s) for s, _ in names]
+        order = np.lexsort([[library.index(t) for _, t in names], columns])
+        own = (self.root if root is None else root)[order[coef[order] != 0.0]]
+        return SparseModel(
+            library=library,
+            states=states,
+            coef=coef_matrix(library, values),
+            units=units,
+            provenance=provenance,
+            covariance=own @ own.T,
+        )
 
 
 def fit_draws(
@@ -165,11 +233,15 @@ def _fit_alone(
     )
 
 
-def _solve(
-    equations: Sequence[WeightedEquation], constraint: Constraint
-) -> tuple[Float[np.ndarray, " coefs"], Float[np.ndarray, "coefs coefs"]]:
-    """All coefficients and their covariance, in SI; noisy rows are reweighted in each pass."""
+def solve_constrained(
+    problems: Sequence[RegressionRows], constraint: Constraint
+) -> ConstrainedSolution:
+    """Free coefficients that fit all equations at once; noisy rows are reweighted in each pass.
+
+    Coefficients that the rows do not determine are as small as the rows allow.
+    """
     C, d = constraint.C, constraint.d
+    equations = weigh_equations(problems, constraint)
     coef = d.copy()
     for equation in equations:
         coef[equation.at] = equation.start
@@ -181,10 +253,14 @@ def _solve(
             theta = np.concatenate([theta, terms @ C[equation.at]])
             target = np.concatenate([target, slope - terms @ d[equation.at]])
         fit = LeastSquares.of_rows(theta, target)
-        if not fit.is_determined:
-            names = [constraint.coefficients[k] for k in constraint.free[fit.dependent]]
-            raise ValueError(f"coefficients must be independent to be fitted: {names} are not")
         coef = constraint.coef(fit.coef)
-    root = C @ fit.root
-    variance = 1.0 if all(noisy) else fit.squares / max(len(target) - C.shape[1], 1)
-    return coef, root @ root.T * variance
+    return ConstrainedSolution(
+        constraint=constraint,
+        fit=fit,
+        theta=theta,
+        left=target - theta @ fit.coef,
+        groups=np.concatenate(
+            [np.zeros(0, np.int64), *(e.problem.groups[~e.problem.test] for e in equations)]
+        ),
+        variance=1.0 if all(noisy) else fit.squares / max(len(target) - C.shape[1], 1),
+    )

@@ -227,8 +227,7 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
 
     One Gauss-Newton step: the residual of the series is regressed on the change of slope.
     """
-    columns = _fourier_columns(phase, order)
-    triangle = _factorise(columns)
+    columns, triangle = _fourier_columns(phase, order)
 
     def fit(values: np.ndarray) -> np.ndarray:
         return np.linalg.solve(triangle, np.linalg.solve(triangle.T, columns.T @ values))
@@ -247,29 +246,52 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
     return phase + float(np.clip(change, -np.pi, np.pi)) * since
 
 
-def _fourier_columns(phase: np.ndarray, order: int) -> np.ndarray:
-    """Constant, then cosine and sine of each harmonic: (samples, 1 + 2 order)."""
+def _fourier_columns(phase: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Constant, then cosine and sine of each harmonic, (samples, 1 + 2 order); and their factor R.
+
+    columns = Q R but for signs; the basis Q, which takes long to form, is not needed.
+    """
     # Powers of one exponential: each costs a product instead of a sine and a cosine.
     turns = np.multiply.accumulate(np.tile(np.exp(1j * phase), (order, 1)))
     columns = np.empty((len(phase), 1 + 2 * order))
     columns[:, 0], columns[:, 1::2], columns[:, 2::2] = 1.0, turns.real.T, turns.imag.T
-    return columns
+    return columns, _factorise(columns, turns)
 
 
-def _factorise(columns: np.ndarray) -> np.ndarray:
-    """R of columns = Q R but for signs; the basis Q, which takes long to form, is not needed.
+def _factorise(columns: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """R of Fourier columns; turns: exp(i m phase) of each harmonic m, (order, samples).
 
     Harmonics over some periods are nearly orthogonal, so that R follows from the columns' products
     (Cholesky). Where it does not, because samples cluster in the phase, it is found by reflections.
     """
     try:
-        triangle: np.ndarray = np.linalg.cholesky(columns.T @ columns).T
+        triangle: np.ndarray = np.linalg.cholesky(_fourier_products(turns)).T
     except np.linalg.LinAlgError:
         triangle = np.zeros((1, 1))
     size = np.diagonal(triangle)
     if size.min() > WELL_CONDITIONED * size.max():
         return triangle
     return np.asarray(np.linalg.qr(columns, mode="r"))
+
+
+def _fourier_products(turns: np.ndarray) -> np.ndarray:
+    """Products of all Fourier columns, by the sums of exp(i m phase) for m up to twice the order.
+
+    cos m cos n = (cos(m-n) + cos(m+n)) / 2, and so on: no column is multiplied with another.
+    """
+    order, n = turns.shape
+    sums = np.concatenate([[n], turns.sum(axis=1), turns @ turns[-1]])
+    m = np.arange(order + 1)
+    apart = sums[np.abs(m[:, None] - m)]
+    apart = np.where(m[:, None] < m, apart.conj(), apart)
+    beside = sums[m[:, None] + m]
+    products = np.empty((1 + 2 * order, 1 + 2 * order))
+    cosine, sine = np.append(0, 1 + 2 * m[:-1]), 2 + 2 * m[:-1]
+    products[np.ix_(cosine, cosine)] = 0.5 * (apart + beside).real
+    products[np.ix_(sine, sine)] = 0.5 * (apart - beside).real[1:, 1:]
+    products[np.ix_(cosine, sine)] = 0.5 * (beside - apart).imag[:, 1:]
+    products[np.ix_(sine, cosine)] = products[np.ix_(cosine, sine)].T
+    return products
 
 
 def _most_harmonics(n_samples: int, n_periods: float) -> int:
@@ -287,8 +309,7 @@ def _fit_series(
     chosen: if true, BIC chooses the number of harmonics, up to `most`.
     """
     # The columns are ordered, so one factorisation gives the fits of every number of harmonics.
-    columns = _fourier_columns(phase, most)
-    triangle = _factorise(columns)
+    columns, triangle = _fourier_columns(phase, most)
     known = np.linalg.solve(triangle.T, columns.T @ scaled)
     whole = np.square(scaled).sum(axis=0)
     left = np.maximum(whole - np.cumsum(np.square(known), axis=0)[::2], 1e-12 * whole)

@@ -1,398 +1,448 @@
-"""Models of laws, and tables: of `+exp=predict`, and the control laws of `+exp=parametric`."""
+"""The law of whole models over operating points: how it is found, and its tables and texts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
-from ep2sindy.figures.operating import frequency_scale
-from ep2sindy.forecasting.skill import AUTOREGRESSION, MODEL, ForecastSkill
-from ep2sindy.operating.branch import Branch, StructureCase, StructureTrial
-from ep2sindy.operating.fit import LeaveOneOut, error_statistics
-from ep2sindy.operating.law import Known, constrain_law
-from ep2sindy.operating.map import Fate, MapPoint
-from ep2sindy.operating.point_fits import Case
-from ep2sindy.operating.quantities import ControlLaw, PointResult
-from ep2sindy.operating.records import OperatingRecord, point_label
-from ep2sindy.report.document import Equation, places
-from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
-from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
-from ep2sindy.signals.spectrum import Oscillation
-from ep2sindy.studies.fits import Terms, terms_of
-from ep2sindy.studies.forecasts import skill_of
-from ep2sindy.studies.views import terms_text, with_error
+from ep2sindy.figures.operating import cycle_figure, frequency_scale, laws_figure, left_out_figure
+from ep2sindy.model.model import SparseModel
+from ep2sindy.operating.given_models import GivenModel, PointResult, fits_of
+from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.left_out import (
+    LawTrial,
+    LeftOutRun,
+    error_statistics,
+    fewest_of_least,
+    interpolation_errors,
+    try_law,
+)
+from ep2sindy.operating.map import Fate, MapPoint, law_map, map_points
+from ep2sindy.operating.point_fits import LawFunctions
+from ep2sindy.operating.records import OperatingRecord, Point
+from ep2sindy.report.document import (
+    Block,
+    Captioned,
+    Picture,
+    Result,
+    Section,
+    Table,
+    Text,
+    places,
+)
+from ep2sindy.report.results import Metric, ResultTable, View, percent
+from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers, collect
+from ep2sindy.studies.views import NO_ENDS, display_equation, intervals, terms_text, with_error
 
-Parameters = Mapping[str, float]
-Laws = Mapping[str, Mapping[str, ControlLaw]]  # fit -> quantity -> law
+N_TOGETHER = 24  # points of a map computed as one piece: the records are sent with each piece
 
-
-@dataclass(frozen=True)
-class LawModel:
-    """The terms of every state, and relations and known coefficients that hold at every point."""
-
-    terms: Terms
-    relations: Sequence[str] = ()
-    known: Known = field(default_factory=dict)
-
-    def case(self, name: str, states: Sequence[str], parameters: Sequence[str]) -> StructureCase:
-        key = f"models.{name}.terms"
-        library, structure = terms_of(self.terms, states=states, key=key)
-        if inputs := [v for v in library.variables if v not in states]:
-            raise ValueError(
-                f"a law's model runs freely, on its states {list(states)} alone: {inputs} came in "
-                f"{key}"
-            )
-        try:
-            constrain_law(library, structure, self.relations, self.known, parameters=parameters)
-        except ValueError as error:
-            raise ValueError(
-                f"models.{name} cannot hold: {error} (or leave it out: ~models.{name})"
-            ) from error
-        return StructureCase(library, structure, self.relations, self.known, name)
-
-
-def known_beside_files(models: Mapping[str, LawModel]) -> str:
-    """What the models hold for known beside data of files, and how to change it; may be empty."""
-    known = [
-        (f"models.{name}.known.{state}.{term}.{function}", factor)
-        for name, model in models.items()
-        for state, terms in model.known.items()
-        for term, factors in terms.items()
-        for function, factor in factors.items()
-    ]
-    if not known:
-        return ""
-    place, factor = known[-1]
-    name = place.split(".")[1]
-    return (
-        f"data are files, and models hold a known inflow, {place}={factor:g}, which as shipped is "
-        "that of the package's thruster; set it to that of yours, for each model that has one, or "
-        f"leave such models out: ~models.{name}"
-    )
-
-
-def points_table(
-    points: Sequence[Parameters],
-    statuses: Mapping[str, str],
-    records: Sequence[OperatingRecord],
-    members: Mapping[str, Sequence[Parameters]],
-) -> pd.DataFrame:
-    """One row per operating point: status of its record, and its cycle."""
-    known = {record.label: record for record in records}
-    cycle = {point_label(p): name for name, group in members.items() for p in group}
-    rows = []
-    for point in points:
-        label = point_label(point)
-        record = known.get(label)
-        rows.append(
-            {
-                **point,
-                "status": statuses[label],
-                "branch": cycle.get(label, ""),
-                "f_kHz": 1e-3 * record.cycle.frequency_Hz if record else np.nan,
-                "relative_amplitude": record.relative_amplitude if record else np.nan,
-            }
-        )
-    return pd.DataFrame(rows)
-
-
-def laws_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
-    """One row per coefficient of a law, with its 95 % interval."""
-    rows = []
-    for name, branch in branches.items():
-        law = branch.law
-        known = {} if law.covariance is None else law.intervals()
-        for (state, term), row in zip(law.coefficients, law.coef, strict=True):
-            for function, value in zip(law.functions.names, row, strict=True):
-                ends = known.get((state, term), {}).get(function, (np.nan, np.nan))
-                rows.append((name, state, term, function, value, *ends))
-    columns = ["branch", "state", "term", "function", "value", "low", "high"]
-    return pd.DataFrame(rows, columns=columns)
-
-
-def coefficients_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
-    """Coefficients at every point, refined alone and from the law, each with 95 % intervals."""
-    rows = []
-    for name, branch in branches.items():
-        pairs = zip(branch.fit.records, branch.fit.fits, branch.refinement.models, strict=True)
-        for record, alone, pooled in pairs:
-            for state in pooled.states:
-                for term, value in pooled.terms(state).items():
-                    row = {**record.parameters, "branch": name, "state": state, "term": term}
-                    row |= {"alone": alone.model.terms(state)[term], "law": value}
-                    for kind, model in (("alone", alone.model), ("law", pooled)):
-                        if model.covariance is not None:
-                            low, high = model.intervals(state)[term]
-                            row |= {f"{kind}_low": low, f"{kind}_high": high}
-                    rows.append(row)
-    return pd.DataFrame(rows)
+INTERVALS = (
+    "In SI units, and the parameters in theirs. ±: half the 95 % interval by the jackknife: how "
+    "far the law moves if a point is left out. It holds the noise of the records, and that "
+    "coefficients are not exactly of this form."
+)
+LEFT_OUT = (
+    "Each point in turn read off the law of the others, and run freely from one sample of its "
+    "record, where the states move least. Errors are those against the record's cycle; a model "
+    "lives within 1 % of frequency, 10 % of amplitude and 0.2 standard deviations of waveform; "
+    "enclosed: whether the others enclose it."
+)
+TRIED = (
+    "error: mean over the points left out; of models that run freely the largest deviation from "
+    "the cycle, in units of its bound (1 % of frequency, 10 % of amplitude, 0.2 of waveform), 10 "
+    "at most, else that of the rates, relative to them; f error: median; numbers: of the law. Chosen: "
+    "the fewest numbers within a standard error of the least."
+)
+CAPTIONS = {
+    "laws": "Coefficients over the operating parameters: refined at each point alone (open, with "
+    "95 % intervals) and by the law that is fitted to these points (lines), at up to five values "
+    "of the other parameters. Where the open points leave the lines by more than their bars, other "
+    "coefficients make up for it: points are sloppy in some directions, and those count little.",
+    "left_out": "Points left out, each read off the law of the others. Left: frequency of the free "
+    "run over the record's, the band 1 %. Right: errors of amplitude and waveform of each "
+    "state, those beyond the panel filled on its edge; band and line are the bounds of a "
+    "model that lives.",
+    "map": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
+    "over the operating parameters, and of the records in the same colours (circles); crosses: "
+    "points that do not oscillate; diamonds: records of another cycle, not fitted here. Black "
+    "line: where the model's cycle ends; dashed: where its fixed point turns stable; grey: what "
+    "the points that the law was fitted to enclose, beyond which it is extrapolated, and the map "
+    "faded. White: no cycle.",
+    "line": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
+    "over the operating parameter (line, ending where the cycle does), and of the records "
+    "(circles); crosses: points that do not oscillate; diamonds: records of another cycle, not "
+    "fitted here. Shaded: between the points that the law was fitted to.",
+}
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOutPoint:
-    """Prediction at one point by the law of the other points.
+class FoundLaw:
+    """The law of the records on one cycle, and what was tried for it.
 
-    also: other cycles whose law oscillates there. skill: of forecasts over the second half of the
-    point's record, by the same law; None if there are none.
+    cycle: its name; "all" if there is only one. smooth: relative errors of frequency and amplitude
+    if these are themselves interpolated, at points left out, by the law's functions. at_points: the law's models at all points of the study.
+    map: the same over a grid that encloses these. Of a model that inputs drive, which has no free
+    runs, all three are empty.
     """
 
-    branch: str
-    result: LeaveOneOut
-    also: str
-    skill: ForecastSkill | None = None
+    cycle: str
+    records: Sequence[OperatingRecord]
+    trials: Sequence[LawTrial]
+    choice: LawTrial
+    law: OperatingLaw
+    smooth: tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]] | None
+    at_points: Sequence[MapPoint]
+    map: Sequence[MapPoint]
 
     @property
-    def record(self) -> OperatingRecord:
-        return self.result.record
+    def parameters(self) -> list[str]:
+        return list(self.records[0].parameters)
+
+    def model_at(self, point: Point) -> SparseModel:
+        own = {name: point[name] for name in self.law.parameters}
+        return self.law.at(extrapolate=True, **own)
+
+    @cached_property
+    def statistics(self) -> dict[str, float | int]:
+        """Of the points left out: of their free runs, or of their rates if nothing ran freely."""
+        if self.choice.runs:
+            return error_statistics(self.choice.runs)
+        errors = self.choice.rate_errors
+        return {"n": len(errors), "rates_median": float(np.median(errors))}
 
     @property
-    def f_kHz(self) -> float:
-        return 1e-3 * self.record.cycle.frequency_Hz
-
-    def forecast_error(self, name: str) -> float:
-        """Half a period ahead, in standard deviations; NaN if there is none."""
-        known = {} if self.skill is None else self.skill.at(0.5 / self.record.cycle.frequency_Hz)
-        return known.get(name, float("nan"))
-
-
-def skills_left_out(
-    left_out: Sequence[LeaveOneOut], *, starts: int, progress: Progress = SILENT
-) -> list[ForecastSkill | None]:
-    """At points left out, each by the law of the others over the second half of its record."""
-    skills = []
-    for each in count_pieces(progress, left_out, "point", "forecasts at points left out"):
-        record = each.record.run
-        half = record.n_samples // 2
-        skills.append(
-            skill_of(each.run.model, record, n_fitted=half, starts=starts, progress=progress)
+    def text(self) -> str:
+        """How the law does at the points left out, in the median, and beside interpolation."""
+        found, text = self.statistics, percent(2)
+        if self.smooth is None:
+            return (
+                f"Left out one at a time, the law of the others misses the rates at "
+                f"{found['n']} points by {text(found['rates_median'])} in the median."
+            )
+        smooth_f, smooth_amplitude = (float(np.median(each)) for each in self.smooth)
+        most = f"nine in ten within {text(found['f_90'])}"
+        if not np.isfinite(found["f_90"]):
+            most = "more than one in ten do not oscillate"
+        return (
+            f"Left out one at a time, {found['n_lives']} of {found['n']} points live, diverging: "
+            f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} "
+            f"({most}), the worst state's amplitude {text(found['amplitude_median'])} and waveform "
+            f"{places(found['waveform_median'], 3)}. The records' own frequencies and amplitudes, "
+            f"interpolated by the same functions, miss by {text(smooth_f)} and "
+            f"{text(smooth_amplitude)} in the median."
         )
-    return skills
+
+    @property
+    def advice(self) -> str:
+        """What to try if no point left out lives; empty if one does."""
+        if not self.choice.runs or self.statistics["n_lives"]:
+            return ""
+        return (
+            f"none of {len(self.choice.runs)} points left out lives by the law of the others, so "
+            "it predicts none between them: try points that lie closer together, laws of a lower "
+            "degree, other models, or models=null, longer records, and inputs that are states "
+            "(docs/predict.md)"
+        )
+
+    def agreement(self, statuses: Mapping[str, bool]) -> tuple[int, int]:
+        """At how many points the law says rightly whether they oscillate: all, and quiet ones."""
+        right = [
+            (point.fate is Fate.OSCILLATES) == oscillates
+            for point, oscillates in zip(self.at_points, statuses.values(), strict=True)
+        ]
+        quiet = [
+            r for r, oscillates in zip(right, statuses.values(), strict=True) if not oscillates
+        ]
+        return sum(right), sum(quiet)
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        return {
+            "laws": _laws_table(self.law),
+            "coefficients": self.coefficients,
+            "trials": ResultTable(self.trials, _trial_metrics(self.choice)).csv(),
+            "left_out": ResultTable(self.choice.runs, _left_out_metrics(self.choice.runs)).csv(),
+            "map": pd.DataFrame([point.row for point in self.map]),
+        }
+
+    @cached_property
+    def coefficients(self) -> pd.DataFrame:
+        """Coefficients at every point, refined alone and from the law, each with 95 % intervals."""
+        rows = []
+        for record, alone in zip(self.records, self.choice.fits.models, strict=True):
+            pooled = self.model_at(record.parameters)
+            for state in pooled.states:
+                for term, value in pooled.terms(state).items():
+                    row = {**record.parameters, "state": state, "term": term}
+                    row |= {"alone": alone.terms(state).get(term, np.nan), "law": value}
+                    for kind, model in (("alone", alone), ("law", pooled)):
+                        ends = (intervals(model) or {}).get(state, {}).get(term, NO_ENDS)
+                        row |= {f"{kind}_low": ends[0], f"{kind}_high": ends[1]}
+                    rows.append(row)
+        return pd.DataFrame(rows)
+
+    def figures(self, points: pd.DataFrame, labels: Mapping[str, str]) -> dict[str, Captioned]:
+        """Those that show something: none of runs or maps without an oscillation.
+
+        points: status, cycle, frequency and amplitude of every point.
+        """
+        found: dict[str, Captioned] = {}
+        left_out = self.tables()["left_out"]
+        if self.choice.runs and left_out["f_model_kHz"].notna().any():
+            found["left_out"] = Captioned(partial(left_out_figure, left_out), CAPTIONS["left_out"])
+        draw = partial(
+            laws_figure, self.coefficients, self.law, parameters=self.parameters, labels=labels
+        )
+        found["laws"] = Captioned(draw, CAPTIONS["laws"])
+        if any(point.fate is Fate.OSCILLATES for point in self.map):
+            caption = CAPTIONS["map" if len(self.parameters) == 2 else "line"]
+            draw = partial(
+                cycle_figure, pd.DataFrame([point.row for point in self.map]), points,
+                self.law.points, branch=self.cycle, parameters=self.parameters, labels=labels,
+            )  # fmt: skip
+            found["map"] = Captioned(draw, caption)
+        return found
+
+    def sections(self, statuses: Mapping[str, bool], drawn: Mapping[str, Any]) -> list[Section]:
+        bold = [k for k, trial in enumerate(self.trials) if trial is self.choice]
+        tried = Table(ResultTable(self.trials, _trial_metrics(self.choice)).screen(), bold=bold,
+                      note=TRIED)  # fmt: skip
+        found = [Section("Model and order", [tried])] if len(self.trials) > 1 else []
+        found.append(self._law())
+        blocks: list[Block] = [Text(self.text)]
+        if runs := self.choice.runs:
+            table = ResultTable(runs, _left_out_metrics(runs)).screen()
+            blocks += [Table(table, note=LEFT_OUT), Picture("left_out")]
+        found.append(Section("Points left out", blocks))
+        if self.at_points:
+            right, quiet = self.agreement(statuses)
+            n_quiet = sum(not oscillates for oscillates in statuses.values())
+            text = f"Oscillating or not, the law is right at {right} of {len(statuses)} points"
+            text += f"; at {quiet} of the {n_quiet} that do not oscillate" if n_quiet else ""
+            shown: Block = (
+                Picture("map")
+                if "map" in drawn
+                else Text("Nowhere on the map does the law's model oscillate." if self.map else "")
+            )
+            found.append(Section("Where it oscillates", [Text(f"{text}."), shown]))
+        return found
+
+    def _law(self) -> Section:
+        law, rows = self.law, _laws_table(self.law)
+        middle = self.middle
+        shown = [
+            {
+                "coefficient": f"{state}: {term}",
+                **{r["function"]: _number(r) for r in group.to_dict("records")},
+            }
+            for (state, term), group in rows.groupby(["state", "term"], sort=False)
+        ]
+        text = (
+            f"{len(law.coefficients)} coefficients of {len(law.functions)} functions each, "
+            f"{self.choice.n_numbers} numbers, from {len(law.points)} records. At {middle.label}:"
+        )
+        exact = [Text(f"exact at every point: {each}") for each in self.choice.fits.relations.texts]
+        model = self.model_at(middle.parameters)
+        equations: list[Block] = [display_equation(model, state) for state in model.states]
+        blocks = [*exact, Text(text), *equations, Table(pd.DataFrame(shown), note=INTERVALS)]
+        return Section(f"Law of {self.choice.name}", [*blocks, Picture("laws")])
+
+    @property
+    def middle(self) -> OperatingRecord:
+        """The record whose parameters are nearest to the mean of all."""
+        values = pd.DataFrame([dict(record.parameters) for record in self.records])
+        off = (values - values.mean()) / (values.max() - values.min()).replace(0.0, 1.0)
+        return self.records[int(np.square(off).sum(axis=1).to_numpy().argmin())]
+
+    def in_short(self, statuses: Mapping[str, bool], drawn: Mapping[str, Any]) -> Result:
+        """The law at the middle point, how it does at points left out, and what others do."""
+        middle, numbers = self.middle, self.statistics
+        model = self.model_at(middle.parameters)
+        best = {trial.name: trial for trial in sorted(self.trials, key=lambda t: -t.errors.mean())}
+        others = ", ".join(
+            f"{trial.name} {trial.errors.mean():.2g}"
+            for trial in reversed(best.values())
+            if trial.name != self.choice.name
+        )
+        lives = f"{numbers['n_lives']} of {numbers['n']} points live" if self.choice.runs else ""
+        blocks: list[Block] = [
+            *(display_equation(model, s, lead=f"at {middle.label}") for s in model.states),
+            Text(self.text.partition(". The records")[0]),
+        ]
+        if others:
+            own = f"{self.choice.errors.mean():.2g}"
+            blocks.append(Text(f"Errors where left out: {self.choice.name} {own}; {others}"))
+        if self.at_points:
+            right, _ = self.agreement(statuses)
+            blocks.append(Text(f"Oscillating or not, right at {right} of {len(statuses)} points"))
+        head = f"Found: a law over {', '.join(self.law.parameters)}, by the fit {self.choice.name}"
+        return Result(
+            f"{head}; left out one at a time, {lives}" if lives else head,
+            blocks,
+            load='ep.operating.OperatingLaw.load("{}/law.json")',
+            picture=next(name for name in ("map", "left_out", "laws") if name in drawn),
+        )
+
+    def summary(self, statuses: Mapping[str, bool]) -> dict[str, Any]:
+        fits = self.choice.fits
+        right, quiet = self.agreement(statuses) if self.at_points else (None, None)
+        return {
+            "fit": self.choice.name,
+            "cycle": self.cycle,
+            "terms": {s: list(self.law.numbers[s]) for s in self.law.states},
+            "exact": list(fits.relations.texts),
+            "functions": list(self.choice.functions.names),
+            "n_numbers": self.choice.n_numbers,
+            "errors": {
+                f"{t.name}, {len(t.functions)}": float(t.errors.mean()) for t in self.trials
+            },
+            "left_out": self.statistics,
+            "oscillating_or_not": {"right": right, "points": len(statuses), "quiet": quiet},
+        }
+
+    def headline(self, statuses: Mapping[str, bool]) -> dict[str, float]:
+        numbers = {key: float(value) for key, value in self.statistics.items()}
+        right = self.agreement(statuses)[0] / len(statuses) if self.at_points else np.nan
+        return {**numbers, "map_right": right}
 
 
-def left_out_metrics(points: Sequence[LeftOutPoint]) -> list[Metric[LeftOutPoint]]:
-    """Metrics of points left out; their cycle is shown if there are several."""
-    several = View.SHOWN if len({point.branch for point in points}) > 1 else View.FILES
-    forecast = View.SHOWN if any(point.skill for point in points) else View.FILES
-    factor, unit = frequency_scale(pd.Series([point.f_kHz for point in points]))
-    relative = percent(2, sign=True)
+def find_law(
+    results: Sequence[PointResult],
+    records: Sequence[OperatingRecord],
+    models: Mapping[str, GivenModel],
+    laws: Sequence[LawFunctions],
+    points: Sequence[Point],
+    *,
+    cycle: str,
+    n_map: int | None,
+    workers: Workers,
+    run: Run,
+) -> FoundLaw:
+    """Find the law of the records, of the models and functions that do best at points left out.
+
+    results, records: of the points of one cycle. models: by the name of the fit. points: all points
+    of the study, which the map encloses.
+    Raises ValueError if the records do not suffice for any of the laws.
+    """
+    pieces, reasons = [], []
+    for name, model in models.items():
+        fits = fits_of(name, model, results)
+        for each in laws:
+            functions = fits.functions(each)
+            try:
+                fits.rate_errors(functions)
+                pieces.append((name, fits, functions))
+            except ValueError as error:
+                reasons.append(str(error))
+    if not pieces:
+        raise ValueError(f"the {len(records)} points that oscillate get no law: {reasons[0]}")
+    stage = run.progress(len(pieces), "law", "laws at points left out")
+    trials = collect(workers, partial(_try_law, records=records), pieces, stage)
+    best = trials[fewest_of_least([(trial.errors, trial.n_numbers) for trial in trials])]
+    law, smooth = best.fits.law(best.functions), None
+    at_points: list[MapPoint] = []
+    grid: list[MapPoint] = []
+    if best.runs:
+        smooth = interpolation_errors(records, best.fits.basis(best.functions))
+        at_points = _follow(law, records, points, workers, run)
+        grid = _follow(law, records, map_points(points, n_map), workers, run) if n_map else []
+    return FoundLaw(cycle, records, trials, best, law, smooth, at_points, grid)
+
+
+def _try_law(piece: tuple[Any, ...], *, records: Sequence[OperatingRecord]) -> LawTrial:
+    name, fits, functions = piece
+    return try_law(name, fits, records, functions)
+
+
+def _follow(
+    law: OperatingLaw,
+    records: Sequence[OperatingRecord],
+    points: Sequence[Point],
+    workers: Workers,
+    run: Run,
+) -> list[MapPoint]:
+    pieces = [points[first : first + N_TOGETHER] for first in range(0, len(points), N_TOGETHER)]
+    stage = run.progress(len(points), "point", "map of the law")
+    maps = collect(workers, partial(law_map, law, records), pieces, stage, size=len)
+    return [point for piece in maps for point in piece]
+
+
+def _laws_table(law: OperatingLaw) -> pd.DataFrame:
+    """One row per coefficient and function of a law, with its 95 % interval."""
+    known = {} if law.covariance is None else law.intervals()
+    rows = [
+        (state, term, function, value, *known.get((state, term), {}).get(function, NO_ENDS))
+        for (state, term), row in zip(law.coefficients, law.coef.tolist(), strict=True)
+        for function, value in zip(law.functions.names, row, strict=True)
+    ]
+    return pd.DataFrame(rows, columns=["state", "term", "function", "value", "low", "high"])
+
+
+def _number(row: Mapping[Any, Any]) -> str:
+    """A number of a law with its error; one that is exact has none."""
+    reach = 0.5 * (row["high"] - row["low"])
+    return with_error(row["value"], reach) if reach else f"{row['value']:g}"
+
+
+def _trial_metrics(choice: LawTrial) -> list[Metric[LawTrial]]:
+    def f_error(trial: LawTrial) -> float:
+        return error_statistics(trial.runs)["f_median"] if trial.runs else np.nan
+
+    def terms(trial: LawTrial) -> str:
+        common = trial.fits.relations.common
+        return terms_text(
+            {s: [t for state, t in common.coefficients if state == s] for s in common.states}
+        )
+
+    def marked(trial: LawTrial) -> str:
+        return trial.name + ("  <- chosen" if trial is choice else "")
+
+    rates = View.FILES if choice.runs else View.SHOWN
     return [
-        Metric("branch", lambda p: p.branch, several, "cycle"),
-        *(_parameter(name) for name in points[0].record.parameters),
+        Metric("fit", lambda trial: trial.name),
+        Metric("fit", marked, View.SCREEN),
+        Metric("terms", terms),
+        Metric("functions", lambda trial: ", ".join(trial.functions.names), View.SHOWN),
+        Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
+        Metric("error", lambda trial: float(trial.errors.mean()), View.SHOWN),
+        Metric("f_error", f_error, View.SHOWN, format=percent(2)),
+        Metric("rate_error", lambda t: float(np.median(t.rate_errors)), rates, format=percent(2)),
+        Metric("chosen", lambda trial: trial is choice),
+    ]
+
+
+def _left_out_metrics(runs: Sequence[LeftOutRun]) -> list[Metric[LeftOutRun]]:
+    def f_kHz(left_out: LeftOutRun) -> float:
+        return 1e-3 * left_out.record.cycle.frequency_Hz
+
+    factor, unit = frequency_scale(pd.Series([f_kHz(each) for each in runs] or [1.0]))
+    relative = percent(2, sign=True)
+    names = list(runs[0].record.parameters) if runs else []
+    return [
+        *(Metric(n, lambda p, n=n: p.record.parameters[n], View.SHOWN, n, "{:g}") for n in names),
         Metric(
             "enclosed",
-            lambda p: p.result.inside,
+            lambda p: p.inside,
             View.SHOWN,
             format=lambda inside: "yes" if inside else "no",
         ),
-        Metric("f_kHz", lambda p: p.f_kHz),
-        Metric("f", lambda p: factor * p.f_kHz, View.SCREEN, f"f ({unit})", "{:.2f}"),
-        Metric("f_model_kHz", lambda p: p.f_kHz * (1.0 + p.result.run.f_error)),
-        Metric("f_error", lambda p: p.result.run.f_error, View.SHOWN, format=relative),
+        Metric("f_kHz", f_kHz),
+        Metric("f", lambda p: factor * f_kHz(p), View.SCREEN, f"f ({unit})", "{:.2f}"),
+        Metric("f_model_kHz", lambda p: f_kHz(p) * (1.0 + p.run.f_error)),
+        Metric("f_error", lambda p: p.run.f_error, View.SHOWN, format=relative),
         Metric(
             "amplitude",
-            lambda p: p.result.run.amplitude_ratio,
+            lambda p: p.run.amplitude_ratio,
             View.SHOWN,
             "amplitude {}",
             lambda ratio: relative(ratio - 1.0),
         ),
-        Metric(
-            "waveform", lambda p: p.result.run.waveform_error, View.SHOWN, "waveform {}", "{:.3f}"
-        ),
-        Metric("verdict", lambda p: str(p.result.run.verdict), View.SHOWN),
-        Metric("forecast", lambda p: p.forecast_error(MODEL), forecast, format="{:.3f}"),
-        Metric(
-            "autoregression", lambda p: p.forecast_error(AUTOREGRESSION), forecast, "AR", "{:.3f}"
-        ),
-        Metric("also", lambda p: p.also, several),
+        Metric("waveform", lambda p: p.run.waveform_error, View.SHOWN, "waveform {}", "{:.3f}"),
+        Metric("verdict", lambda p: str(p.run.verdict), View.SHOWN),
     ]
-
-
-def _parameter(name: str) -> Metric[LeftOutPoint]:
-    return Metric(name, lambda p: p.record.parameters[name], View.SHOWN, name, "{:g}")
-
-
-def structures_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
-    """One row per structure and degree tried, with the weighted laws' errors at points left out."""
-    tables = [
-        ResultTable(branch.trials, structure_metrics(name, branch)).csv()
-        for name, branch in branches.items()
-    ]
-    return pd.concat(tables, ignore_index=True)
-
-
-def structure_metrics(name: str, branch: Branch) -> list[Metric[StructureTrial]]:
-    def is_chosen(trial: StructureTrial) -> bool:
-        return trial is branch.choice
-
-    def marked(trial: StructureTrial) -> str:
-        text = trial.case.name or terms_text(trial.fit.structure)
-        return text + ("  <- chosen" if is_chosen(trial) else "")
-
-    return [
-        Metric("branch", lambda trial: name),
-        Metric("model", lambda trial: trial.case.name),
-        Metric("terms", lambda trial: terms_text(trial.fit.structure)),
-        Metric("model" if branch.choice.case.name else "terms", marked, View.SCREEN),
-        Metric("degree", lambda trial: trial.degree, View.SHOWN),
-        Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
-        Metric("error", lambda trial: float(trial.errors.mean()), View.SHOWN),
-        Metric(
-            "f_error",
-            lambda trial: error_statistics(trial.left_out)["f_median"],
-            View.SHOWN,
-            format=percent(2),
-        ),
-        Metric(
-            "diverging", lambda trial: error_statistics(trial.left_out)["diverging"], View.SHOWN
-        ),
-        Metric("chosen", is_chosen),
-    ]
-
-
-def map_table(branches: Mapping[str, Branch], which: str) -> pd.DataFrame:
-    """The law's models over the map, or at the points of the study (`at_points`)."""
-    rows = []
-    for name, branch in branches.items():
-        points: Sequence[MapPoint] = branch.map if which == "map" else branch.at_points
-        for point in points:
-            rows.append({"branch": name, **point.row})
-    return pd.DataFrame(rows)
-
-
-def agreement(
-    branches: Mapping[str, Branch], statuses: Mapping[str, str]
-) -> tuple[int, int, int, int]:
-    """How often laws predict rightly whether a point oscillates, over all points and quiet ones.
-
-    Returns (right, all points, right among the quiet points, quiet points).
-    """
-    says = dict.fromkeys(statuses, False)
-    for branch in branches.values():
-        for point in branch.at_points:
-            label = point_label(point.parameters)
-            says[label] = says[label] or point.fate is Fate.OSCILLATES
-    quiet = [label for label, status in statuses.items() if status != Oscillation.OSCILLATING]
-    right = [says[label] == (statuses[label] == Oscillation.OSCILLATING) for label in statuses]
-    return sum(right), len(right), sum(not says[label] for label in quiet), len(quiet)
-
-
-def advice_if_none_lives(branch: Branch, degrees: Sequence[int], *, searched: bool) -> str:
-    """What to try if no point left out lives; empty if one does.
-
-    degrees: that were tried. searched: whether terms were searched for, and not given.
-    """
-    if error_statistics(branch.left_out)["n_lives"]:
-        return ""
-    n = len(branch.left_out)
-    lower = "" if min(degrees) == 1 else "degrees=[1], "
-    terms = "more terms, structures.max_terms" if searched else "other models, or models=null"
-    return (
-        f"none of {n_points(n)} left out lives by the law of the others, so it predicts none "
-        f"between them: try points that lie closer together, {lower}{terms}, longer records, and "
-        "inputs that are states (docs/predict.md)"
-    )
-
-
-def left_out_text(branch: Branch) -> str:
-    """How the law does at the points left out, in the median, and beside plain interpolation."""
-    found = error_statistics(branch.left_out)
-    smooth_f, smooth_amplitude = branch.smooth
-    text = percent(2)
-    most = f"nine in ten within {text(found['f_90'])}"
-    if not np.isfinite(found["f_90"]):
-        most = "more than one in ten do not oscillate"
-    return (
-        f"Left out one at a time, {found['n_lives']} of {found['n']} points live, diverging: "
-        f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} "
-        f"({most}), the worst state's amplitude "
-        f"{text(found['amplitude_median'])} and waveform {places(found['waveform_median'], 3)}. "
-        "The records' own frequencies and amplitudes, interpolated by the same functions, miss by "
-        f"{text(float(np.median(smooth_f)))} and {text(float(np.median(smooth_amplitude)))} in the "
-        "median."
-    )
-
-
-def best_fit(fits: Iterable[str], results: Sequence[PointResult], laws: Laws) -> str:
-    """The fit whose laws miss left-out points least, of those done at the most points."""
-
-    def rank(fit: str) -> tuple[int, float]:
-        n_done = sum(result.usable(fit) for result in results)
-        errors = [law.search_error for law in laws.get(fit, {}).values()]
-        mean = float(np.mean(errors)) if errors else np.inf
-        return -n_done, mean if np.isfinite(mean) else np.inf
-
-    return min(fits, key=rank)
-
-
-# A control law with its fit and quantity. Its errors are those at points left out.
-CONTROL_LAW: Metrics[tuple[str, str, ControlLaw]] = [
-    Metric("fit", lambda row: row[0], View.CSV),
-    Metric("quantity", lambda row: row[1], View.CSV),
-    Metric("law", lambda row: Equation(row[1], row[2].coef_by_term, rate=False), View.CSV),
-    Metric("terms", lambda row: row[2].coef_by_term, View.JSON),
-    Metric("r2", lambda row: row[2].r2),
-    Metric("loo_error", lambda row: row[2].loo_error),
-    Metric("search_error", lambda row: row[2].search_error),
-]
-
-
-def control_laws_table(laws: Laws) -> pd.DataFrame:
-    """One row per control law."""
-    rows = [(fit, name, law) for fit, of_fit in laws.items() for name, law in of_fit.items()]
-    return ResultTable(rows, CONTROL_LAW).csv()
-
-
-def control_laws_summary(laws: Laws) -> dict[str, Any]:
-    """Terms and errors of every control law, by fit and quantity."""
-    return {
-        fit: {name: facts((fit, name, law), CONTROL_LAW) for name, law in of_fit.items()}
-        for fit, of_fit in laws.items()
-    }
-
-
-def law_errors(laws: Laws, fits: Mapping[str, Case]) -> dict[str, float]:
-    """Prediction error of the laws by fit and quantity; NaN for a law that was not found."""
-    found = control_laws_summary(laws)
-    return {
-        f"law/{fit}/{name}/{key}": found.get(fit, {}).get(name, {}).get(key, np.nan)
-        for fit, case in fits.items()
-        for name in case.quantities
-        for key in ("loo_error", "search_error")
-    }
-
-
-def published_table(
-    thesis: Mapping[str, Sequence[Mapping[str, float]]], parameters: Sequence[str]
-) -> pd.DataFrame:
-    """One row per published value: parameters, fit, quantity, value.
-
-    thesis: fit -> points, each with its parameters and quantities.
-    Raises ValueError for a published point without all parameters, or with nothing else.
-    """
-    rows = []
-    for fit, points in thesis.items():
-        for point in points:
-            if not set(parameters) < set(point):
-                raise ValueError(
-                    f"thesis must give {list(parameters)} and quantities at every point, or be "
-                    f"null: {point} came"
-                )
-            at = {name: point[name] for name in parameters}
-            found = {name: value for name, value in point.items() if name not in at}
-            rows += [{**at, "fit": fit, "quantity": q, "value": v} for q, v in found.items()]
-    table = pd.DataFrame(rows, columns=[*parameters, "fit", "quantity", "value"])
-    return table.astype(dict.fromkeys(parameters, float))
-
-
-def number_text(value: float, reach: float) -> str:
-    """A number of a law with its error; one that is exact has none."""
-    return with_error(value, reach) if reach else f"{value:g}"
-
-
-def n_points(n: int) -> str:
-    """`1 point`, `3 points`."""
-    return f"{n} point" if n == 1 else f"{n} points"

@@ -1,223 +1,417 @@
-"""Operating points of a study: their data, and the records that are made of these."""
+"""One model at many operating points, and its laws: `+exp=parametric` and `+exp=predict`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import product
-from typing import Annotated, Any
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
-from ep2sindy.data.quantities import STEP_DOUBT
-from ep2sindy.data.trajectory import ConstantStateError
-from ep2sindy.operating.file_names import FilePattern
-from ep2sindy.operating.records import OperatingRecord, name_point, point_label
-from ep2sindy.report.run import Run
-from ep2sindy.runtime.parallel import Workers, collect
-from ep2sindy.signals.spectrum import Oscillation
-from ep2sindy.studies.source import DivergedError, Source, amiss, is_simulation, quiet
-from ep2sindy.studies.study import Check, Deferred
+import numpy as np
+import pandas as pd
 
-QUIET = (
-    "their statuses are above; try the part of the records behind the start-up "
-    "('prepare=[{_target_:ep2sindy.prepare.crop,start_s:...}]'), another zone "
-    "(trajectory.zone.z=...), or other points"
+from ep2sindy.data.trajectory import point_label
+from ep2sindy.discovery.method import Regression
+from ep2sindy.library.library import Library, named_terms, polynomial
+from ep2sindy.model.model import SparseModel
+from ep2sindy.discovery.discover import discover
+from ep2sindy.operating.given_models import (
+    REFINED,
+    FittingSettings,
+    GivenModel,
+    PointResult,
+    fit_models,
 )
-WITHOUT_BREATHING = (  # attributes of a simulation
-    Oscillation.STEADY, Oscillation.DECAYING, Oscillation.TRANSIT, Oscillation.DIVERGED,
-)  # fmt: skip
+from ep2sindy.operating.law import Known, constrain_law, make_basis
+from ep2sindy.operating.quantities import Quantity
+from ep2sindy.operating.records import OperatingRecord, branches_of, read_points
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.report.document import Block, Captioned, Result, Section, Text
+from ep2sindy.report.results import json_rows
+from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers
+from ep2sindy.signals.spectrum import Oscillation
+from ep2sindy.studies.fits import Terms, terms_of
+from ep2sindy.studies.law_tables import FoundLaw, find_law
+from ep2sindy.studies.point_sources import (
+    QUIET,
+    GivenPoints,
+    OpenedPoint,
+    Points,
+    given_points,
+    open_points,
+)
+from ep2sindy.studies.quantity_tables import FoundQuantities, check_published
+from ep2sindy.studies.resume import resumed
+from ep2sindy.studies.source import Source, compile_kernels
+from ep2sindy.studies.study import Count, CountOrNone, Positive
+from ep2sindy.studies.views import coefficients, display_equation
 
-Points = Annotated[
-    Sequence[Mapping[str, Any]] | str,
-    Check(
-        "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}], or a pattern of files, "
-        "'points.files=runs/V{V_D_V}_m{mdot_mg_s}.csv'",
-        lambda value: isinstance(value, list | str) and bool(value),
-    ),
-]
+FOUND = "found"  # name of the model whose terms were searched for
 
 
 @dataclass(frozen=True)
-class GivenPoints:
-    """Operating points as they were given.
+class ModelSettings:
+    """The terms of every state, with relations and known coefficients that hold at every point.
 
-    places: parameter -> its place in the data group; None if it has none. points: values of all
-    parameters, and `data` for other differences from the data group. left_out: files that a pattern
-    nearly fits.
+    quantities: what coefficients stand for; their control laws and trends are found.
     """
 
-    places: Mapping[str, str | None]
-    points: Sequence[Mapping[str, Any]]
-    left_out: Sequence[str] = ()
-
-    @property
-    def names(self) -> list[str]:
-        return list(self.places)
-
-    def sources(self, source: Source) -> list[PointSource]:
-        return point_sources(source, self.places, self.points)
-
-    def tell(self, run: Run) -> None:
-        """Report the files that are no points."""
-        if self.left_out:
-            run.say(f"left out, for their names hold no number there: {', '.join(self.left_out)}")
+    terms: Terms
+    relations: Sequence[str] = ()
+    known: Known = field(default_factory=dict)
+    quantities: Mapping[str, Quantity] = field(default_factory=dict)
 
 
-def given_points(
-    points: Sequence[Mapping[str, Any]] | str, parameters: Mapping[str, str | None], source: Source
-) -> GivenPoints:
-    """Operating points of a config: a list, or the files of a pattern, which names the parameters.
+@dataclass(frozen=True)
+class Windows:
+    """Windows of every record: number, and length in periods of its oscillation."""
 
-    Raises ValueError for a pattern beside data that are not read from files, or that no file fits.
-    """
-    if not isinstance(points, str):
-        return GivenPoints(parameters, points)
-    if "path" not in source.data.settings:
-        raise ValueError(
-            "points of files need data that are read from files: "
-            f"{source.data.settings['_target_']} came with {points!r}; add data=recognised, or "
-            "data=NAME for a config that ep2sindy inspect --write made of them"
-        )
-    pattern = FilePattern(points)
-    found, others = pattern.points()
-    given = [{**values, "data": {"path": file}} for file, values in found.items()]
-    return GivenPoints(dict.fromkeys(pattern.names), given, others)
+    n_windows: Count
+    periods: Positive
+
+
+Laws = Sequence[Count | Sequence[str]]  # degrees, or lists of functions of the parameters
 
 
 @dataclass(frozen=True, eq=False)
-class PointSource:
-    """One operating point and the source of its data. It can be sent to another process."""
+class Study:
+    """Fit models at all operating points that oscillate, and find how they depend on the point.
 
-    parameters: Mapping[str, float]
+    parameters: the place of each parameter in the data group; None if it has none. points: blocks,
+    each with one value or a list of values for all parameters, and `data` for other differences
+    from the data group; or the pattern of files, which names the parameters.
+    models: by name; None searches products of the states up to a degree for terms that are the same
+    at all points. windows: of the
+    refinements. laws: of whole models, of which one is selected at points left out; None: none.
+    map_points: number of points along each parameter, of a map over these laws; None: no map.
+    labels: names of parameters and quantities in figures. thesis: published quantities by model.
+    keep: whether a run goes on with the finished pieces of one that was broken off.
+    """
+
     source: Source
+    formulation: Formulation
+    parallel: Workers
+    parameters: Mapping[str, str | None]
+    points: Points
+    models: Mapping[str, ModelSettings] | None
+    windows: Windows
+    laws: Laws | None
+    labels: Mapping[str, str]
+    map_points: CountOrNone = None
+    degree: Count = 2
+    thesis: Mapping[str, Sequence[Mapping[str, float]]] | None = None
+    keep: bool = True
+
+    def __post_init__(self) -> None:
+        self._given_models(self.models or {})
+        check_published(self.thesis or {}, self._given.names)
+        sources, names = self._given.sources(self.source), self._given.names
+        points = read_points([source.parameters for source in sources], names)
+        if self.laws:
+            # Points too few for a law, even if all oscillate, are refused before any simulation.
+            smallest = min((self._functions(law) for law in self.laws), key=len)
+            remedy = "give it more values, or leave it out (~parameters.{name})"
+            make_basis(smallest, points, n_spare=1, remedy=remedy)
+
+    def compute(self, run: Run) -> Outcome:
+        self._given.tell(run)
+        if "path" in self.source.data.settings and (words := self._known_beside_files()):
+            run.say(words)
+        sources = self._given.sources(self.source)
+        with run.progress(None, "", "kernels, compiled once"):
+            compile_kernels([source.source.data for source in sources])
+        with resumed(self.keep, run, self.parallel) as workers:
+            inputs = self.source.inputs([self._given_models(self.models or {})[0]])
+            opened = open_points(sources, inputs, workers=workers, run=run)
+            return self._found(opened, workers, run)
+
+    def _found(self, opened: Sequence[OpenedPoint], workers: Workers, run: Run) -> Outcome:
+        models = self.models or self._search(opened, run)
+        library, given = self._given_models(models)
+        windows = self.windows
+        how = FittingSettings(library, self.formulation, windows.n_windows, windows.periods)
+        (rng, _) = np.random.default_rng(run.seed).spawn(2)
+        fitted = fit_models(
+            [point.run for point in opened], given, how, workers=workers, rng=rng,
+            tell=lambda k, result: run.board.scalars(_live(result), step=k), progress=run.watch,
+        )  # fmt: skip
+        results = [
+            fitted.get(k, PointResult(point.parameters, point.status))
+            for k, point in enumerate(opened)
+        ]
+        if not any(result.fits for result in results):
+            run.warn("none of the operating points oscillates, so there is no fit: " + QUIET)
+        quantities = None
+        if any(model.quantities for model in given.values()):
+            quantities = FoundQuantities(library, given, results, self.thesis or {}, self.labels)
+        cycles, law = dict[str, str](), None
+        if self.laws:
+            cycles, law = self._law(opened, results, given, workers, run)
+        return Outcome(opened, results, given, quantities, cycles, law, self.labels)
+
+    def _law(
+        self,
+        opened: Sequence[OpenedPoint],
+        results: Sequence[PointResult],
+        given: Mapping[str, GivenModel],
+        workers: Workers,
+        run: Run,
+    ) -> tuple[dict[str, str], FoundLaw]:
+        """The cycle of every record by its label, and the law of those on the main one."""
+        records = {}
+        for point, result in zip(opened, results, strict=True):
+            if point.run is not None and result.fits:
+                try:
+                    record = OperatingRecord(point.run)
+                    _ = record.cycle
+                    records[point.label] = record, result
+                except ValueError as error:
+                    run.warn(str(error))
+        if not records:
+            raise ValueError(
+                "a law needs operating points that oscillate: none of these does; " + QUIET
+            )
+        cycles = dict(zip(records, name_cycles([r for r, _ in records.values()]), strict=True))
+        main, n_main = Counter(cycles.values()).most_common(1)[0]
+        if len(records) > n_main:
+            others = ", ".join(label for label, cycle in cycles.items() if cycle != main)
+            run.warn(
+                f"two cycles coexist: the law is that of the {n_main} points on the {main} one; "
+                f"on the other are {others}"
+            )
+        run.say(f"fitting a law to {n_main} points ...")
+        used = [pair for label, pair in records.items() if cycles[label] == main]
+        law = find_law(
+            [result for _, result in used],
+            [record for record, _ in used],
+            {name + REFINED: model for name, model in given.items()},
+            [self._functions(each) for each in self.laws or ()],
+            [point.parameters for point in opened],
+            cycle=main, n_map=self.map_points, workers=workers, run=run,
+        )  # fmt: skip
+        run.write("law.json", law.law.save)
+        if law.advice:
+            run.warn(law.advice)
+        return cycles, law
+
+    def _search(self, opened: Sequence[OpenedPoint], run: Run) -> dict[str, ModelSettings]:
+        """The terms that a search of all points finds, as one model."""
+        runs = [point.run for point in opened if point.run is not None]
+        if not runs:
+            raise ValueError("a search needs points that oscillate: none of these does; " + QUIET)
+        library = polynomial(self.source.states, degree=self.degree)
+        found = discover(
+            runs, library, Regression(), shared=True, seed=run.seed, progress=run.watch
+        )
+        return {FOUND: ModelSettings({s: front.chosen for s, front in found.fronts.items()})}
+
+    def _functions(self, law: int | Sequence[str]) -> Library:
+        names = self._given.names
+        return polynomial(names, degree=law) if isinstance(law, int) else named_terms(names, law)
+
+    @cached_property
+    def _given(self) -> GivenPoints:
+        return given_points(self.points, self.parameters, self.source)
+
+    def _given_models(
+        self, models: Mapping[str, ModelSettings]
+    ) -> tuple[Library, dict[str, GivenModel]]:
+        """The models, and a library that holds the terms of all of them."""
+        states, parameters = self.source.states, self._given.names
+        terms = {name: terms_of(own.terms, states=states, key=f"models.{name}.terms")[1]
+                 for name, own in models.items()}  # fmt: skip
+        together = {
+            s: list(dict.fromkeys(term for own in terms.values() for term in own[s]))
+            for s in states
+        }
+        if not models:
+            return polynomial(states, degree=self.degree), {}
+        library, _ = terms_of(together, states=states, key="models")
+        found = {}
+        for name, own in models.items():
+            try:
+                relations = constrain_law(
+                    library, terms[name], own.relations, own.known, parameters=parameters
+                )
+                for quantity in own.quantities.values():
+                    quantity.place(relations.common, library)
+            except ValueError as error:
+                raise ValueError(
+                    f"models.{name} cannot hold: {error} (or leave it out: ~models.{name})"
+                ) from error
+            found[name] = GivenModel(relations, own.quantities)
+        return library, found
+
+    def _known_beside_files(self) -> str:
+        """What the models hold for known beside data of files, and how to change it; or nothing."""
+        places = [
+            f"models.{name}.known.{state}.{term}.{function}={factor:g}"
+            for name, model in (self.models or {}).items()
+            for state, terms in model.known.items()
+            for term, factors in terms.items()
+            for function, factor in factors.items()
+        ]
+        if not places:
+            return ""
+        return (
+            f"data are files, and models hold a known inflow, {places[-1]}, which as shipped is "
+            "that of the package's thruster; set it to that of yours, for each model that has one, "
+            f"or leave such models out: ~models.{places[-1].split('.')[1]}"
+        )
+
+
+def name_cycles(records: Sequence[OperatingRecord]) -> list[str]:
+    """The cycle of every record: `all` if there is one, else `strong` or `weak`."""
+    number = branches_of(records)
+    return ["all"] * len(records) if not number.any() else [("strong", "weak")[n] for n in number]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Results of all points, and what depends on the point: quantities, and the law of models.
+
+    cycles: of the records of a law, by label. labels: names in figures.
+    """
+
+    opened: Sequence[OpenedPoint]
+    results: Sequence[PointResult]
+    given: Mapping[str, GivenModel]
+    quantities: FoundQuantities | None
+    cycles: Mapping[str, str]
+    law: FoundLaw | None
+    labels: Mapping[str, str]
+
+    def models(self) -> dict[str, SparseModel]:
+        """Models by number of the point and name of the fit, and those of the law."""
+        found = {
+            f"point_{number}_{name}": fit.model
+            for number, result in enumerate(self.results)
+            for name, fit in result.fits.items()
+        }
+        if self.law is not None:
+            for number, record in enumerate(self.law.records):
+                found[f"law_{number}"] = self.law.model_at(record.parameters)
+        return found
+
+    @cached_property
+    def _points(self) -> pd.DataFrame:
+        """One row per operating point: status of its record, its cycle, and what the law says."""
+        known = {} if self.law is None else {r.label: r for r in self.law.records}
+        rows = []
+        for k, (point, result) in enumerate(zip(self.opened, self.results, strict=True)):
+            record = known.get(point.label)
+            row: dict[str, Any] = {
+                **point.parameters,
+                "status": result.status,
+                "branch": self.cycles.get(point.label, ""),
+                "f_kHz": 1e-3 * (record.cycle.frequency_Hz if record else result.f_Hz),
+                "n_samples": result.n_samples,
+                "dt_s": result.dt_s,
+                **{f"spread_{state}": value for state, value in result.spread.items()},
+            }
+            if record is None and point.run is not None and point.label in self.cycles:
+                record = OperatingRecord(point.run)
+            row["relative_amplitude"] = record.relative_amplitude if record else np.nan
+            if self.law is not None and self.law.at_points:
+                row["law"] = str(self.law.at_points[k].fate)
+            rows.append(row)
+        return pd.DataFrame(rows)
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        rows = [
+            {**result.parameters, "fit": fit, "status": fitted.status, "loss": fitted.loss,
+             **{f"r2_{state}": value for state, value in fitted.r2.items()}}
+            for result in self.results
+            for fit, fitted in result.fits.items()
+        ]  # fmt: skip
+        found = {"points": self._points, "fits": pd.DataFrame(rows)}
+        found["coefficients_alone"] = coefficients(
+            {f"{point_label(r.parameters)}, {name}": fit.model
+             for r in self.results for name, fit in r.fits.items()},
+            heading="model",
+        )  # fmt: skip
+        if self.quantities is not None:
+            found |= self.quantities.tables()
+        return found if self.law is None else found | self.law.tables()
+
+    def figures(self) -> dict[str, Captioned]:
+        found = {} if self.quantities is None else self.quantities.figures()
+        return found if self.law is None else found | self._law_figures
+
+    @cached_property
+    def _law_figures(self) -> dict[str, Captioned]:
+        assert self.law is not None
+        return self.law.figures(self._points, self.labels)
 
     @property
-    def label(self) -> str:
-        return point_label(self.parameters)
+    def _oscillates(self) -> dict[str, bool]:
+        pairs = zip(self.opened, self.results, strict=True)
+        return {point.label: result.status == Oscillation.OSCILLATING for point, result in pairs}
 
-    def open(self, inputs: Sequence[str]) -> OperatingRecord:
-        """Open or simulate the point; a point that does not breathe comes without a trajectory.
+    def in_short(self) -> Result:
+        """What was found: by the law where models run freely, else by quantities."""
+        if self.law is not None:
+            return self.law.in_short(self._oscillates, self._law_figures)
+        if self.quantities is not None:
+            return self.quantities.in_short()
+        n = sum(bool(result.fits) for result in self.results)
+        return Result(f"Found: {len(self.given)} models at {n} operating points that oscillate", [])
 
-        A state that stays exactly constant makes a point steady, as no trajectory may hold it.
-        """
-        with name_point(self.parameters):
-            try:
-                field = self.source.field()
-                if (status := field.attrs.get("status")) in WITHOUT_BREATHING:
-                    return OperatingRecord(self.parameters, None, status)
-                sampling = self.source.trajectory
-                run = sampling.trajectory(field, inputs=inputs, label=self.label)
-                doubts = [field.attrs[STEP_DOUBT]] if STEP_DOUBT in field.attrs else []
-                notes = amiss(field.attrs) if is_simulation(field.attrs) else doubts
-                words = [field.attrs.get("file", ""), sampling.place(field)]
-                used = "; ".join(word for word in words if word)
-                return OperatingRecord(self.parameters, run, notes=notes, used=used)
-            except DivergedError:
-                return OperatingRecord(self.parameters, None, Oscillation.DIVERGED)
-            except ConstantStateError:
-                return OperatingRecord(self.parameters, None, Oscillation.STEADY)
+    def sections(self) -> list[Section]:
+        fitted = [result for result in self.results if result.fits]
+        found = [Section("Operating points", [Text(line) for line in self._lines()])]
+        for name in self.given if fitted and self.law is None else ():
+            model = fitted[0].fits[name].model
+            blocks: list[Block] = [
+                display_equation(model, state, on_screen=False) for state in model.states
+            ]
+            found.append(Section(f"{name}, at {point_label(fitted[0].parameters)}", blocks))
+        if self.quantities is not None and fitted:
+            found += self.quantities.sections()
+        if self.law is not None:
+            found += self.law.sections(self._oscillates, self._law_figures)
+        return found
 
+    def _lines(self) -> Iterator[str]:
+        """`26 oscillating`, `2 steady at V_D_V, mdot_mg_s = (150, 3), (175, 2)`, `UNITS`."""
+        groups: dict[str, list[Mapping[str, float]]] = {}
+        for result in self.results:
+            groups.setdefault(result.status, []).append(result.parameters)
+        for status, points in groups.items():
+            if status == Oscillation.OSCILLATING:
+                yield f"{len(points)} {status}"
+                continue
+            texts = [", ".join(f"{value:g}" for value in point.values()) for point in points]
+            texts = [f"({text})" for text in texts] if len(points[0]) > 1 else texts
+            yield f"{len(points)} {status} at {', '.join(points[0])} = {', '.join(texts)}"
+        yield "Units are SI, unless a name ends in another, such as mdot_mg_s."
 
-def expand(blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]) -> list[dict[str, Any]]:
-    """Every combination of the values in each block; repeated points count once.
+    def summary(self) -> dict[str, Any]:
+        tables = self.tables()
+        found: dict[str, Any] = {name: json_rows(tables[name]) for name in ("points", "fits")}
+        if self.quantities is not None:
+            kept = tables["control_laws"].assign(law=tables["control_laws"]["law"].map(str))
+            found["quantities"] = json_rows(tables["quantities"])
+            found |= {"control_laws": json_rows(kept), "trends": json_rows(tables["trends"])}
+            found["best_fit"] = self.quantities.best
+        return found if self.law is None else found | {"law": self.law.summary(self._oscillates)}
 
-    Points are repeated if they have the same values and the same data. 300 and 300.0 are equal, and
-    the order of parameters in a block does not matter.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    for block in blocks:
-        lists = {
-            name: value if isinstance(value, list) else [value]
-            for name, value in block.items()
-            if name in parameters
+    def headline(self) -> dict[str, float]:
+        found = {
+            "n_points": float(len(self.results)),
+            "n_oscillating": float(sum(bool(result.fits) for result in self.results)),
         }
-        rest = {name: value for name, value in block.items() if name not in lists}
-        for values in product(*lists.values()):
-            point = {**dict(zip(lists, values, strict=True)), **rest}
-            same = {name: float(v) if type(v) is int else v for name, v in point.items()}
-            found.setdefault(str(sorted(same.items(), key=lambda item: item[0])), point)
-    return list(found.values())
+        if self.quantities is not None:
+            found |= self.quantities.headline()
+        return found if self.law is None else found | self.law.headline(self._oscillates)
 
 
-def point_sources(
-    source: Source, places: Mapping[str, str | None], points: Sequence[Mapping[str, Any]]
-) -> list[PointSource]:
-    """The source once per operating point, with its parameters and data in the data group.
-
-    places: parameter -> its place in the data group; None if it has none.
-    Raises ValueError for points without all parameters, or that would open the same data twice.
-    """
-    names = list(places)
-    if not points:
-        raise ValueError(f"points must be a list with all of {names} each: {points!r} came")
-    found, seen = [], dict[str, str]()
-    for given in points:
-        parameters = _parameters(given, names)
-        changes = {place: parameters[name] for name, place in places.items() if place is not None}
-        data = _changed(source.data, changes, given.get("data", {}))
-        point = PointSource(parameters, replace(source, data=data))
-        if point.label in seen.values():
-            raise ValueError(f"an operating point may come once: {point.label} comes again")
-        if (same := str(data)) in seen:
-            raise ValueError(
-                f"operating points must differ in their data: {point.label} has that of "
-                f"{seen[same]}; say in parameters where the data group takes them, or give each "
-                "point its data"
-            )
-        seen[same] = point.label
-        found.append(point)
-    return found
-
-
-def open_points(
-    sources: Sequence[PointSource], inputs: Sequence[str], *, workers: Workers, run: Run
-) -> list[OperatingRecord]:
-    """Open or simulate all points, and report their data and warnings."""
-    stage = run.progress(len(sources), "point opened")
-    points = collect(workers, partial(PointSource.open, inputs=inputs), sources, stage)
-    used = {point.label: point.used for point in points if point.used}
-    if len(alike := {*used.values()}) == 1:  # all points are averaged alike
-        run.say(f"data: {alike.pop()}")
-    else:
-        for label, words in used.items():
-            run.say(f"data: {label}: {words}")
-    for point in points:
-        for note in point.notes:
-            run.warn(f"{point.label}: {note}")
-    return points
-
-
-def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:
-    if set(given) - {"data"} != set(names) or not isinstance(given.get("data", {}), Mapping):
-        raise ValueError(f"a point must have {names}, and data where they differ: {given!r} came")
-    for name in names:
-        if type(given[name]) not in (int, float):
-            raise ValueError(f"points must give {name} as a number: {given[name]!r} came")
-    return {name: float(given[name]) for name in names}
-
-
-def _changed(data: Deferred, places: Mapping[str, float], more: Mapping[str, Any]) -> Deferred:
-    try:
-        data = data.changed(places)
-    except ValueError as error:
-        raise ValueError(
-            f"parameters must name numbers of the data group, or be null: {error}"
-        ) from error
-    return quiet(data.changed({}, more))
-
-
-def oscillating_records(
-    opened: Sequence[OperatingRecord], run: Run
-) -> tuple[list[OperatingRecord], dict[str, str]]:
-    """The records that hold enough periods, and the status of every point by its label."""
-    records, statuses = [], {}
-    for point in opened:
-        statuses[point.label] = point.status
-        if point.trajectory is None:
-            continue
-        try:
-            records.append(OperatingRecord.of(point.parameters, point.trajectory))
-        except ValueError as error:
-            statuses[point.label] = Oscillation.NO_PERIOD
-            run.warn(str(error))
-    return records, statuses
+def _live(result: PointResult) -> dict[str, float]:
+    """Scalars that TensorBoard shows for a point as soon as it is done."""
+    scalars: dict[str, float] = {}
+    for fit, fitted in result.fits.items():
+        scalars |= {f"{fit}/{name}": each.value for name, each in fitted.estimates.items()}
+        scalars |= {f"{fit}/r2/{state}": value for state, value in fitted.r2.items()}
+    return scalars

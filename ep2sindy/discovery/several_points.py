@@ -1,0 +1,215 @@
+"""Equations at several operating points: one support for all, its coefficients, and their law."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.data.coerce import Task
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.choice import as_in
+from ep2sindy.discovery.method import DiscoveryMethod, Regression, TrajectorySearch
+from ep2sindy.discovery.result import Discovery
+from ep2sindy.discovery.shared_support import SharedFront, check_shared, search_shared
+from ep2sindy.library.relations import Constraint, Relation
+from ep2sindy.operating.law import (
+    Known,
+    LawConstraint,
+    OperatingLaw,
+    constrain_law,
+    law_of_constraint,
+)
+from ep2sindy.operating.left_out import fewest_of_least
+from ep2sindy.operating.point_fits import LawFunctions, PointFits, fit_rows, fit_trajectories
+from ep2sindy.operating.records import most_central, read_points
+from ep2sindy.refinement.problem import RefinementSettings
+from ep2sindy.regression.ambiguity import ambiguities
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.searches import BestSubset
+from ep2sindy.runtime.progress import Progress, count_pieces
+
+# States are weighted by their standard deviation at every point: points weigh alike in a law.
+WINDOWS = RefinementSettings(n_windows=20, periods=2.0, n_reweights=0)
+
+
+@dataclass(frozen=True, eq=False)
+class PointsTask:
+    """What is asked of several operating points together, and the method that answers it.
+
+    points: the runs of each point, by its label. known: coefficients as functions of the
+    parameters. structure: the constraint of terms that a search under roles has found; or None.
+    Raises ValueError for hidden states, or a method that cannot weigh all points at once.
+    """
+
+    asked: Task
+    points: Mapping[str, Sequence[Trajectory]]
+    known: Known
+    method: DiscoveryMethod
+    structure: Constraint | None = None
+
+    def __post_init__(self) -> None:
+        if self.asked.hidden:
+            raise ValueError(
+                f"equations of several points need samples of every state: {self.asked.hidden} "
+                "came as hidden; make the same states of every run by ep.signals.embed"
+            )
+        check_shared(self.regression)
+
+    @property
+    def regression(self) -> Regression:
+        """The regression by which supports for all points are found."""
+        if isinstance(self.method, Regression):
+            return self.method
+        if not isinstance(self.method, TrajectorySearch):
+            raise ValueError(
+                "equations of several points are found by Regression or TrajectorySearch: "
+                f"{self.method!r} came"
+            )
+        n_terms = self.method.max_terms
+        return Regression(search=BestSubset() if n_terms is None else BestSubset(max_terms=n_terms))
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return tuple(self.asked.runs[0].parameters)
+
+    @property
+    def values(self) -> Float[np.ndarray, "points parameters"]:
+        return read_points([runs[0].parameters for runs in self.points.values()], self.parameters)
+
+    def discover(
+        self,
+        law: LawFunctions | Sequence[LawFunctions] | None,
+        *,
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> Discovery:
+        """One support for all points, its coefficients at each, and their law if one is asked."""
+        problems = self._rows(rng, progress)
+        fronts = self._fronts(problems, progress)
+        rows = fit_rows(
+            self.parameters, self.values, list(problems.values()), self._relations(fronts),
+            provenance=self.regression.provenance,
+        )  # fmt: skip
+        fits, found = rows, None if law is None else choose_law(rows, law)
+        if isinstance(self.method, TrajectorySearch):
+            fits = self._refine(rows, found, rng, progress)
+            found = None if law is None else choose_law(fits, law)
+        return join_points(
+            {
+                label: self._at_point(label, problems[label], fronts, fits, k)
+                for k, label in enumerate(self.points)
+            },
+            self.values,
+            found,
+        )
+
+    def _at_point(
+        self,
+        label: str,
+        problems: Sequence[RegressionRows],
+        fronts: Sequence[SharedFront],
+        fits: PointFits,
+        number: int,
+    ) -> Discovery:
+        model = fits.models[number]
+        own = {front.equation: front.points[label] for front in fronts}
+        return Discovery(
+            fronts=own,
+            chosen={state: as_in(model, front.best) for state, front in own.items()},
+            model=replace(model, clock=self.points[label][0].clock),
+            method=self.regression,
+            ambiguities=tuple(dict.fromkeys(a for part in problems for a in ambiguities(part))),
+            constraint=fits.relations.at(fits.points[[number]])[0],
+        )
+
+    def _rows(
+        self, rng: np.random.Generator, progress: Progress
+    ) -> dict[str, Sequence[RegressionRows]]:
+        """Rows of every point, made in the order of their names, so that theirs does not count."""
+        form, library = self.regression.formulation, self.asked.library
+        labels = count_pieces(progress, sorted(self.points), "point", "rows of the regression")
+        rows = {
+            label: form.assemble([r.complete() for r in self.points[label]], library, rng=rng)
+            for label in labels
+        }
+        return {label: rows[label] for label in self.points}
+
+    def _fronts(
+        self, problems: Mapping[str, Sequence[RegressionRows]], progress: Progress
+    ) -> list[SharedFront]:
+        # A term whose coefficient is known is in every support.
+        told = [
+            Relation(((1.0, state, term),), 1.0, "")
+            for state, terms in self.known.items()
+            for term in terms
+        ]
+        task = replace(self.asked, relations=[*self.asked.relations, *told])
+        return search_shared(problems, task, self.regression, progress=progress)
+
+    def _relations(self, fronts: Sequence[SharedFront]) -> LawConstraint:
+        """The terms of all points, with their relations."""
+        if self.structure is not None:
+            return law_of_constraint(self.structure, self.parameters)
+        return constrain_law(
+            self.asked.library,
+            {front.equation: front.chosen for front in fronts},
+            self.asked.relations,
+            self.known,
+            parameters=self.parameters,
+        )
+
+    def _refine(
+        self,
+        rows: PointFits,
+        law: OperatingLaw | None,
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> PointFits:
+        """Coefficients by the trajectories of each point, from those that its rows gave.
+
+        A law starts all points, since it averages the noise of their rows.
+        """
+        start = rows
+        if law is not None:
+            at = [dict(zip(self.parameters, each, strict=True)) for each in rows.points.tolist()]
+            models = [
+                law.at(extrapolate=True, **{name: point[name] for name in law.parameters})
+                for point in at
+            ]
+            start = replace(rows, models=models)
+        runs = list(self.points.values())
+        return fit_trajectories(start, runs, WINDOWS, seed=rng, progress=progress)
+
+
+def join_points(
+    points: Mapping[str, Discovery],
+    values: Float[np.ndarray, "points parameters"],
+    law: OperatingLaw | None = None,
+) -> Discovery:
+    """The discoveries of all points as one, which shows that of the most central point."""
+    central = list(points.values())[most_central(values)]
+    return replace(central, points=points, law=law)
+
+
+def choose_law(fits: PointFits, law: LawFunctions | Sequence[LawFunctions]) -> OperatingLaw:
+    """The law through the fits of all points, of several the one that errs least where left out.
+
+    Laws whose errors cannot be told apart count as equal, and that of fewest functions is taken.
+    Raises ValueError if the points do not suffice for any.
+    """
+    if not isinstance(law, Sequence):
+        return fits.law(fits.functions(law))
+    laws, reasons = [], ["law=[...] must name degrees or functions"]
+    for each in law:
+        try:
+            functions = fits.functions(each)
+            laws.append((functions, fits.rate_errors(functions)))
+        except ValueError as error:
+            reasons.append(str(error))
+    if not laws:
+        raise ValueError(reasons[-1])
+    best = fewest_of_least([(errors, len(functions)) for functions, errors in laws])
+    return fits.law(laws[best][0])

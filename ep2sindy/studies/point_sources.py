@@ -1,0 +1,224 @@
+"""Operating points of a study: where their data come from, and the records made of these."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from typing import Annotated, Any
+
+from ep2sindy.data.quantities import STEP_DOUBT
+from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
+from ep2sindy.operating.file_names import FilePattern
+from ep2sindy.operating.records import Point, name_point
+from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers, collect
+from ep2sindy.signals.spectrum import Oscillation
+from ep2sindy.studies.source import DivergedError, Source, amiss, is_simulation, quiet
+from ep2sindy.studies.study import Check, Deferred
+
+QUIET = (
+    "their statuses are above; try the part of the records behind the start-up "
+    "('prepare=[{_target_:ep2sindy.prepare.crop,start_s:...}]'), another zone "
+    "(trajectory.zone.z=...), or other points"
+)
+WITHOUT_BREATHING = (  # attributes of a simulation
+    Oscillation.STEADY, Oscillation.DECAYING, Oscillation.TRANSIT, Oscillation.DIVERGED,
+)  # fmt: skip
+
+Points = Annotated[
+    Sequence[Mapping[str, Any]] | str,
+    Check(
+        "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}], or a pattern of files, "
+        "'points.files=runs/V{V_D_V}_m{mdot_mg_s}.csv'",
+        lambda value: isinstance(value, list | str) and bool(value),
+    ),
+]
+
+
+@dataclass(frozen=True)
+class GivenPoints:
+    """Operating points as they were given.
+
+    places: parameter -> its place in the data group; None if it has none. points: values of all
+    parameters, and `data` for other differences from the data group. left_out: files that a pattern
+    nearly fits.
+    """
+
+    places: Mapping[str, str | None]
+    points: Sequence[Mapping[str, Any]]
+    left_out: Sequence[str] = ()
+
+    @property
+    def names(self) -> list[str]:
+        return list(self.places)
+
+    def sources(self, source: Source) -> list[PointSource]:
+        return point_sources(source, self.places, self.points)
+
+    def tell(self, run: Run) -> None:
+        """Report the files that are no points."""
+        if self.left_out:
+            run.say(f"left out, for their names hold no number there: {', '.join(self.left_out)}")
+
+
+def given_points(
+    points: Sequence[Mapping[str, Any]] | str, parameters: Mapping[str, str | None], source: Source
+) -> GivenPoints:
+    """Operating points of a config: a list, or the files of a pattern, which names the parameters.
+
+    Raises ValueError for a pattern beside data that are not read from files, or that no file fits.
+    """
+    if not isinstance(points, str):
+        return GivenPoints(parameters, expand(points, list(parameters)))
+    if "path" not in source.data.settings:
+        raise ValueError(
+            "points of files need data that are read from files: "
+            f"{source.data.settings['_target_']} came with {points!r}; add data=recognised, or "
+            "data=NAME for a config that ep2sindy inspect --write made of them"
+        )
+    pattern = FilePattern(points)
+    found, others = pattern.points()
+    given = [{**values, "data": {"path": file}} for file, values in found.items()]
+    return GivenPoints(dict.fromkeys(pattern.names), given, others)
+
+
+@dataclass(frozen=True, eq=False)
+class PointSource:
+    """One operating point and the source of its data. It can be sent to another process."""
+
+    parameters: Mapping[str, float]
+    source: Source
+
+    @property
+    def label(self) -> str:
+        return point_label(self.parameters)
+
+    def open(self, inputs: Sequence[str]) -> OpenedPoint:
+        """Open or simulate the point; one that does not oscillate comes without a run.
+
+        A state that stays exactly constant makes a point steady, as no trajectory may hold it.
+        """
+        opened = OpenedPoint(self.parameters)
+        with name_point(self.parameters):
+            try:
+                field = self.source.field()
+                if (status := field.attrs.get("status")) in WITHOUT_BREATHING:
+                    return replace(opened, status=status)
+                sampling = self.source.trajectory
+                run = sampling.trajectory(field, inputs=inputs, label=self.label)
+                run = replace(run, parameters=self.parameters)
+                doubts = [field.attrs[STEP_DOUBT]] if STEP_DOUBT in field.attrs else []
+                notes = amiss(field.attrs) if is_simulation(field.attrs) else doubts
+                words = [field.attrs.get("file", ""), sampling.place(field)]
+                used = "; ".join(word for word in words if word)
+                return replace(opened, run=run, notes=notes, used=used)
+            except DivergedError:
+                return replace(opened, status=Oscillation.DIVERGED)
+            except ConstantStateError:
+                return replace(opened, status=Oscillation.STEADY)
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedPoint:
+    """One operating point, and the run that was recorded there.
+
+    run: None if the source says that nothing oscillates. status: as the source says. notes:
+    remarks on problems of the data. used: description of the data.
+    """
+
+    parameters: Point
+    run: Trajectory | None = None
+    status: str = Oscillation.OSCILLATING
+    notes: Sequence[str] = ()
+    used: str = ""
+
+    @property
+    def label(self) -> str:
+        return point_label(self.parameters)
+
+
+def expand(blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]) -> list[dict[str, Any]]:
+    """Every combination of the values in each block; repeated points count once.
+
+    Points are repeated if they have the same values and the same data. 300 and 300.0 are equal, and
+    the order of parameters in a block does not matter.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for block in blocks:
+        names = [name for name in parameters if name in block]
+        lists = {n: block[n] if isinstance(block[n], list) else [block[n]] for n in names}
+        rest = {name: value for name, value in block.items() if name not in names}
+        for values in product(*lists.values()):
+            point = {**dict(zip(names, values, strict=True)), **rest}
+            same = {name: float(v) if type(v) is int else v for name, v in point.items()}
+            found.setdefault(str(same), point)
+    return list(found.values())
+
+
+def point_sources(
+    source: Source, places: Mapping[str, str | None], points: Sequence[Mapping[str, Any]]
+) -> list[PointSource]:
+    """The source once per operating point, with its parameters and data in the data group.
+
+    places: parameter -> its place in the data group; None if it has none.
+    Raises ValueError for points without all parameters, or that would open the same data twice.
+    """
+    names = list(places)
+    if not points:
+        raise ValueError(f"points must be a list with all of {names} each: {points!r} came")
+    found, seen = [], dict[str, str]()
+    for given in points:
+        parameters = _parameters(given, names)
+        changes = {place: parameters[name] for name, place in places.items() if place is not None}
+        data = _changed(source.data, changes, given.get("data", {}))
+        point = PointSource(parameters, replace(source, data=data))
+        if point.label in seen.values():
+            raise ValueError(f"an operating point may come once: {point.label} comes again")
+        if (same := str(data)) in seen:
+            raise ValueError(
+                f"operating points must differ in their data: {point.label} has that of "
+                f"{seen[same]}; say in parameters where the data group takes them, or give each "
+                "point its data"
+            )
+        seen[same] = point.label
+        found.append(point)
+    return found
+
+
+def open_points(
+    sources: Sequence[PointSource], inputs: Sequence[str], *, workers: Workers, run: Run
+) -> list[OpenedPoint]:
+    """Open or simulate all points, and report their data and warnings."""
+    stage = run.progress(len(sources), "point opened")
+    points = collect(workers, partial(PointSource.open, inputs=inputs), sources, stage)
+    used = {point.label: point.used for point in points if point.used}
+    if len(alike := {*used.values()}) == 1:  # all points are averaged alike
+        run.say(f"data: {alike.pop()}")
+    else:
+        for label, words in used.items():
+            run.say(f"data: {label}: {words}")
+    for point in points:
+        for note in point.notes:
+            run.warn(f"{point.label}: {note}")
+    return points
+
+
+def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:
+    if set(given) - {"data"} != set(names) or not isinstance(given.get("data", {}), Mapping):
+        raise ValueError(f"a point must have {names}, and data where they differ: {given!r} came")
+    for name in names:
+        if type(given[name]) not in (int, float):
+            raise ValueError(f"points must give {name} as a number: {given[name]!r} came")
+    return {name: float(given[name]) for name in names}
+
+
+def _changed(data: Deferred, places: Mapping[str, float], more: Mapping[str, Any]) -> Deferred:
+    try:
+        data = data.changed(places)
+    except ValueError as error:
+        raise ValueError(
+            f"parameters must name numbers of the data group, or be null: {error}"
+        ) from error
+    return quiet(data.changed({}, more))
