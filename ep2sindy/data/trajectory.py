@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from numbers import Real
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.gaps import LONGEST_STEP, MIN_STRETCH, between_gaps, mean_step, usual_step
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
-from ep2sindy.library.names import check_state
+from ep2sindy.library.names import check_state, check_variable
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_list, locked, read_only
@@ -47,14 +48,16 @@ class Trajectory:
 
     t: (samples,) in s, increasing; steps may be unequal. Dates are counted from the first, in s.
     states: (samples, n_states). inputs: (samples, n_inputs), by default none.
-    units: name -> unit for any of the variables; the default is "1".
+    units: name -> unit for any of the variables and parameters; the default is "1".
     missing: (samples, n_states), true where a state was not measured, such as a channel of a slower
     rate; its samples there may be NaN and are interpolated. None if all were measured.
     clock: unit in which times are displayed; t stays in s.
+    parameters: the operating point, name -> value of what was the same at all samples.
     Raises ValueError for time that does not increase, unequal lengths, values that are masked, not
     finite or not real numbers, a variable of a magnitude below 1e-50 or above 1e150, repeated
     names, names that are not words of letters, digits and _ (or averages such as `<n_i*n_n>`),
-    fewer than two samples, or a state that never changes.
+    fewer than two samples, a state that never changes, or parameters that are no finite numbers or
+    bear the name of a variable.
 
     >>> t = np.linspace(0.0, 1e-3, 101)
     >>> run = ep.Trajectory(t, np.sin(6e4 * t)[:, None], ["I_d"], units={"I_d": "A"})
@@ -72,6 +75,7 @@ class Trajectory:
     label: str = ""
     clock: Clock = SECONDS
     missing: Bool[np.ndarray, "_ n_states"] | None = None
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_list("state_names", self.state_names)
@@ -84,11 +88,19 @@ class Trajectory:
             "inputs": locked(real_numbers(inputs, "inputs")),
             "state_names": tuple(self.state_names),
             "input_names": tuple(self.input_names),
-            "units": MappingProxyType({n: self.units.get(n, "1") for n in self.names}),
+            "parameters": MappingProxyType(_finite(self.parameters)),
         }.items():
             object.__setattr__(self, name, value)
         for name in self.names:
             check_state(name)
+        for name in self.parameters:
+            check_variable(name)
+            if name in (*self.names, "time"):
+                raise ValueError(
+                    f"a parameter needs a name that no variable has: {name!r} came; rename one"
+                )
+        units = {n: self.units.get(n, "1") for n in (*self.names, *self.parameters)}
+        object.__setattr__(self, "units", MappingProxyType(units))
         self._check_shapes()
         check_time(self.t)
         self._check_finite()
@@ -221,8 +233,17 @@ class Trajectory:
         return as_dataframe(self.t, self._as_measured(), self.names)
 
     def to_xarray(self) -> xr.Dataset:
-        """States and inputs over `time` in s, NaN where missing, with their units and clock."""
-        return as_dataset(self.t, self._as_measured(), self.names, self.units, self.clock)
+        """States and inputs over `time` in s, NaN where missing, with their units and clock.
+
+        The parameters are scalar coordinates, which their attribute `role` tells from others.
+        """
+        samples = as_dataset(self.t, self._as_measured(), self.names, self.units, self.clock)
+        return samples.assign_coords(
+            {
+                name: ((), value, {"units": self.units[name], ROLE: PARAMETER})
+                for name, value in self.parameters.items()
+            }
+        )
 
     def _as_measured(self) -> Float[np.ndarray, "samples variables"]:
         """All values, NaN in place of those that were interpolated."""
@@ -248,6 +269,7 @@ class Trajectory:
         lengths = [self.dt_s] if even else [float(steps.min()), float(steps.max())]
         step = " to ".join(f"{factor * each:.4g}" for each in lengths)
         label = f" {self.label!r}" if self.label else ""
+        label += f" at {point_label(self.parameters)}" if self.parameters else ""
         lacking = "" if self.missing is None else f" ({self._lacking()})"
         return (
             f"Trajectory{label}: {self.n_samples} samples{lacking}, t = {factor * self.t[0]:.6g} "
@@ -306,6 +328,19 @@ class Trajectory:
                 )
 
 
+def point_label(parameters: Mapping[str, float]) -> str:
+    """Label of an operating point, such as `V_D_V=300, mdot_mg_s=5`."""
+    return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
+
+
+def _finite(parameters: Mapping[str, float]) -> dict[str, float]:
+    """The parameters as floats. Raises ValueError unless they are finite numbers."""
+    for name, value in parameters.items():
+        if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
+            raise ValueError(f"a parameter must be a finite number: {name}={value!r} came")
+    return {name: float(value) for name, value in parameters.items()}
+
+
 def check_time(t: Float[np.ndarray, " samples"]) -> None:
     """Raise ValueError unless t has two samples or more, is finite and increases."""
     if t.ndim != 1 or len(t) < 2:
@@ -333,8 +368,8 @@ def check_increasing(name: str, points: Float[np.ndarray, " points"], unit: str)
 def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]) -> None:
     """Raise ValueError unless all trajectories have the same states, and agree in units.
 
-    variables: of the library. They may stand in any order among the inputs, which are taken by
-    name; states must come in one order.
+    Units of parameters count, too. variables: of the library. They may stand in any order among
+    the inputs, which are taken by name; states must come in one order.
     """
     if not trajectories:
         raise ValueError("at least one trajectory is needed to find equations: none came")
@@ -348,8 +383,8 @@ def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]
                 f"{list(variables)}: trajectory {k} has states {list(run.state_names)} and inputs "
                 f"{list(run.input_names)}; {_way_to_agree(first, missing)}"
             )
-        for name in names:
-            if run.units[name] != first.units[name]:
+        for name in (*names, *run.parameters):
+            if run.units[name] != first.units.get(name, run.units[name]):
                 raise ValueError(
                     f"units must agree: {name!r} is in {first.units[name]} in trajectory 0 and "
                     f"in {run.units[name]} in trajectory {k}; convert one of them first"
@@ -392,6 +427,7 @@ def spread_blocks(runs: Sequence[Trajectory], *, most: int, block: int) -> list[
 
 
 CLOCK = "read_in"  # attribute of the time coordinate: the unit in which times are displayed
+ROLE, PARAMETER = "role", "parameter"  # attribute of a scalar coordinate, and its value
 
 
 def as_dataframe(

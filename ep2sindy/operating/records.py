@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.data.numbers import least_squares, zero_to_one
-from ep2sindy.data.trajectory import Trajectory, check_agreement
+from ep2sindy.data.trajectory import Trajectory, check_agreement, point_label
 from ep2sindy.regression.pooled import Basis
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.spectrum import Oscillation, relative_amplitude, steps_in
@@ -113,11 +113,6 @@ class OperatingRecord:
     @property
     def from_slowest(self) -> Trajectory:
         return self.run.window(self.slowest, self.run.n_samples)
-
-
-def point_label(parameters: Mapping[str, float]) -> str:
-    """Label of an operating point, such as `V_D_V=300, mdot_mg_s=5`."""
-    return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
 
 
 @contextmanager
