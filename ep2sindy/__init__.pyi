@@ -7,6 +7,7 @@ from ep2sindy.data.open import open_field as open_field  # for configs
 from ep2sindy.data.open import inspect_file as inspect_file
 from ep2sindy.data.open import read_field as read_field  # for configs
 from ep2sindy.data.open import write_field as write_field
+from ep2sindy.data.run_files import read_runs as read_runs
 from ep2sindy.data.zones import zone_average as zone_average
 from ep2sindy.data.sampling import zone_averages as zone_averages
 from ep2sindy.data.sampling import point_samples as point_samples

@@ -10,7 +10,7 @@ import pytest
 
 from ep2sindy.app.arguments import mend
 from ep2sindy.app.schema import study_of
-from ep2sindy.operating.file_names import FilePattern, propose_pattern
+from ep2sindy.data.run_files import FilePattern, propose_pattern
 from ep2sindy.studies import parametric, predict
 from tests.models import lienard
 from tests.programs import Computed, composed, computed, ended
@@ -34,6 +34,20 @@ def test_each_file_is_a_point_in_the_order_of_its_quantities(here: Path) -> None
     assert others == ["runs/V200_mold.csv"]
 
 
+def test_a_p_between_digits_is_a_decimal_point_and_so_is_a_comma_that_separates_nothing(
+    here: Path,
+) -> None:
+    touch("V2p5_m4,5.csv", "V2p_m4.csv", "V-3p25e1,m4.csv")
+    points, others = FilePattern("V{V}_m{m}.csv").points()
+    assert points == {"V2p5_m4,5.csv": {"V": 2.5, "m": 4.5}}
+    assert others == ["V2p_m4.csv"]
+    points, _ = FilePattern("V{V},m{m}.csv").points()
+    assert points == {"V-3p25e1,m4.csv": {"V": -32.5, "m": 4.0}}
+    assert FilePattern("V{V}p_m{m}.csv").points()[0] == {"V2p_m4.csv": {"V": 2.0, "m": 4.0}}
+    touch("a1,2.csv")
+    assert FilePattern("a{x},{y}.csv").points()[0] == {"a1,2.csv": {"x": 1.0, "y": 2.0}}
+
+
 def test_a_pattern_takes_signs_of_the_shell_and_a_quantity_twice(here: Path) -> None:
     touch("V200/a_V200.csv", "V300/b_V300.csv", "V300/b_V200.csv", "V[1]/c_V4.csv")
     points, others = FilePattern("V{V}/?_V{V}.csv").points()
@@ -45,12 +59,23 @@ def test_a_pattern_takes_signs_of_the_shell_and_a_quantity_twice(here: Path) -> 
 @pytest.mark.parametrize(
     ("files", "pattern"),
     [
-        (["runs/V200_m4.5.csv", "runs/V300_m5.csv"], "runs/V{V_D_V}_m{mdot_mg_s}.csv"),
-        (["200V_5mgs.csv", "300V_5mgs.csv"], "{V_D_V}V_5mgs.csv"),
-        (["run_V=200,m=4.csv", "run_V=300,m=5.csv"], "run_V={V_D_V},m={mdot_mg_s}.csv"),
+        (["runs/V200_m4.5.csv", "runs/V300_m5.csv"], "runs/V{V}_m{m}.csv"),
+        (["200V_5mgs.csv", "300V_5mgs.csv"], "{V}V_5mgs.csv"),
+        (["run_V=200,m=4.csv", "run_V=300,m=5.csv"], "run_V={V},m={m}.csv"),
+        (["mdot4p5.csv", "mdot5.csv"], "mdot{mdot}.csv"),
         (["a_-1.csv", "a_2.5e-3.csv"], "a_{a}.csv"),
-        (["x1_1.csv", "x2_2.csv"], "x{x}_{p}.csv"),
-        (["data1.csv", "data2.csv"], "data{p}.csv"),  # `data` is a key of every point
+        (["x1_x2.csv", "x2_x3.csv"], "x{x}_x{x1}.csv"),
+        # Names of shots and files, and dates, are no quantities.
+        (["shot#101_U=250V.csv", "shot#103_U=300V.csv"], "shot#*_U={U}V.csv"),
+        (["run_200V.csv", "run_300V.csv"], "run_{V}V.csv"),
+        (["a7_20240131_120005.csv", "a8_20240201_120006.csv"], "a{a}_*.csv"),
+        (["run2_2024-01-31_V7.csv", "run3_2024-02-01_V8.csv"], "run*_*_V{V}.csv"),
+        (["Run 12a.csv", "Run 13a.csv"], None),
+        (["run12a.csv", "run13a.csv"], None),
+        (["data1.csv", "data2.csv"], None),
+        (["V_2024-01-31.csv", "V_2024-02-01.csv"], None),
+        (["001.csv", "002.csv"], None),
+        (["m4,5.csv", "m4,6.csv"], None),  # one number, or two
         (["a.csv", "b.csv"], None),
         (["a1.csv"], None),
     ],
@@ -68,7 +93,7 @@ def test_a_pattern_is_proposed_where_names_differ_in_numbers(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("runs/a.csv", "need a pattern with a placeholder for each quantity, like 'points.files="),
+        ("runs/a.csv", "need a pattern with a placeholder for each quantity, like 'runs/V"),
         ("runs/{a b}.csv", "a placeholder must be the name of a quantity, .*: 'a b' came"),
         ("runs/{data}.csv", "a placeholder must be .* and not 'data', .*: 'data' came"),
         ("runs/W{V}.csv", r"no file fits .* 1 files beside it: runs/V1.csv \.\.\."),
@@ -143,7 +168,8 @@ def test_an_inspection_of_a_glob_writes_the_list_and_the_command(
     swing(here, 0.6, 0.9, 1.2)
     assert not ended("inspect", "a*.csv")
     said = capsys.readouterr().out
-    assert "3 operating points, if the numbers in the names are such (a; " in said
+    assert "3 operating points, if the numbers in the names are such:\n" in said
+    assert "{mdot_mg_s} for a flow in mg/s" in said
     assert "  a=0.6: a0.6.csv\n  a=0.9: a0.9.csv\n  a=1.2: a1.2.csv\n" in said
     assert "ep2sindy +exp=predict data=recognised 'points.files=a{a}.csv'" in said
     assert not ended("inspect", "a*.csv", "--write", "mine")
@@ -166,9 +192,9 @@ def test_points_of_a_thruster_are_proposed_to_both_studies_of_points(
         table.to_csv(here / f"V{V}_m5.csv", index=False)
     assert not ended("inspect", "V*.csv", "--plasma")
     assert re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out) == [
-        "+exp=parametric data=recognised 'points.files=V{V_D_V}_m5.csv' data.plasma=true "
+        "+exp=parametric data=recognised 'points.files=V{V}_m5.csv' data.plasma=true "
         "thesis=null 'trends=[]'",
-        "+exp=predict data=recognised 'points.files=V{V_D_V}_m5.csv' data.plasma=true "
+        "+exp=predict data=recognised 'points.files=V{V}_m5.csv' data.plasma=true "
         "'~models.inflow' '~models.conserving' '~models.leaving'",
     ]
 

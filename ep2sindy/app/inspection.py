@@ -16,9 +16,9 @@ from ep2sindy.data.inspection import STEP, Inspection, compare_files, unlike
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import inspect_file
 from ep2sindy.data.quantities import COORDINATE_UNITS, KNOWN_UNITS
+from ep2sindy.data.run_files import FilePattern, propose_pattern
 from ep2sindy.data.steps import records_of
-from ep2sindy.operating.file_names import FilePattern, propose_pattern
-from ep2sindy.operating.records import point_label
+from ep2sindy.data.trajectory import point_label
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.screen import in_line, say
 
@@ -98,10 +98,11 @@ def point_lines(pattern: FilePattern) -> list[str]:
     """The operating points that the names of files tell, and their pattern."""
     points, _ = pattern.points()
     return [
-        f"{len(points)} operating points, if the numbers in the names are such "
-        f"({', '.join(pattern.names)}; V_D_V in V, mdot_mg_s in mg/s):",
+        f"{len(points)} operating points, if the numbers in the names are such:",
         *(in_line(f"  {point_label(values)}: {file}") for file, values in points.items()),
-        in_line(f"their pattern: points.files={pattern.text}"),
+        in_line(f"their pattern: points.files={pattern.text}, in Python ep.read_runs"),
+        "a name in braces may be replaced by any name with its unit, as {V_D_V} for a voltage in V",
+        "and {mdot_mg_s} for a flow in mg/s",
         "",
     ]
 
@@ -128,7 +129,7 @@ def commands(
     lines: list[list[str]] = []
     if pattern is not None:
         data = [f"data={group}", f"points.files={pattern.text}", *step]
-        lines = point_commands(first, data, pattern.names, n_points=len(found))
+        lines = point_commands(first, data, n_enough=len(pattern.names) + 2, n_points=len(found))
     if not lines:
         data = [f"data={group}", *([f"data.path={path}"] if path else []), *step]
         lines = record_commands(first, data, are_several=len(found) > 1)
@@ -138,18 +139,16 @@ def commands(
 
 
 def point_commands(
-    found: Inspection, data: list[str], names: Sequence[str], *, n_points: int
+    found: Inspection, data: list[str], *, n_enough: int, n_points: int
 ) -> list[list[str]]:
-    """Commands that study the files as operating points. names: quantities of the points."""
+    """Commands that study the files as operating points. n_enough: of these, for a prediction."""
     lines = []
     if not found.lacking(NEEDS["parametric"]):
-        both = {"V_D_V", "mdot_mg_s"} == set(names)
-        aside = ["thesis=null", *([] if both else ["trends=[]"])]
-        more = [*aside, *channel(found), *preparation(found)]
+        more = ["thesis=null", "trends=[]", *channel(found), *preparation(found)]
         lines.append(["+exp=parametric", *data, *more])
     # Laws of degree one must fit, with each point left out in turn.
-    if not found.lacking(NEEDS["predict"]) and n_points >= len(names) + 2:
-        aside = [] if "mdot_mg_s" in names else [f"~models.{name}" for name in WITH_INFLOW]
+    if not found.lacking(NEEDS["predict"]) and n_points >= n_enough:
+        aside = [f"~models.{name}" for name in WITH_INFLOW]
         lines.append(["+exp=predict", *data, *aside, *channel(found)])
     return lines
 

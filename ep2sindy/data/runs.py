@@ -14,7 +14,7 @@ from jaxtyping import Float
 from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
 from ep2sindy.data.numbers import count_dates, real_numbers, seconds
 from ep2sindy.data.quantities import axis_of, columns_in_si, time_unit
-from ep2sindy.data.trajectory import CLOCK, Trajectory
+from ep2sindy.data.trajectory import CLOCK, PARAMETER, ROLE, Trajectory
 from ep2sindy.library.units import SECONDS, Clock, seconds_in
 from ep2sindy.runtime.values import check_list, check_positive
 
@@ -49,7 +49,8 @@ def trajectories_of(
       other columns are states; columns labelled by a number are called x0, x1 ... Results are
       displayed in the unit of the times.
     - An xarray Dataset whose one dimension is time, such as `Trajectory.to_xarray` gives; its
-      attribute `units` says in which unit of time.
+      attribute `units` says in which unit of time. Scalar coordinates whose attribute `role` is
+      "parameter" are its operating point.
     - A tuple (t, x) of times (samples,) and states (samples,) or (samples, n_states). The states
       are then called x, or x0, x1 ...
     - An array x, or a DataFrame without times, where `t` gives them.
@@ -184,9 +185,14 @@ def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
         said = {CLOCK: unit} | field["time"].attrs | {"units": "s"}
         field = field.assign_coords(time=("time", times, said))
     run = _from_table(field.to_dataframe()[list(field.data_vars)], partial)
-    units = {str(name): str(each.attrs.get("units", "1")) for name, each in field.data_vars.items()}
-    clock = field["time"].attrs.get(CLOCK)
-    return replace(run, units=units, clock=run.clock if clock is None else Clock.of(str(clock)))
+    units = {str(name): str(each.attrs.get("units", "1")) for name, each in field.variables.items()}
+    point = {
+        str(name): each.item()
+        for name, each in field.coords.items()
+        if not each.dims and each.attrs.get(ROLE) == PARAMETER
+    }
+    clock = Clock.of(str(field["time"].attrs.get(CLOCK, run.clock.unit)))
+    return replace(run, units=units, clock=clock, parameters=point)
 
 
 def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:

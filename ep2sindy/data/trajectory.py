@@ -88,9 +88,7 @@ class Trajectory:
             "inputs": locked(real_numbers(inputs, "inputs")),
             "state_names": tuple(self.state_names),
             "input_names": tuple(self.input_names),
-            "parameters": MappingProxyType(
-                {n: _parameter(n, v) for n, v in self.parameters.items()}
-            ),
+            "parameters": MappingProxyType(_finite(self.parameters)),
         }.items():
             object.__setattr__(self, name, value)
         for name in self.names:
@@ -335,11 +333,12 @@ def point_label(parameters: Mapping[str, float]) -> str:
     return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
 
 
-def _parameter(name: str, value: object) -> float:
-    """The value of a parameter. Raises ValueError unless it is a finite number."""
-    if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
-        raise ValueError(f"a parameter must be a finite number: {name}={value!r} came")
-    return float(value)
+def _finite(parameters: Mapping[str, float]) -> dict[str, float]:
+    """The parameters as floats. Raises ValueError unless they are finite numbers."""
+    for name, value in parameters.items():
+        if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
+            raise ValueError(f"a parameter must be a finite number: {name}={value!r} came")
+    return {name: float(value) for name, value in parameters.items()}
 
 
 def check_time(t: Float[np.ndarray, " samples"]) -> None:
@@ -369,8 +368,8 @@ def check_increasing(name: str, points: Float[np.ndarray, " points"], unit: str)
 def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]) -> None:
     """Raise ValueError unless all trajectories have the same states, and agree in units.
 
-    Units of parameters count, too. variables: of the library. They may stand in any order among the inputs, which are taken by
-    name; states must come in one order.
+    Units of parameters count, too. variables: of the library. They may stand in any order among
+    the inputs, which are taken by name; states must come in one order.
     """
     if not trajectories:
         raise ValueError("at least one trajectory is needed to find equations: none came")

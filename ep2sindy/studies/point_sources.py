@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from ep2sindy.data.quantities import STEP_DOUBT
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
-from ep2sindy.operating.file_names import FilePattern
+from ep2sindy.data.run_files import FilePattern
 from ep2sindy.operating.records import Point, name_point
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, collect

@@ -10,8 +10,8 @@ from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
+from ep2sindy.data.run_files import FilePattern
 from ep2sindy.data.steps import files_of
-from ep2sindy.operating.file_names import FilePattern
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.files import fingerprint
 from ep2sindy.runtime.parallel import ONE_BY_ONE, KeptWorkers, Workers

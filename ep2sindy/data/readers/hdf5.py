@@ -12,7 +12,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from ep2sindy.data.blocks import AT_ONCE, UNDECODED
-from ep2sindy.data.readers.source import PACKED_BY, FileSource, Reader, check_packing
+from ep2sindy.data.readers.source import PACKED_BY, FileSource, Reader, check_packing, plain
 from ep2sindy.trust.memory import check_memory
 
 if TYPE_CHECKING:
@@ -34,7 +34,8 @@ def read_hdf5(path: Path) -> FileSource:
     """Read HDF5; a name is the path of a data set, such as "group/n_i".
 
     Numbers packed by `scale_factor` and `add_offset` are unpacked. Numbers equal to `_FillValue`,
-    and numbers that were never written, are NaN. A group's attributes `time` and `dt` are arrays of
+    and numbers that were never written, are NaN. Numbers in the file's own attributes describe all
+    of it. A group's attributes `time` and `dt` are arrays of
     one number, "group/time". Of openPMD, units and the grids of meshes are read too; of a mesh in
     azimuthal modes (thetaMode) the first, which is the average over the azimuth.
     """
@@ -51,12 +52,15 @@ def read_hdf5(path: Path) -> FileSource:
             array = array[0] if _has_modes(found) else array
         unit = attrs.pop("units")
         packed = xr.Dataset({"it": array.assign_attrs(attrs)})
-        plain = xr.decode_cf(packed, decode_coords=False, **UNDECODED)["it"]
-        return plain.drop_attrs().assign_attrs(units=unit)
+        decoded = xr.decode_cf(packed, decode_coords=False, **UNDECODED)["it"]
+        return decoded.drop_attrs().assign_attrs(units=unit)
 
     names = names_in_hdf5(path)
     beside = {name: array for name, array in beside.items() if name not in names}
-    return FileSource(path, [*names, *beside], read)
+    with h5py.File(path) as file:
+        said = {key: _plain(value) for key, value in file.attrs.items()}
+    numbers = {key: value for key, value in said.items() if isinstance(value, int | float)}
+    return FileSource(path, [*names, *beside], read, attributes=numbers)
 
 
 def _beside(path: Path) -> dict[str, xr.DataArray]:
@@ -230,7 +234,7 @@ def _plain(value: Any) -> Any:
 
     if isinstance(value, h5py.Empty):
         return None
-    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+    value = plain(value)
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 

@@ -115,6 +115,11 @@ def _is_workbook(path: Path) -> bool:
         return path.suffix.lower() in (".xlsx", ".xlsm")
 
 
+def plain(value: Any) -> Any:
+    """A number of NumPy, or an array of one element, as a plain value; others as they are."""
+    return value.item() if isinstance(value, np.ndarray | np.generic) and value.size == 1 else value
+
+
 @contextmanager
 def damage_named(path: Path) -> Iterator[None]:
     """Turn any error of a parsing library into a ValueError of one line that names the file."""
@@ -166,7 +171,8 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
             array.compute()  # damage shows here, where the error names the file; result not kept
         return array
 
-    said = {str(k): v for k, v in dataset.attrs.items() if isinstance(v, str | int | float)}
+    said = {str(key): plain(value) for key, value in dataset.attrs.items()}
+    said = {key: value for key, value in said.items() if isinstance(value, str | int | float)}
     return FileSource(path, [*stored], read, dims_named=True, channel_m=length, attributes=said)
 
 

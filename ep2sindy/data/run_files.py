@@ -1,0 +1,285 @@
+"""Runs from files, and their operating points: by the names of the files, or as these say."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from glob import escape, glob
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from ep2sindy.data.inspection import Inspection
+from ep2sindy.data.numbers import real_numbers
+from ep2sindy.data.open import inspect_file, open_field
+from ep2sindy.data.quantities import COUNTERS, is_counter_name, own_unit, to_si
+from ep2sindy.data.readers.source import file_named
+from ep2sindy.data.steps import files_of
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.zones import Zone, zone_average
+from ep2sindy.runtime.values import check_list
+
+NUMBER = r"[+-]?(?:\d+(?:\.\d*|[p,]\d+)?|\.\d+)(?:[eE][+-]?\d+)?"
+_PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
+_DATE = (
+    r"(?<!\d)(?:19|20)\d\d[-_.]?(?:0\d|1[0-2])[-_.]?[0-3]\d"
+    r"(?:[-_ T]?\d\d[-_.:]?\d\d(?:[-_.:]?\d\d)?)?(?![^\W_])"
+)
+# A date or a number in a name. A sign counts only behind `_`, `=`, `/` or `(`, for `-` also
+# separates.
+_IN_NAME = re.compile(_DATE + r"|(?:(?<=[_=/(])[+-])?\d+(?:[.p]\d+)?(?:[eE][+-]?\d+)?")
+_LETTERS = r"[^\W\d_]+"
+DATA = "data"  # key of a point's data, and so no name of a quantity
+# Words before a number that names a file, and is no quantity.
+LABELS = COUNTERS | {"shot", "run", "rec", "file", "test", "trial", "num", "meas", "date", DATA}
+MOST_SHOWN = 3  # names of files in an error
+
+
+@dataclass(frozen=True)
+class FilePattern:
+    """Pattern of the names of files that hold one operating point each.
+
+    text: a path in which `{NAME}` stands for the number that the quantity NAME has at the point.
+    `*` and `?` stand for any characters, as in a shell, but for `/`. A `p` between digits is a
+    decimal point, `m4p5`, and so is a comma, unless the pattern holds a comma itself.
+    Raises ValueError for a pattern without a placeholder, or one that is no word.
+
+    >>> FilePattern("runs/V{V_D_V}_m{mdot_mg_s}.csv").names
+    ('V_D_V', 'mdot_mg_s')
+    """
+
+    text: str
+
+    def __post_init__(self) -> None:
+        example = "'runs/V{V_D_V}_m{mdot_mg_s}.csv'"
+        if not self.names or re.search(r"[{}]", _PLACEHOLDER.sub("", self.text)):
+            raise ValueError(
+                "the files of operating points need a pattern with a placeholder for each "
+                f"quantity, like {example}: {self.text!r} came"
+            )
+        if wrong := [name for name in self.names if not name.isidentifier() or name == DATA]:
+            raise ValueError(
+                "a placeholder must be the name of a quantity, of letters, digits and _, and not "
+                f"{DATA!r}, like {example}: {wrong[0]!r} came in {self.text!r}"
+            )
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The quantities, in the order of their placeholders."""
+        return tuple(dict.fromkeys(_PLACEHOLDER.findall(self.text)))
+
+    def points(self) -> tuple[dict[str, dict[str, float]], list[str]]:
+        """Files by the pattern, each with its quantities, in their order; and the other files.
+
+        The others fit the pattern with some text in the place of a number.
+        Raises ValueError if no file fits.
+        """
+        parts = _PLACEHOLDER.split(self.text)
+        shape = "".join("*" if k % 2 else _for_glob(part) for k, part in enumerate(parts))
+        number = NUMBER.replace("[p,]", "p") if "," in self.text else NUMBER
+        reads = re.compile(_expression(parts, number), re.DOTALL)
+        files = {file: reads.fullmatch(file) for file in sorted(glob(shape))}
+        found = {
+            file: {name: float(re.sub("[p,]", ".", match[name])) for name in self.names}
+            for file, match in files.items()
+            if match
+        }
+        others = [file for file, match in files.items() if not match]
+        if not found:
+            near = others or sorted(glob(str(Path(escape(str(Path(self.text).parent)), "*"))))
+            shown = f": {', '.join(near[:MOST_SHOWN])} ..." if near else ""
+            raise ValueError(
+                f"no file fits the pattern {self.text!r} in {Path.cwd()}, a number in the place "
+                f"of each {{NAME}}; there are {len(near)} files beside it{shown}"
+            )
+        ordered = sorted(found.items(), key=lambda pair: tuple(pair[1].values()))
+        return dict(ordered), others
+
+
+def _for_glob(text: str) -> str:
+    """Text of a pattern for a glob: `*` and `?` keep their meaning."""
+    return text.replace("[", "[[]")
+
+
+def _expression(parts: Sequence[str], number: str) -> str:
+    """Regular expression of the pattern that texts and names make by turns."""
+    found, seen = "", set[str]()
+    for k, part in enumerate(parts):
+        if k % 2:
+            found += f"(?P={part})" if part in seen else f"(?P<{part}>{number})"
+            seen.add(part)
+        else:
+            found += re.escape(part).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
+    return found
+
+
+def propose_pattern(paths: Sequence[str]) -> FilePattern | None:
+    """The pattern of which files are operating points; None if their names tell none.
+
+    Names must differ in numbers alone. Each number that differs is a quantity, called as the
+    letters before it, or else behind it. Dates, numbers without letters and those that name a file
+    (`#103`, `run_7`) are none: `*` stands for them. `4,5` may be one number or two, and tells none.
+
+    >>> propose_pattern(["a/V200_m4.5.csv", "a/V300_m5.csv"]).text
+    'a/V{V}_m{m}.csv'
+    """
+    if len({_IN_NAME.sub("0", path) for path in paths}) != 1 or len(paths) < 2:
+        return None
+    if any(re.search(r"[{}*?[]|\d,\d", path) for path in paths):
+        return None
+    numbers = [[match[0] for match in _IN_NAME.finditer(path)] for path in paths]
+    texts = _IN_NAME.split(paths[0])
+    inner, names = numbers[0], list[str]()
+    for k, column in enumerate(zip(*numbers, strict=True)):
+        if len({*column}) > 1:
+            is_date = re.fullmatch(_DATE, column[0])
+            name = "" if is_date else _quantity(texts[k], texts[k + 1], taken=names)
+            inner[k] = f"{{{name}}}" if name else "*"
+            names += [name] * bool(name)
+    pieces = [piece for pair in zip(texts, [*inner, ""], strict=True) for piece in pair]
+    pattern = FilePattern("".join(pieces)) if names else None
+    return pattern if pattern and len(pattern.points()[0]) == len(paths) else None
+
+
+def _quantity(before: str, after: str, *, taken: Sequence[str]) -> str:
+    """A name for the quantity of a number between two texts; "" for a number that is a label."""
+    name = before.rpartition("/")[2].rstrip()
+    ahead = re.search(rf"({_LETTERS})([-_= (]*)$", name)
+    words = [*([ahead[1]] if ahead else []), *re.findall(rf"^{_LETTERS}", after)]
+    if name.endswith("#") or (ahead and not ahead[2] and ahead[1].lower() in LABELS):
+        return ""
+    base = next((word for word in words if word.lower() not in LABELS), "")
+    free = (f"{base}{k}" if k else base for k in range(len(taken) + 1))
+    return next(name for name in free if name not in taken)
+
+
+def read_runs(
+    files: str | Path | Sequence[str | Path],
+    *,
+    parameters: Sequence[str] = (),
+    states: Sequence[str] | None = None,
+    inputs: Sequence[str] = (),
+    zone: Zone | None = None,
+    units: Mapping[str, str] | None = None,
+    dt_s: float | None = None,
+    plasma: bool = False,
+) -> list[Trajectory]:
+    """Read runs with their operating points, one from each file.
+
+    files: a pattern such as "runs/V{V_D_V}_m{mdot_mg_s}.csv", whose placeholders are parameters and
+        in which `m4p5` is 4.5; or a glob such as "runs/*.nc", or a list of files.
+    parameters: names of those that each file says itself, as a column or variable that is constant,
+        or as an attribute.
+    states, inputs: names of variables; states None: all others but the parameters, and counters.
+    zone: of fields over z or r, the part that is averaged over.
+    units: variable or parameter -> unit, where the file states none. A time without one is in s.
+    dt_s, plasma: as for `open_field`, which opens the files.
+    Warns of files that are left out, for they fit a pattern but for a number.
+    Raises ValueError for a file that comes twice, and, naming the file, for a parameter that is
+    nowhere or not constant, a field without a zone, and whatever `open_field` refuses.
+
+    >>> runs = ep.read_runs("run*.nc", states=["n_i", "n_n"], zone=ep.Zone(z=(0.01, 0.02)))
+    >>> [run.label for run in runs]
+    ['run.nc']
+    """
+    for what, names in {"parameters": parameters, "states": states, "inputs": inputs}.items():
+        check_list(what, names)
+    if isinstance(files, str | Path) and "{" in str(files):
+        points, others = FilePattern(str(files)).points()
+        if others:
+            words = f"left out, for their names hold no number there: {', '.join(others)}"
+            warnings.warn(words, stacklevel=2)
+    else:
+        listed = files_of(files)
+        places = Counter(Path(file).resolve() for file in listed)
+        if twice := [str(place) for place, n in places.items() if n > 1]:
+            raise ValueError(f"every file may come once: {twice[0]} comes again; leave one out")
+        points = {file: {} for file in listed}
+    read = partial(
+        _read_run, parameters=parameters, states=states, inputs=inputs, zone=zone,
+        units=units or {}, dt_s=dt_s, plasma=plasma,
+    )  # fmt: skip
+    return [read(file, named) for file, named in points.items()]
+
+
+def _read_run(
+    file: str,
+    named: Mapping[str, float],
+    *,
+    parameters: Sequence[str],
+    states: Sequence[str] | None,
+    inputs: Sequence[str],
+    zone: Zone | None,
+    units: Mapping[str, str],
+    dt_s: float | None,
+    plasma: bool,
+) -> Trajectory:
+    """The run of one file. named: parameters by its name; parameters: those that it must say."""
+    with file_named(Path(file)):
+        found = inspect_file(file, plasma=plasma)
+        aside = {*named, *parameters} - {*found.variables}
+        given = {"time": "s"} if dt_s is None and "time" in found.no_unit else {}
+        given |= {name: unit for name, unit in units.items() if name not in aside}
+        field = open_field(file, units=given, dt_s=dt_s, plasma=plasma)
+        point = {
+            name: _in_si(name, xr.DataArray(named[name]), units)
+            if name in named
+            else _parameter_in(found, field, name, units)
+            for name in (*named, *parameters)
+        }
+        if states is None:
+            used = {n for n, v in found.variables.items() if {n, v.name} & {*parameters}}
+            varied = (str(n) for n, each in field.data_vars.items() if "time" in each.dims)
+            states = [n for n in varied if n not in {*inputs, *used} and not is_counter_name(n)]
+        axes = {axis for n in (*states, *inputs) if n in field for axis in field[n].dims}
+        if zone is None and (space := sorted(map(str, axes - {"time"}))):
+            raise ValueError(
+                f"a field over {' and '.join(space)} needs a zone to be averaged over: give "
+                "zone=ep.Zone(z=(FROM, TO)) in m, or ep.Zone() for all of it"
+            )
+        run = zone_average(field, zone, states=states, inputs=inputs, label=file)
+        return replace(
+            run,
+            parameters={name: float(value) for name, value in point.items()},
+            units={**run.units, **{name: value.attrs["units"] for name, value in point.items()}},
+        )
+
+
+def _parameter_in(
+    found: Inspection, field: xr.Dataset, name: str, units: Mapping[str, str]
+) -> xr.DataArray:
+    """What a file says of a parameter. Raises ValueError for one that is nowhere, or varies."""
+    source = found.source
+    if name in field:
+        array = field[name]
+    elif name in source.known:
+        array = source.read(name)
+        array.attrs.setdefault("units", source.units.get(name, ""))
+    elif name in source.attributes:
+        array = xr.DataArray(source.attributes[name])
+    else:
+        known = [*source.names, *source.attributes]
+        raise ValueError(
+            f"a parameter must be an attribute, a scalar or a column: {name!r} is none of {known}"
+        )
+    values = real_numbers(array.values, f"parameter {name!r}")
+    values = np.unique(values[np.isfinite(values)])
+    if len(values) != 1:
+        ends = f", from {values[0]:g} to {values[-1]:g}" if len(values) else ""
+        raise ValueError(
+            f"a parameter must be constant: {name!r} has {len(values)} values{ends}; take it as an "
+            "input, or leave it out"
+        )
+    one = xr.DataArray(values[0], attrs=array.attrs)
+    return one if name in field else _in_si(name, one, units)
+
+
+def _in_si(name: str, value: xr.DataArray, units: Mapping[str, str]) -> xr.DataArray:
+    """A value in SI, or in the unit of its name's suffix, by the unit that is given or stated."""
+    unit = units.get(name) or own_unit(name, str(value.attrs.get("units", "")))
+    return to_si(value, name, unit, is_variable=True)
