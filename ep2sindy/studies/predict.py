@@ -305,8 +305,8 @@ class Outcome:
             if any(point.fate is Fate.OSCILLATES for point in branch.map):
                 caption = CAPTIONS["map" if len(self.parameters) == 2 else "line"]
                 draw = partial(
-                    cycle_figure, self._of("map", name), self._tables["points"], branch.law.points,
-                    branch=name, parameters=self.parameters, labels=self.labels,
+                    cycle_figure, self._of("map", name), self._tables["points"], branch=name,
+                    parameters=self.parameters, labels=self.labels,
                 )  # fmt: skip
                 found[f"map_{name}"] = Captioned(draw, caption)
         return found
