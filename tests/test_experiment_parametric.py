@@ -173,7 +173,7 @@ def test_a_figure_has_a_panel_per_quantity_and_trend_and_a_colour_per_kind() -> 
             assert [len(each.get_xdata()) for each in marks] == [3, 3, 3]
             assert len({each.get_color() for each in marks}) == 3
     known = [entry.get_label() for entry in figure.legends[0].legend_handles]
-    assert known == ["least squares", "refined", "thesis", "control law"]
+    assert known == ["least squares", "refined", "thesis", "control law, least squares"]
 
 
 def own_files(output: Path, *paths: Path) -> list[str]:

@@ -1,96 +1,243 @@
 """Figures of laws of the operating point, drawn from small tables."""
 
 import warnings
+from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 
 from ep2sindy.figures.operating import (
+    FADED,
+    PUBLISHED,
+    WRONG,
     cycle_figure,
     frequency_scale,
     laws_figure,
     left_out_figure,
+    trends_figure,
 )
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.quantities import fit_control_law
 
 POINTS = pd.DataFrame(
     {
-        "a": [1.0, 2.0, 1.0, 2.0, 1.5],
-        "b": [0.0, 0.0, 1.0, 1.0, 0.5],
-        "branch": ["strong", "strong", "strong", "", "weak"],
-        "f_kHz": [10.0, 11.0, 12.0, np.nan, 14.0],
-        "relative_amplitude": [0.9, 1.0, 1.1, np.nan, 0.3],
+        "a": [1.0, 2.0, 1.0, 2.0, 1.5, 2.0],
+        "b": [0.0, 0.0, 1.0, 1.0, 0.5, 0.5],
+        "branch": ["strong", "strong", "strong", "", "weak", ""],
+        "f_kHz": [10.0, 11.0, 12.0, np.nan, 14.0, np.nan],
+        "relative_amplitude": [0.9, 1.0, 1.1, np.nan, 0.3, np.nan],
     }
 )
-GRID = pd.DataFrame(
-    {
-        "a": [1.0, 1.0, 2.0, 2.0],
-        "b": [0.0, 1.0, 0.0, 1.0],
-        "fate": ["oscillates", "oscillates", "oscillates", "rests"],
-        "f_kHz": [10.0, 12.0, 11.0, np.nan],
-        "relative_amplitude": [0.9, 1.1, 1.0, np.nan],
-        "growth_per_s": [1.0, 1.0, 1.0, -1.0],
-    }
-)
-FITTED = np.array([[1.0, 0.0], [2.0, 0.0], [1.0, 1.0]])
+LONG = "n_i^2*n_n"
 
 
 def drawn(figure: Figure) -> list[str]:
-    """What its legends say; nothing may collapse."""
+    """What its legends say; nothing may collapse, and no text lie on another or on a panel."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         figure.draw_without_rendering()
     legends = [*figure.legends, *(ax.get_legend() for ax in figure.axes)]
-    return [text.get_text() for legend in legends if legend for text in legend.get_texts()]
+    entries = [text for legend in legends if legend for text in legend.get_texts()]
+    texts = [*entries, *(text for ax in figure.axes for text in outside(ax))]
+    boxes = [(text.get_text(), text.get_window_extent()) for text in texts if text.get_text()]
+    for (one, box), (other, beside) in combinations(boxes, 2):
+        assert not meet(box, beside), (one, other)
+    for ax in figure.axes:
+        for text, box in boxes:
+            assert not meet(box, ax.get_window_extent()), (text, ax.get_title())
+    for text, box in boxes:
+        assert box.x0 >= 0.0 and box.x1 <= figure.bbox.x1, text
+    return [text.get_text() for text in entries]
 
 
-def left_out(scale: float) -> pd.DataFrame:
+def outside(ax: Axes) -> list[Text]:
+    """Titles, labels and marks of ticks that a panel shows."""
+    texts = [ax.title]
+    for axis in (ax.xaxis, ax.yaxis):
+        low, high = sorted(axis.get_view_interval())
+        texts += [axis.label, axis.get_offset_text()]
+        for tick in axis.get_major_ticks():
+            if low <= tick.get_loc() <= high:
+                texts += [each for each in (tick.label1, tick.label2) if each.get_visible()]
+    return [text for text in texts if text.get_visible()]
+
+
+def meet(one: Bbox, other: Bbox) -> bool:
+    """Whether boxes share more than a pixel's edge."""
+    shared = Bbox.intersection(one, other)
+    return shared is not None and min(shared.width, shared.height) > 1.0
+
+
+def spots(ax: Axes) -> dict[tuple[float, ...], tuple[str, str]]:
+    """Face and edge of every mark, by its place."""
+    return {
+        tuple(place): (to_hex(face), to_hex(edge))
+        for marks in ax.collections
+        if len(places := np.asarray(marks.get_offsets())) and marks.get_facecolor().size
+        for place, face in zip(
+            places, np.resize(marks.get_facecolor(), (len(places), 4)), strict=True
+        )
+        for edge in marks.get_edgecolor()[:1]
+    }
+
+
+def left_out(scale: float, states: Sequence[str]) -> pd.DataFrame:
     f = scale * np.array([10.0, 11.0, 12.0])
-    return pd.DataFrame(
-        {
-            "branch": "all", "enclosed": [False, True, False], "f_kHz": f, "f_model_kHz": 1.01 * f,
-            "amplitude_x": [1.0, 1.1, 9.0], "waveform_x": [0.1, 0.2, 3.0],
-        }
-    )  # fmt: skip
+    shapes = {}
+    for state in states:
+        shapes |= {f"amplitude_{state}": [1.0, 1.1, 9.0], f"waveform_{state}": [0.1, 0.2, 3.0]}
+    known = {"enclosed": [False, True, False], "f_kHz": f, "f_model_kHz": 1.01 * f}
+    return pd.DataFrame({"branch": "all", **known, **shapes})
 
 
 @pytest.mark.parametrize(("scale", "unit"), [(1.0, "kHz"), (1e-5, "mHz"), (1e5, "GHz")])
 def test_points_left_out_are_drawn_at_any_frequency(scale: float, unit: str) -> None:
-    figure = left_out_figure(left_out(scale))
+    figure = left_out_figure(left_out(scale, ["x"]))
     assert "enclosed by the others" in drawn(figure)
     left = figure.axes[0]
     assert left.get_xlabel() == f"frequency of the record ({unit})"
-    assert frequency_scale(left_out(scale)["f_kHz"])[1] == unit
+    assert frequency_scale(left_out(scale, ["x"])["f_kHz"])[1] == unit
     assert 1.0 <= left.get_xlim()[1] < 2e3
     boxes = [ax.get_window_extent() for ax in figure.axes]
     assert min(box.width for box in boxes) > 200
 
 
-def test_a_map_shows_every_point_and_the_cycle_that_it_is_not_of() -> None:
-    figure = cycle_figure(GRID, POINTS, FITTED, branch="strong", parameters=["a", "b"], labels={})
-    assert {"record", "not oscillating", "record of another cycle"} <= set(drawn(figure))
-    outline = figure.axes[0].lines[0].get_xydata()
-    assert len(outline) == 4  # closed
-    assert {tuple(corner) for corner in outline} == {tuple(corner) for corner in FITTED}
+@pytest.mark.parametrize("n", [1, 3, 9])
+def test_every_state_has_its_own_mark_at_points_left_out(n: int) -> None:
+    states = [f"n_{k}@downstream" for k in range(n)]
+    figure = left_out_figure(left_out(1.0, states))
+    assert len(drawn(figure)) == 3 + n + 2
+    marks = {
+        (line.get_marker(), line.get_color())
+        for line in figure.axes[1].lines
+        if line.get_label().startswith("$")
+    }
+    assert len(marks) == n
 
 
-def test_points_on_a_line_have_no_area() -> None:
-    flat = np.array([[1.0, 0.0], [1.5, 0.5], [2.0, 1.0]])
-    figure = cycle_figure(GRID, POINTS, flat, branch="strong", parameters=["a", "b"], labels={})
-    outline = np.unique(figure.axes[0].lines[0].get_xydata(), axis=0)
-    np.testing.assert_array_equal(outline, flat[[0, 2]])
+def grid(n: int) -> pd.DataFrame:
+    """A law over a in [1, 2] and b in [0, 1], fitted below their diagonal, at rest for large a."""
+    a, b = (each.ravel() for each in np.meshgrid(np.linspace(1, 2, n), np.linspace(0, 1, n)))
+    rows = pd.DataFrame({"a": a, "b": b}).sort_values(["a", "b"])
+    alive = (rows["a"] < 1.9) | (rows["b"] > 0.7)
+    return rows.assign(
+        inside=rows["a"] - 1.0 + rows["b"] <= 1.0,
+        fate=np.where(alive, "oscillates", "rests"),
+        f_kHz=(10.0 + rows["a"]).where(alive),
+        relative_amplitude=(0.9 + 0.1 * rows["b"]).where(alive),
+        growth_per_s=np.where(alive, 1.0, -1.0),
+    )
+
+
+def cycles(rows: pd.DataFrame, *parameters: str) -> Figure:
+    labels = {"a": "discharge voltage (V)", "b": "mass flow of the anode (mg/s)"}
+    return cycle_figure(rows, POINTS, branch="strong", parameters=parameters, labels=labels)
+
+
+def test_a_mark_on_a_map_has_its_own_colour_and_is_red_where_the_law_errs() -> None:
+    figure = cycles(grid(11), "a", "b")
+    assert drawn(figure) == [
+        "record", "record, no cycle by the law", "not oscillating",
+        "not oscillating, unlike the law", "record of another cycle", "the law's cycle ends",
+        "its fixed point turns stable", "beyond the points fitted",
+    ]  # fmt: skip
+    ax = figure.axes[0]
+    of, map_ = spots(ax), ax.collections[0]
+    for place, f in (((1.0, 0.0), 10.0), ((1.0, 1.0), 12.0), ((2.0, 0.0), 11.0)):
+        assert of[place][0] == to_hex(map_.cmap(map_.norm(f)))
+    assert [of[place][1] == WRONG for place in ((1.0, 0.0), (2.0, 0.0))] == [False, True]
+    # the law oscillates at (2, 1) and rests at (2, 0.5); neither point does
+    assert [of[place][0] for place in ((2.0, 1.0), (2.0, 0.5))] == [WRONG, "#222222"]
+    assert of[1.5, 0.5][0] == "#ffffff"
+
+
+def test_a_map_is_faded_beyond_the_fitted_points_and_white_without_a_cycle() -> None:
+    rows = grid(11)
+    map_ = cycles(rows, "a", "b").axes[0].collections[0]
+    opacity = np.asarray(map_.get_alpha()).T.ravel()
+    np.testing.assert_array_equal(opacity, np.where(rows["inside"], 1.0, FADED))
+    shown = np.ma.masked_invalid(map_.get_array()).T.ravel()
+    np.testing.assert_array_equal(shown.mask, rows["fate"] == "rests")
+    assert "beyond the points fitted" not in drawn(cycles(rows.assign(inside=True), "a", "b"))
 
 
 def test_one_parameter_has_a_line_that_ends_with_the_cycle() -> None:
-    rows = GRID[GRID["b"] == 1.0]
-    figure = cycle_figure(rows, POINTS, FITTED[:, :1], branch="strong", parameters=["a"], labels={})
-    assert {"the model's cycle", "record", "not oscillating"} <= set(drawn(figure))
-    line = figure.axes[0].lines[0]
-    assert line.get_xdata().tolist() == [1.0, 2.0]
-    np.testing.assert_array_equal(line.get_ydata(), [12.0, np.nan])
+    rows = grid(11)
+    rows = rows[rows["b"] == 0.0].assign(inside=rows["a"] < 1.45)
+    figure = cycles(rows, "a")
+    words = {"the law's cycle", "record", "not oscillating", "beyond the points fitted"}
+    assert words <= set(drawn(figure))
+    whole, inside = figure.axes[0].lines
+    np.testing.assert_array_equal(whole.get_ydata(), rows["f_kHz"])
+    assert (whole.get_alpha(), inside.get_alpha()) == (FADED, None)
+    np.testing.assert_array_equal(inside.get_ydata(), rows["f_kHz"].where(rows["a"] < 1.45))
+    assert spots(figure.axes[1])[2.0, 0.0][0] == "#222222"  # no amplitude, and a law at rest
+    assert spots(figure.axes[0])[2.0, 11.0][1] == WRONG  # a record where the law is at rest
+
+
+def example_law(n: int, parameters: Sequence[str]) -> tuple[OperatingLaw, pd.DataFrame]:
+    """A law of n coefficients, and its table with values of points alone a tenth higher."""
+    names = ["x", "x^2", LONG, f"x*{LONG}", "x*n_i", "n_i*n_n"] * 2
+    pairs = tuple((("n_i", "n_n")[k // 6], name) for k, name in enumerate(names[:n]))
+    functions = polynomial(parameters, degree=1)
+    values = [np.linspace(1.0, 6.0, 6), np.linspace(100.0, 300.0, 3)]
+    points = np.array(np.meshgrid(*values[: len(parameters)])).reshape(len(parameters), -1).T
+    law = OperatingLaw(
+        functions=functions,
+        library=named_terms(("x", "n_i", "n_n"), tuple(dict.fromkeys(names))),
+        states=("n_i", "n_n"),
+        coefficients=pairs,
+        coef=np.random.default_rng(0).normal(size=(n, len(functions))) * 1e5,
+        points=points,
+        units={"x": "m^-3", "n_i": "m^-3", "n_n": "m^-3"},
+    )
+    of_law = functions.evaluate(points) @ law.coef.T
+    rows = [
+        {
+            **dict(zip(parameters, point, strict=True)), "state": state, "term": term,
+            "law": value, "alone": 1.1 * value, "alone_low": value, "alone_high": 1.2 * value,
+        }
+        for point, at in zip(points, of_law, strict=True)
+        for (state, term), value in zip(pairs, at, strict=True)
+    ]  # fmt: skip
+    return law, pd.DataFrame(rows)
+
+
+@pytest.mark.parametrize("parameters", [["m"], ["V", "m"]])
+@pytest.mark.parametrize("n", [1, 2, 5, 12])
+def test_filled_marks_lie_on_the_line_of_their_law(n: int, parameters: list[str]) -> None:
+    law, rows = example_law(n, parameters)
+    figure = laws_figure(rows, law, parameters=parameters, labels={"V": "$V_D$ (V)"})
+    assert len(drawn(figure)) == 2 + 3 * (len(parameters) - 1)
+    assert len(figure.axes) == n
+    for ax, pair in zip(figure.axes, law.coefficients, strict=True):
+        lines = [
+            line for line in ax.lines if line.get_linestyle() == "-" and len(line.get_xdata()) > 6
+        ]
+        marks = [each.lines[0] for each in ax.containers]
+        for line, filled, open_ in zip(lines, marks[::2], marks[1::2], strict=True):
+            colour = line.get_color()
+            assert (filled.get_mfc(), open_.get_mfc(), open_.get_color()) == (
+                colour,
+                "none",
+                colour,
+            )
+            for mark in (filled, open_):
+                assert set(mark.get_xdata()) <= set(rows["m"])
+            on_line = np.interp(filled.get_xdata(), line.get_xdata(), line.get_ydata())
+            np.testing.assert_allclose(filled.get_ydata(), on_line, rtol=1e-9)
+        own = rows[(rows["state"] == pair[0]) & (rows["term"] == pair[1])]
+        alone = np.concatenate([mark.get_ydata() for mark in marks[1::2]])
+        np.testing.assert_allclose(np.sort(alone), np.sort(own["alone"]))
 
 
 def test_a_coefficient_that_is_constant_looks_constant_and_has_its_unit() -> None:
@@ -116,3 +263,39 @@ def test_a_coefficient_that_is_constant_looks_constant_and_has_its_unit() -> Non
     assert [ax.get_title().rpartition("  ")[2] for ax in figure.axes] == [
         "(s$^{-1}$)", "(m$^{3}$ s$^{-1}$)",
     ]  # fmt: skip
+
+
+KINDS = ("refined", "least squares", PUBLISHED)
+
+
+@pytest.mark.parametrize("n", [1, 4, 8])
+@pytest.mark.parametrize("name", ["q", "an efficiency of ionization (m$^3$ s$^{-1}$)"])
+def test_estimates_of_all_kinds_stand_at_their_points(n: int, name: str) -> None:
+    points = np.array([[200, 5], [300, 2], [300, 4], [300, 5], [300, 6], [400, 5]], dtype=float)
+    # the published points reach further than the fitted ones, which alone have a law
+    rows = pd.DataFrame(
+        {"V": V, "m": m, "kind": kind, "quantity": f"{name} {q}", "value": 1e23 * (V * m + k)}
+        for k, kind in enumerate(KINDS)
+        for q in range(n)
+        for V, m in [*points, *([(300.0, 9.0)] if kind == PUBLISHED else [])]
+    )
+    rows = rows.assign(low=0.9 * rows["value"], high=1.1 * rows["value"])
+    labels = {quantity: quantity for quantity in rows["quantity"]} | {"V": "$V_D$ (V)"}
+    law = fit_control_law(1e23 * points.prod(axis=1), points, polynomial(["V", "m"], degree=2))
+    laws = dict.fromkeys(rows["quantity"], law)
+    trends = [("m", {"V": 300.0}), ("V", {"m": 5.0})]
+    figure = trends_figure(rows, laws, trends=trends, labels=labels)
+    assert drawn(figure) == [*KINDS, "control law, refined"]
+    assert len(figure.axes) == 2 * n
+    for ax in figure.axes:
+        x = {"m": [2.0, 4.0, 5.0, 6.0], "V_D": [200.0, 300.0, 400.0]}
+        along = x["V_D" if "V_D" in ax.get_xlabel() else "m"]
+        marks: list[Line2D] = [each.lines[0] for each in ax.containers]
+        assert [mark.get_xdata().tolist()[: len(along)] for mark in marks] == [along] * 3
+        assert len({mark.get_marker() for mark in marks}) == 3
+        assert [mark.get_mfc() == mark.get_color() for mark in marks] == [True, False, False]
+        (line,) = (line for line in ax.lines if len(line.get_xdata()) == 60)
+        assert (line.get_xdata()[[0, -1]] == [along[0], along[-1]]).all()
+        assert line.get_color() == marks[0].get_color()
+        there = np.interp(along, line.get_xdata(), line.get_ydata())
+        np.testing.assert_allclose(marks[0].get_ydata(), there, rtol=1e-9)

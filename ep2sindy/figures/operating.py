@@ -1,7 +1,8 @@
 """Figures of laws of the operating point: coefficients, points left out, maps and trends.
 
 The maps show frequency and amplitude of a law's limit cycle over its parameters; the trends, the
-quantities of the parametric study over one parameter.
+quantities of the parametric study over one parameter. Filled marks belong to the line, and every
+mark stands at its own point.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -20,42 +20,32 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from scipy.spatial import ConvexHull, QhullError
+from matplotlib.textpath import TextPath
 
-from ep2sindy.figures.style import (
-    COLOURS,
-    DATA,
-    GREY,
-    MORE_COLOURS,
-    SMALL,
-    TITLE,
-    WIDTH,
-    held_label,
-    legend_above,
-    make_grid,
-    make_panels,
-    name_label,
-    sample_line,
-    unit_text,
-)
+from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.figures import style
+from ep2sindy.figures.style import COLOURS, DATA, GREY, MORE_COLOURS, SMALL, TITLE, WIDTH
 from ep2sindy.library.equations import latex_derivative, latex_name, latex_term_name
 from ep2sindy.library.units import unit_product, with_prefix
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.quantities import ControlLaw
 
 FAR_PERCENT, FAR_WAVEFORM = 40.0, 0.6  # beyond: filled marks on the edge
-
 MIN_RANGE = 0.1  # least axis range, as a share of the coefficient's size
+MAX_LINES = 5  # number of the other parameters' values that are drawn
+FADED = 0.35  # opacity of a map's colours beyond the points that the law was fitted to
+WRONG = "#d00000"  # marks where the law says otherwise than the record; no colour of the map
+MARKERS = "os^Dv<>P"
+PUBLISHED = "published"  # the kind of estimate that comes from a publication
 
-MAX_LINES = 5  # number of the second parameter's values that are drawn
+FILLED: dict[str, Any] = {"marker": "o", "ms": 3.5}
+OPEN: dict[str, Any] = {"marker": "o", "ms": 6.0, "mfc": "none"}
+RECORD: dict[str, Any] = {"marker": "o", "s": 52, "edgecolor": "white", "lw": 1.2}
+CROSS: dict[str, Any] = {**RECORD, "marker": "X", "s": 64, "facecolor": DATA}
+DIAMOND: dict[str, Any] = {"marker": "D", "s": 34, "edgecolor": DATA, "facecolor": "white"}
 
-QUANTITIES = ("f_kHz", "relative_amplitude")
-_MARK = {"ls": "none", "color": COLOURS[1], "zorder": 4}
-CROSS: dict[str, Any] = {**_MARK, "marker": "x", "mew": 1.8, "ms": 6.5}
-DIAMOND: dict[str, Any] = {**_MARK, "marker": "D", "mfc": "white", "mew": 1.5, "ms": 6.0}
-
-# Records of a cycle, points that do not oscillate, and records of another cycle.
-Records = tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]
+# Points of one kind on a map: their rows, their marks, and what the legend calls them.
+Kind = tuple[pd.DataFrame, Mapping[str, Any], str]
 
 
 def laws_figure(
@@ -65,33 +55,52 @@ def laws_figure(
     parameters: Sequence[str],
     labels: Mapping[str, str],
 ) -> Figure:
-    """Every coefficient over the last parameter, with a line for each of some values of the first.
+    """Every coefficient over the last parameter, with a line for each of some values of the others.
 
-    coefficients: per point, state and term, the value refined alone and the ends of its interval.
+    coefficients: per point, state and term, its value by the law (filled, on the line) and refined
+    at the point alone (open), with the ends of their intervals where there are any.
     """
     along, others = parameters[-1], list(parameters[:-1])
-    pairs = list(law.coefficients)
-    figure, axes = make_grid(len(pairs), width=3.0, height=2.4, extra=0.7)
+    titles = [_coef_title(law, *pair) for pair in law.coefficients]
+    width = _panel_width(titles, WIDTH / min(len(titles), 3))
+    figure, axes = style.make_grid(len(titles), width=width, height=2.4, extra=0.7)
     groups = _choose_lines(coefficients, along, others)
-    for ax, (state, term) in zip(axes, pairs, strict=True):
-        unit = unit_text(_unit_of_coef(law, state, term))
-        name = f"${latex_derivative(state)}$:  ${latex_term_name(term)}$  ({unit})"
-        ax.set_title(name, fontsize=TITLE, pad=14.0)
-        for (held, rows), colour in zip(groups, MORE_COLOURS, strict=False):
-            here = rows[(rows["state"] == state) & (rows["term"] == term)].sort_values(along)
-            _draw_law(ax, here, law, (state, term), along, held, colour)
+    coefs = zip(axes, titles, law.coefficients, law.coef, strict=True)
+    for ax, title, (state, term), factors in coefs:
+        ax.set_title(title, fontsize=TITLE, pad=14.0)  # above the ordinate's factor
+        own = {"state": state, "term": term}
+        for (held, group), colour in zip(groups, MORE_COLOURS, strict=False):
+            rows = rows_at(group, own)
+            line, points = style.sample_line(rows[along], along, held, law.parameters)
+            ax.plot(line, law.functions.evaluate(points) @ factors, color=colour, lw=1.5)
+            for kind, mark in (("law", FILLED), ("alone", OPEN)):
+                ends = rows.get(f"{kind}_low"), rows.get(f"{kind}_high")
+                _draw_estimates(ax, rows[along], rows[kind], ends, {"color": colour, **mark})
+        ax.set_xlabel(style.name_label(along, labels))
         ax.grid(alpha=0.3)
-        ax.set_xlabel(name_label(along, labels))
-        _focus(ax, coefficients[(coefficients["state"] == state) & (coefficients["term"] == term)])
-    if others:
-        entries = [
-            Line2D(
-                [], [], color=colour, marker="o", ms=4, mfc="white", label=held_label(held, labels)
-            )
-            for (held, _), colour in zip(groups, MORE_COLOURS, strict=False)
-        ]
-        legend_above(figure, entries)
+        _focus(ax, rows_at(coefficients, own)[["alone", "law"]].to_numpy(float))
+    entries = [
+        Line2D([], [], color=style.SIGN, label="law of all points", **FILLED),
+        Line2D([], [], color=style.SIGN, ls="none", label="each point alone", **OPEN),
+    ]
+    for (held, _), colour in zip(groups if others else [], MORE_COLOURS, strict=False):
+        entries.append(Line2D([], [], color=colour, label=style.held_label(held, labels)))
+    style.legend_above(figure, entries)
     return figure
+
+
+def _coef_title(law: OperatingLaw, state: str, term: str) -> str:
+    """A term in the equation of its state, with the unit of its coefficient."""
+    units = {name: law.units.get(name, "1") for name in law.library.variables}
+    of_term = law.library.units(units)[law.library.index(term)]
+    unit = style.unit_text(unit_product([(units[state], 1), ("s", -1), (of_term, -1)]))
+    return f"${latex_derivative(state)}$:  ${latex_term_name(term)}$  ({unit})"
+
+
+def _panel_width(titles: Sequence[str], least: float) -> float:
+    """Width in inches of panels that these titles fit above, at least this one."""
+    widest = max(TextPath((0, 0), title, size=TITLE).get_extents().width for title in titles)
+    return max(least, widest / 72.0 + 0.3)
 
 
 def _choose_lines(
@@ -102,106 +111,76 @@ def _choose_lines(
     Values with a single point are left out if there are others.
     """
     by_value = rows.groupby(others) if others else [((), rows)]
-    groups = [
-        (dict(zip(others, np.array(key, dtype=float).tolist(), strict=True)), of)
-        for key, of in by_value
-    ]
+    groups = [({name: float(of[name].iloc[0]) for name in others}, of) for _, of in by_value]
     groups = [group for group in groups if group[1][along].nunique() > 1] or groups
-    n = min(len(groups), MAX_LINES)
-    return [groups[k] for k in np.unique(np.linspace(0, len(groups) - 1, n).round().astype(int))]
+    chosen = np.linspace(0, len(groups) - 1, min(len(groups), MAX_LINES))
+    return [groups[k] for k in chosen.round().astype(int)]
 
 
-def _draw_law(
+def _draw_estimates(
     ax: Axes,
-    rows: pd.DataFrame,
-    law: OperatingLaw,
-    pair: tuple[str, str],
-    along: str,
-    held: Mapping[str, float],
-    colour: str,
+    x: pd.Series,
+    value: pd.Series,
+    ends: tuple[pd.Series | None, pd.Series | None],
+    mark: Mapping[str, Any],
 ) -> None:
-    line, points = sample_line(rows[along], along, held, law.parameters)
-    coef = law.coef[law.coefficients.index(pair)]
-    ax.plot(line, law.functions.evaluate(points) @ coef, color=colour, lw=1.5)
-    reach = None
-    if {"alone_low", "alone_high"} <= set(rows):
-        reach = 0.5 * (rows["alone_high"] - rows["alone_low"]).fillna(0.0)
-    ax.errorbar(rows[along], rows["alone"], reach, fmt="o", ms=4, mfc="white", color=colour, lw=0.8,
-                capsize=2, zorder=3)  # fmt: skip
+    """Draw marks at their x, with bars where the ends of an interval are known."""
+    low, high = ends
+    reach = None if low is None or high is None else np.abs([low - value, high - value])
+    ax.errorbar(x, value, reach, ls="none", elinewidth=0.8, capsize=2, zorder=3, **mark)
 
 
-def _focus(ax: Axes, rows: pd.DataFrame) -> None:
+def _focus(ax: Axes, values: np.ndarray) -> None:
     """Set limits by the values alone, as an interval may be very long."""
-    values = np.concatenate([rows["alone"], rows["law"]])
     low, high = values.min(), values.max()
-    size = (MIN_RANGE * np.abs(values).max()) or 1.0
-    margin = max(0.15 * (high - low), 0.5 * (size - (high - low)))
-    ax.set_ylim(low - margin, high + margin)
-
-
-def _unit_of_coef(law: OperatingLaw, state: str, term: str) -> str:
-    """Unit of a term's coefficient in the equation of a state."""
-    units = {name: law.units.get(name, "1") for name in law.library.variables}
-    of_term = law.library.units(units)[law.library.index(term)]
-    return unit_product([(units[state], 1), ("s", -1), (of_term, -1)])
+    reach = max(0.65 * (high - low), 0.5 * MIN_RANGE * np.abs(values).max()) or 0.5
+    ax.set_ylim(0.5 * (low + high) - reach, 0.5 * (low + high) + reach)
 
 
 def left_out_figure(rows: pd.DataFrame) -> Figure:
-    """Frequency and amplitudes of free runs at points left out, against those of the records."""
-    columns = [str(name) for name in rows]
-    states = [name.removeprefix("amplitude_") for name in columns if name.startswith("amplitude_")]
-    cycles = list(dict.fromkeys(rows["branch"]))
-    colours = dict(zip(cycles, MORE_COLOURS, strict=False))
-    figure, ((left, right),) = make_panels(1, 2, (WIDTH, 4.2))
-    _draw_frequencies(left, rows, colours)
-    _draw_shapes(right, rows, states, colours)
+    """Frequency and amplitudes of free runs at points left out, against those of the records.
+
+    rows: the points of one law.
+    """
+    figure, ((left, right),) = style.make_panels(1, 2, (WIDTH, 4.4))
+    _draw_frequencies(left, rows)
+    _draw_shapes(right, rows)
     for ax in (left, right):
         ax.set_box_aspect(1.0)
         ax.grid(alpha=0.3)
-        ax.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, fontsize=SMALL
-        )
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False,
+                  fontsize=SMALL)  # fmt: skip
     return figure
 
 
-def _draw_frequencies(ax: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
+def _draw_frequencies(ax: Axes, rows: pd.DataFrame) -> None:
     """Draw frequencies of the free runs against those of the records."""
     factor, unit = frequency_scale(rows["f_kHz"])
-    for name, colour in colours.items():
-        for enclosed, face in ((True, colour), (False, "white")):
-            of = rows[(rows["branch"] == name) & (rows["enclosed"] == enclosed)]
-            f, of_model = factor * of["f_kHz"], factor * of["f_model_kHz"]
-            ax.plot(f, of_model, "o", color=colour, mfc=face, ms=6, zorder=3)
-        if len(colours) > 1:
-            ax.plot([], [], "s", color=colour, label=f"{name} cycle")
-    for face, words in ((DATA, "enclosed by the others"), ("white", "outside them")):
-        ax.plot([], [], "o", color=DATA, mfc=face, ms=6, label=words)
     known = factor * rows[["f_kHz", "f_model_kHz"]].to_numpy(float)
-    ends = np.array([np.nanmin(known), np.nanmax(known)])
-    ends = ends + np.array([-0.04, 0.04]) * ends.mean()
+    for enclosed, words in ((True, "enclosed by the others"), (False, "outside them")):
+        mark = {"mec": COLOURS[0], "mfc": COLOURS[0] if enclosed else "white", "label": words}
+        ax.plot(*known[rows["enclosed"] == enclosed].T, "o", ms=6, zorder=3, **mark)
+    ends = np.array([0.96, 1.04]) * [np.nanmin(known), np.nanmax(known)]
+    band = {"color": GREY, "alpha": 0.3, "lw": 0.0, "zorder": 0, "label": "1 %"}
     ax.plot(ends, ends, color=GREY, lw=1.0, zorder=1)
-    ax.fill_between(
-        ends, 0.99 * ends, 1.01 * ends, color=GREY, alpha=0.3, lw=0, zorder=0, label="1 %"
-    )
+    ax.fill_between(ends, 0.99 * ends, 1.01 * ends, **band)
     ax.set(xlabel=f"frequency of the record ({unit})", ylabel=f"of the free run ({unit})")
     ax.set(xlim=ends, ylim=ends)
 
 
-def _draw_shapes(
-    ax: Axes, rows: pd.DataFrame, states: Sequence[str], colours: Mapping[str, str]
-) -> None:
+def _draw_shapes(ax: Axes, rows: pd.DataFrame) -> None:
     """Draw waveform errors against amplitude errors."""
-    for state, marker in zip(states, "os^Dv", strict=False):
-        for name, colour in colours.items():
-            of = rows[rows["branch"] == name]
-            off, error = 100.0 * (of[f"amplitude_{state}"] - 1.0), of[f"waveform_{state}"]
-            near = (off.abs() <= FAR_PERCENT) & (error <= FAR_WAVEFORM)
-            ax.plot(off[near], error[near], marker, color=colour, mfc="none", ms=6)
-            if near.all():
-                continue  # an empty artist that is not clipped would fill the canvas in the layout
-            edge = off[~near].clip(-FAR_PERCENT, FAR_PERCENT), error[~near].clip(0, FAR_WAVEFORM)
-            ax.plot(*edge, marker, color=colour, mfc=colour, ms=6, clip_on=False, zorder=5)
-        ax.plot([], [], marker, color=DATA, mfc="none", ms=6, label=f"${latex_name(state)}$")
+    names = [str(name) for name in rows]
+    states = [name.removeprefix("amplitude_") for name in names if name.startswith("amplitude_")]
+    for state, marker, colour in zip(states, cycle(MARKERS), cycle(MORE_COLOURS), strict=False):
+        off, error = 100.0 * (rows[f"amplitude_{state}"] - 1.0), rows[f"waveform_{state}"]
+        near = (off.abs() <= FAR_PERCENT) & (error <= FAR_WAVEFORM)
+        mark: dict[str, Any] = {"ls": "none", "marker": marker, "color": colour, "ms": 6}
+        ax.plot(off[near], error[near], mfc="none", label=f"${latex_name(state)}$", **mark)
+        if near.all():
+            continue  # an empty artist that is not clipped would fill the canvas in the layout
+        edge = off[~near].clip(-FAR_PERCENT, FAR_PERCENT), error[~near].clip(0, FAR_WAVEFORM)
+        ax.plot(*edge, clip_on=False, zorder=5, **mark)
     ax.axvspan(-10, 10, color=GREY, alpha=0.3, lw=0, label="10 % of amplitude")
     ax.axhline(0.2, color=GREY, lw=1.0, label="0.2 of waveform")
     ax.set(xlabel="error of the amplitude (%)", ylabel="error of the waveform (std)")
@@ -217,7 +196,6 @@ def frequency_scale(f_kHz: pd.Series) -> tuple[float, str]:
 def cycle_figure(
     rows: pd.DataFrame,
     points: pd.DataFrame,
-    fitted: np.ndarray,
     *,
     branch: str,
     parameters: Sequence[str],
@@ -225,133 +203,98 @@ def cycle_figure(
 ) -> Figure:
     """Frequency and amplitude of a law's cycle, with those of the records.
 
-    A map over two parameters, a line over one. rows: a grid whose second parameter varies fastest.
-    points: branch (empty for points that do not oscillate), f_kHz and relative_amplitude of the
-    records. fitted: parameters of the law's points.
+    A map over two parameters, a line over one, both faded where the law is extrapolated. rows: a
+    grid of `MapPoint.row`, whose second parameter varies fastest. points: parameters, branch (empty
+    for points that do not oscillate), f_kHz and relative_amplitude of the records.
     """
-    own, quiet = points["branch"] == branch, points["branch"] == ""
-    records = points[own], points[quiet], points[~own & ~quiet]
-    draw = _draw_cycle_map if len(parameters) == 2 else _draw_cycle_line
-    return draw(rows, records, fitted, list(parameters), labels)
-
-
-def _draw_cycle_map(
-    rows: pd.DataFrame,
-    records: Records,
-    fitted: np.ndarray,
-    parameters: list[str],
-    labels: Mapping[str, str],
-) -> Figure:
-    x, y = (np.unique(rows[name].to_numpy(float)) for name in parameters)
-    own, quiet, other = records
-    figure, (axes,) = make_panels(1, 2, (WIDTH, 4.0), sharex=True, sharey=True)
-    for ax, quantity in zip(axes, QUANTITIES, strict=True):
-        factor, title = _scale_quantity(quantity, own)
-        values = factor * rows[quantity].to_numpy(float).reshape(len(x), len(y))
-        seen = factor * own[quantity].to_numpy(float)
-        scale, colours = _colour_range(values, seen), colormaps["viridis"]
-        ax.pcolormesh(x, y, values.T, norm=scale, cmap=colours, shading="nearest", rasterized=True)
-        boundaries = _draw_boundaries(ax, x, y, rows, fitted)
-        at = own[parameters].to_numpy(float)
-        ax.scatter(*at.T, c=colours(scale(seen)), s=52, edgecolor="white", lw=1.2, zorder=4)
-        for which, style in ((quiet, CROSS), (other, DIAMOND)):
-            ax.plot(*which[parameters].to_numpy(float).T, **style)
-        xlabel, ylabel = (name_label(name, labels) for name in parameters)
-        ax.set(xlabel=xlabel, ylabel=ylabel)
-        bar = figure.colorbar(ScalarMappable(scale, colours), ax=ax, pad=0.02, extend="both")
-        bar.set_label(title)
-    legend_above(figure, [*_list_entries(quiet, other, face=GREY), *boundaries])
+    names, own = list(parameters), points["branch"] == branch
+    factor, unit = frequency_scale(points["f_kHz"][own])
+    rows, points = (table.assign(f_kHz=factor * table["f_kHz"]) for table in (rows, points))
+    kinds = _sort_points(rows, points.fillna({"relative_amplitude": 0.0}), own.to_numpy(), names)
+    is_map = len(names) == 2
+    figure, (axes,) = style.make_panels(1, 2, (WIDTH, 4.0), sharex=True, sharey=is_map)
+    quantities = {"f_kHz": f"frequency ({unit})", "relative_amplitude": "relative amplitude"}
+    for ax, (quantity, title) in zip(axes, quantities.items(), strict=True):
+        colours = ScalarMappable(_colour_range(rows[quantity], points[quantity][own]))
+        ax.set_xlabel(style.name_label(names[0], labels))
+        if is_map:
+            ax.set_ylabel(style.name_label(names[1], labels))
+            figure.colorbar(colours, ax=ax, pad=0.02, extend="both", label=title)
+            entries = _draw_map(ax, rows, names, quantity, colours)
+        else:
+            ax.set_ylabel(title)
+            entries = _draw_line(ax, rows, names[0], quantity)
+        for of, mark, _ in kinds:
+            face = colours.to_rgba(of[quantity].to_numpy(float)) if is_map else GREY
+            at = of[names] if is_map else of[[*names, quantity]]
+            ax.scatter(*at.to_numpy(float).T, zorder=4, **{"facecolor": face, **mark})
+    marks = [
+        axes[0].scatter([], [], label=label, **{"facecolor": GREY, **mark})
+        for _, mark, label in kinds
+    ]
+    if not rows["inside"].all():
+        entries.append(Patch(color=COLOURS[0], alpha=FADED, label="beyond the points fitted"))
+    style.legend_above(figure, [*marks, *entries])
     return figure
 
 
-def _draw_cycle_line(
-    rows: pd.DataFrame,
-    records: Records,
-    fitted: np.ndarray,
-    parameters: list[str],
-    labels: Mapping[str, str],
-) -> Figure:
-    (name,) = parameters
-    own, quiet, other = records
-    figure, (axes,) = make_panels(1, 2, (WIDTH, 3.6))
-    for ax, quantity in zip(axes, QUANTITIES, strict=True):
-        factor, title = _scale_quantity(quantity, own)
-        ax.axvspan(fitted.min(), fitted.max(), color=GREY, alpha=0.2, lw=0)
-        ax.plot(rows[name], factor * rows[quantity], color=COLOURS[0], lw=1.8)
-        ax.plot(own[name], factor * own[quantity], "o", color=DATA, mfc="white", zorder=3)
-        ax.plot(other[name], factor * other[quantity], **DIAMOND)
-        bottom = ax.get_xaxis_transform()
-        ax.plot(quiet[name], np.full(len(quiet), 0.05), transform=bottom, **CROSS)
-        ax.set(xlabel=name_label(name, labels), ylabel=title)
-        ax.grid(alpha=0.3)
-    entries = _list_entries(quiet, other, face="white")
-    law = Line2D([], [], color=COLOURS[0], lw=1.8, label="the model's cycle")
-    legend_above(figure, [law, *entries, Patch(color=GREY, alpha=0.2, label="points fitted")])
-    return figure
+def _sort_points(
+    rows: pd.DataFrame, points: pd.DataFrame, own: np.ndarray, names: list[str]
+) -> list[Kind]:
+    """The kinds of points that there are, each point with the law's fate nearest to it in rows."""
+    grid, at = rows[names].to_numpy(float), points[names].to_numpy(float)
+    apart = np.linalg.norm((at[:, None] - grid) / zero_to_one(np.ptp(grid, axis=0)), axis=-1)
+    alive = (rows["fate"] == "oscillates").to_numpy()[apart.argmin(axis=1)]
+    quiet = (points["branch"] == "").to_numpy()
+    kinds = (
+        (own & alive, RECORD, "record"),
+        (own & ~alive, {**RECORD, "edgecolor": WRONG}, "record, no cycle by the law"),
+        (quiet & ~alive, CROSS, "not oscillating"),
+        (quiet & alive, {**CROSS, "facecolor": WRONG}, "not oscillating, unlike the law"),
+        (~own & ~quiet, DIAMOND, "record of another cycle"),
+    )
+    return [(points[of], mark, label) for of, mark, label in kinds if of.any()]
 
 
-def _list_entries(quiet: pd.DataFrame, other: pd.DataFrame, *, face: str) -> list[Artist]:
-    """Legend entries: records, with this marker face, and the other kinds of points that occur."""
-    there = ((quiet, CROSS, "not oscillating"), (other, DIAMOND, "record of another cycle"))
-    record = Line2D([], [], ls="none", marker="o", mec=DATA, mfc=face, label="record")
-    return [record, *(Line2D([], [], **mark, label=label) for of, mark, label in there if len(of))]
+def _draw_map(
+    ax: Axes, rows: pd.DataFrame, names: list[str], quantity: str, colours: ScalarMappable
+) -> list[Artist]:
+    """Draw the map, and lines where its cycle ends; returns their legend entries."""
+    x, y = (np.unique(rows[name].to_numpy(float)) for name in names)
+    alive, faded = (rows["fate"] == "oscillates") - 0.5, FADED + (1.0 - FADED) * rows["inside"]
+    values, opacity, alive, growth = (
+        of.to_numpy(float).reshape(len(x), len(y)).T
+        for of in (rows[quantity], faded, alive, rows["growth_per_s"])
+    )
+    ax.pcolormesh(
+        x, y, values, norm=colours.norm, alpha=opacity, shading="nearest", rasterized=True
+    )
+    entries: list[Artist] = []
+    for field, dash, label in (
+        (alive, "-", "the law's cycle ends"),
+        (growth, "--", "its fixed point turns stable"),
+    ):
+        if min(field.shape) > 1 and (field < 0.0).any() and (field > 0.0).any():
+            lines: dict[str, Any] = {"linestyles": dash, "linewidths": 1.5, "colors": "black"}
+            ax.contour(x, y, np.ma.masked_invalid(field), levels=[0.0], **lines)
+            entries.append(Line2D([], [], color="black", lw=1.5, ls=dash, label=label))
+    return entries
 
 
-def _scale_quantity(quantity: str, records: pd.DataFrame) -> tuple[float, str]:
-    """Factor on a quantity, and the label of its axis."""
-    if quantity != "f_kHz":
-        return 1.0, "relative amplitude"
-    factor, unit = frequency_scale(records["f_kHz"])
-    return factor, f"frequency ({unit})"
+def _draw_line(ax: Axes, rows: pd.DataFrame, name: str, quantity: str) -> list[Artist]:
+    ax.plot(rows[name], rows[quantity], color=COLOURS[0], lw=1.8, alpha=FADED)
+    inside = rows[quantity].where(rows["inside"])
+    law = ax.plot(rows[name], inside, color=COLOURS[0], lw=1.8, label="the law's cycle")
+    ax.grid(alpha=0.3)
+    return [*law]
 
 
-def _colour_range(values: np.ndarray, seen: np.ndarray) -> Normalize:
+def _colour_range(values: pd.Series, seen: pd.Series) -> Normalize:
     """Colour range of the records and nearly all of the map, kept close to the records."""
     low, high = seen.min(), seen.max()
     reach = (high - low) or abs(high)
-    if np.isfinite(values).any():
-        ends = np.nanquantile(values, [0.02, 0.98])
-        low = min(low, max(ends[0], low - reach, 0.0))
-        high = max(high, min(ends[1], high + reach))
-    return Normalize(low, high)
-
-
-def _draw_boundaries(
-    ax: Axes, x: np.ndarray, y: np.ndarray, rows: pd.DataFrame, fitted: np.ndarray
-) -> list[Artist]:
-    """Draw where cycles end, where the fixed point turns stable, and the hull of fitted points.
-
-    Returns legend entries of those that there are.
-    """
-    shape = (len(x), len(y))
-    entries: list[Artist] = []
-    alive = (rows["fate"] == "oscillates").to_numpy().reshape(shape).astype(float)
-    if min(shape) > 1 and 0.0 < alive.mean() < 1.0:
-        ax.contour(x, y, alive.T, levels=[0.5], colors="black", linewidths=1.8)
-        entries.append(Line2D([], [], color="black", lw=1.8, label="the model's cycle ends"))
-    growth = rows["growth_per_s"].to_numpy(float).reshape(shape)
-    if min(shape) > 1 and (growth < 0.0).any() and (growth > 0.0).any():
-        style: dict[str, Any] = {"linestyles": "--", "colors": "black", "linewidths": 1.3}
-        ax.contour(x, y, np.ma.masked_invalid(growth.T), levels=[0.0], **style)
-        label = "its fixed point turns stable"
-        entries.append(Line2D([], [], color="black", lw=1.3, ls="--", label=label))
-    ax.plot(*_enclose(fitted).T, color=GREY, lw=1.5)
-    return [*entries, Line2D([], [], color=GREY, lw=1.5, label="points fitted")]
-
-
-def _enclose(points: np.ndarray) -> np.ndarray:
-    """Closed convex outline of the points; the two ends if all lie on one line."""
-    scaled = (points - points.min(axis=0)) / np.ptp(points, axis=0)
-    try:
-        around = ConvexHull(scaled).vertices
-    except QhullError:
-        around = np.argsort(scaled[:, 0])[[0, -1]]
-    return points[[*around, around[0]]]
-
-
-PUBLISHED = "published"  # the kind of estimate that comes from a publication
-
-APART = 0.022  # offset of fits at one point, as share of the axis: error bars stay visible
+    least, most = values.quantile([0.02, 0.98]).fillna(low)
+    return Normalize(min(low, max(least, low - reach, 0.0)), max(high, min(most, high + reach)))
 
 
 def trends_figure(
@@ -364,34 +307,50 @@ def trends_figure(
     """Quantities of one fit against one parameter at a time, the others held, with 95 % intervals.
 
     estimates: a column per parameter, then kind, quantity, value, low, high; a column of panels per
-    quantity, a colour per kind. Those of kind `PUBLISHED` are drawn as open marks. laws: by
-    quantity, drawn as lines in the first kind's colour. trends: one row of panels each, (parameter,
-    values of the others). labels: names of parameters, quantities and kinds on axes and in the
-    legend; by default their own.
+    quantity, in several blocks if they are many. The first kind is drawn filled, the others open.
+    laws: by quantity, of the first kind, drawn as lines between its points. trends: one row of
+    panels each, (parameter, values of the others). labels: names of parameters, quantities and
+    kinds on axes and in the legend; by default their own.
     """
+    marks = {
+        kind: {"color": colour, "marker": marker, "ms": 5, "mfc": "none" if k else colour}
+        for k, (kind, colour, marker) in enumerate(
+            zip(dict.fromkeys(estimates["kind"]), cycle(COLOURS), cycle(MARKERS), strict=False)
+        )
+    }
     quantities = list(dict.fromkeys(estimates["quantity"]))
-    colours = dict(zip(dict.fromkeys(estimates["kind"]), cycle(COLOURS), strict=False))
-    size = (WIDTH, 2.1 * len(trends) + 0.5)
-    figure, axes = make_panels(len(trends), len(quantities), size, sharex="row", sharey="col")
-    for row, (along, at) in zip(axes, trends, strict=True):
-        here = rows_at(estimates, at)
-        for ax, quantity in zip(row, quantities, strict=True):
-            x = here[along].astype(float)
-            _draw_kinds(ax, rows_at(here, {"quantity": quantity}), along, colours, np.ptp(x))
-            if quantity in laws and np.ptp(x):
-                line, points = sample_line(x, along, at, laws[quantity].functions.variables)
-                colour = next(iter(colours.values()))
-                ax.plot(line, laws[quantity].predict(points), color=colour, lw=1.2, zorder=1)
-            ax.set_xticks(np.unique(x), [f"{value:g}" for value in np.unique(x)])
-            ax.set_xlabel(name_label(along, labels))
-            ax.margins(x=0.1)
-            ax.grid(alpha=0.3)
-        row[0].set_ylabel(f"at {held_label(at, labels)}" if at else "")
-    for ax, quantity in zip(axes[0], quantities, strict=True):
-        title = name_label(quantity, labels)
-        ax.set_title(title, fontsize=TITLE, y=1.0, pad=14.0)  # above the ordinate's factor
-    legend_above(figure, _list_kinds(colours, labels, laws=bool(laws)))
+    titles = [style.name_label(quantity, labels) for quantity in quantities]
+    figure, panels = _make_blocks(titles, len(trends))
+    for of_quantity, quantity, title in zip(panels, quantities, titles, strict=True):
+        shown = rows_at(estimates, {"quantity": quantity})
+        of_quantity[0].set_title(title, fontsize=TITLE, y=1.0, pad=14.0)
+        for ax, (along, at) in zip(of_quantity, trends, strict=True):
+            ax.sharey(of_quantity[0])
+            _draw_trend(ax, rows_at(shown, at), along, at, laws.get(quantity), marks)
+            ax.set_xlabel(style.name_label(along, labels))
+            if at and ax.get_subplotspec().is_first_col():
+                ax.set_ylabel(f"at {style.held_label(at, labels)}".replace(", ", ",\n"))
+    entries = [
+        Line2D([], [], ls="none", label=labels.get(kind, kind), **mark)
+        for kind, mark in marks.items()
+    ]
+    if laws:
+        label = f"control law, {entries[0].get_label()}"
+        entries.append(Line2D([], [], color=COLOURS[0], lw=1.2, label=label))
+    style.legend_above(figure, entries)
     return figure
+
+
+def _make_blocks(titles: Sequence[str], n_trends: int) -> tuple[Figure, np.ndarray]:
+    """Panels by quantity and trend, below each other in blocks that these titles fit above."""
+    most = max(1, int(WIDTH / _panel_width(titles, WIDTH / 4)))
+    n_blocks = -(-len(titles) // most)
+    n_columns, n_rows = -(-len(titles) // n_blocks), n_blocks * n_trends
+    figure, grid = style.make_panels(n_rows, n_columns, (WIDTH, 2.1 * n_rows + 0.5), sharex="row")
+    panels = grid.reshape(n_blocks, n_trends, n_columns).swapaxes(1, 2).reshape(-1, n_trends)
+    for ax in panels[len(titles) :].flat:
+        ax.remove()
+    return figure, panels[: len(titles)]
 
 
 def rows_at(table: pd.DataFrame, held: Mapping[str, Any]) -> pd.DataFrame:
@@ -401,29 +360,22 @@ def rows_at(table: pd.DataFrame, held: Mapping[str, Any]) -> pd.DataFrame:
     return table
 
 
-def _draw_kinds(
-    ax: Axes, rows: pd.DataFrame, along: str, colours: Mapping[str, str], width: float
+def _draw_trend(
+    ax: Axes,
+    rows: pd.DataFrame,
+    along: str,
+    at: Mapping[str, float],
+    law: ControlLaw | None,
+    marks: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Draw estimates of one quantity with their intervals, the kinds a little beside each other."""
-    for k, (kind, colour) in enumerate(colours.items()):
+    """Draw estimates of one quantity with their intervals, and the law of the first kind."""
+    for kind, mark in marks.items():
         of = rows_at(rows, {"kind": kind})
-        reach = np.abs(of[["low", "high"]].sub(of["value"], axis=0).to_numpy().T)
-        x = of[along] + APART * width * (k - 0.5 * (len(colours) - 1))
-        ax.errorbar(x, of["value"], reach, capsize=3, lw=1, zorder=3, **_mark(kind, colour))
-
-
-def _mark(kind: str, colour: str) -> dict[str, Any]:
-    face = "none" if kind == PUBLISHED else colour
-    return {"color": colour, "ls": "none", "marker": "o", "ms": 5, "mfc": face}
-
-
-def _list_kinds(
-    colours: Mapping[str, str], labels: Mapping[str, str], *, laws: bool
-) -> list[Line2D]:
-    """Legend entries: a mark for each kind, and the line of the laws in the first one's colour."""
-    marks = [
-        Line2D([], [], label=labels.get(kind, kind), **_mark(kind, colour))
-        for kind, colour in colours.items()
-    ]
-    colour = next(iter(colours.values()))
-    return marks + ([Line2D([], [], color=colour, lw=1.2, label="control law")] if laws else [])
+        ends = (None, None) if kind == PUBLISHED else (of["low"], of["high"])
+        _draw_estimates(ax, of[along], of["value"], ends, mark)
+    x = rows_at(rows, {"kind": next(iter(marks))})[along]
+    if law is not None and x.nunique() > 1:
+        line, points = style.sample_line(x, along, at, law.functions.variables)
+        ax.plot(line, law.predict(points), color=COLOURS[0], lw=1.2, zorder=1)
+    ax.margins(x=0.1)
+    ax.grid(alpha=0.3)

@@ -133,6 +133,5 @@ def _(
         for record in records
     ]
     return law_cycle_figure(
-        rows, pd.DataFrame(seen), law.points, branch="law", parameters=law.parameters,
-        labels=labels,
-    )  # fmt: skip
+        rows, pd.DataFrame(seen), branch="law", parameters=law.parameters, labels=labels
+    )
