@@ -61,7 +61,7 @@ def plot(value: object, *rest: object, **settings: object) -> Figure:
     plot(cycle, run=None): a `LimitCycle` in the plane of the first two states, with runs from other
     starts. run: samples to draw behind it, of at least these two states.
     plot(law, records, n_points=25, labels={}): frequency and amplitude of the cycle of an
-    `OperatingLaw` over its one or two parameters. records: `OperatingRecord`s of the points, from
+    `OperatingLaw` over its one or two parameters. runs: those of the operating points, from
     whose cycles the law's models are started, and which are drawn as well. n_points: along each
     parameter. labels: names of the parameters on the axes.
     Raises TypeError for another value, ValueError for a number that is not positive and for a law
@@ -111,16 +111,17 @@ def _(cycle: LimitCycle, run: Trajectory | None = None) -> Figure:
 @plot.register
 def _(
     law: OperatingLaw,
-    records: Sequence[OperatingRecord],
+    runs: Sequence[Trajectory],
     *,
     n_points: int = 25,
     labels: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
+    records = [OperatingRecord(run) for run in runs]
     grid = map_points([record.parameters for record in records], n_points)
     if not grid:
         raise ValueError(
             f"a map is over one or two parameters: this law has {list(law.parameters)}; hold the "
-            "others, and draw law.model_at(...) yourself"
+            "others, and draw law.at(...) yourself"
         )
     rows = pd.DataFrame([point.row for point in law_map(law, records, grid)])
     seen = [

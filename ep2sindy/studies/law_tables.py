@@ -57,8 +57,8 @@ LEFT_OUT = (
 TRIED = (
     "error: mean over the points left out; of models that run freely the largest deviation from "
     "the cycle, in units of its bound (1 % of frequency, 10 % of amplitude, 0.2 of waveform), 10 "
-    "at most, else that of the rates, relative to them; f error: median; numbers: of the law. Chosen: "
-    "the fewest numbers within a standard error of the least."
+    "at most, else that of the rates, relative to them; f error: median; numbers: of the law. "
+    "Chosen: the fewest numbers within a standard error of the least."
 )
 CAPTIONS = {
     "laws": "Coefficients over the operating parameters: refined at each point alone (open, with "
@@ -71,14 +71,15 @@ CAPTIONS = {
     "model that lives.",
     "map": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
     "over the operating parameters, and of the records in the same colours (circles); crosses: "
-    "points that do not oscillate; diamonds: records of another cycle, not fitted here. Black "
-    "line: where the model's cycle ends; dashed: where its fixed point turns stable; grey: what "
-    "the points that the law was fitted to enclose, beyond which it is extrapolated, and the map "
-    "faded. White: no cycle.",
+    "points that do not oscillate, red where the law says that they do; diamonds: records of "
+    "another cycle, not fitted here. Black line: where the model's cycle ends; dashed: where its "
+    "fixed point turns stable. Beyond the points that the law was fitted to it is extrapolated, "
+    "and the map is faded. White: no cycle.",
     "line": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
-    "over the operating parameter (line, ending where the cycle does), and of the records "
-    "(circles); crosses: points that do not oscillate; diamonds: records of another cycle, not "
-    "fitted here. Shaded: between the points that the law was fitted to.",
+    "over the operating parameter (line, ending where the cycle does, faded beyond the points "
+    "that the law was fitted to), and of the records (circles); crosses: points that do not "
+    "oscillate, red where the law says that they do; diamonds: records of another cycle, not "
+    "fitted here.",
 }
 
 
@@ -87,9 +88,9 @@ class FoundLaw:
     """The law of the records on one cycle, and what was tried for it.
 
     cycle: its name; "all" if there is only one. smooth: relative errors of frequency and amplitude
-    if these are themselves interpolated, at points left out, by the law's functions. at_points: the law's models at all points of the study.
-    map: the same over a grid that encloses these. Of a model that inputs drive, which has no free
-    runs, all three are empty.
+    if these are themselves interpolated, at points left out, by the law's functions. at_points: the
+    law's models at all points of the study. map: the same over a grid that encloses these. Of a
+    model that inputs drive, which has no free runs, all three are empty.
     """
 
     cycle: str
@@ -204,7 +205,7 @@ class FoundLaw:
             caption = CAPTIONS["map" if len(self.parameters) == 2 else "line"]
             draw = partial(
                 cycle_figure, pd.DataFrame([point.row for point in self.map]), points,
-                self.law.points, branch=self.cycle, parameters=self.parameters, labels=labels,
+                branch=self.cycle, parameters=self.parameters, labels=labels,
             )  # fmt: skip
             found["map"] = Captioned(draw, caption)
         return found

@@ -9,8 +9,8 @@ from itertools import product
 from typing import Annotated, Any
 
 from ep2sindy.data.quantities import STEP_DOUBT
-from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
 from ep2sindy.data.run_files import FilePattern
+from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
 from ep2sindy.operating.records import Point, name_point
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, collect

@@ -12,10 +12,10 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import point_label
+from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.model import SparseModel
-from ep2sindy.discovery.discover import discover
 from ep2sindy.operating.given_models import (
     REFINED,
     FittingSettings,
@@ -65,7 +65,7 @@ class ModelSettings:
 
 
 @dataclass(frozen=True)
-class Windows:
+class RefiningWindows:
     """Windows of every record: number, and length in periods of its oscillation."""
 
     n_windows: Count
@@ -96,7 +96,7 @@ class Study:
     parameters: Mapping[str, str | None]
     points: Points
     models: Mapping[str, ModelSettings] | None
-    windows: Windows
+    windows: RefiningWindows
     laws: Laws | None
     labels: Mapping[str, str]
     map_points: CountOrNone = None

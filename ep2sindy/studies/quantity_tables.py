@@ -246,7 +246,7 @@ class FoundQuantities:
                 unit=self._units(best)[name],
                 mark=f" ({percent(2)(law.search_error)} off where left out)",
                 on_screen=True,
-            )  # fmt: skip
+            )
             for name, law in (self.laws[best].items() if best else ())
         ]
         others = {fit: error for fit, error in self.errors.items() if fit != best}
