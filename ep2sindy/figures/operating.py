@@ -35,7 +35,7 @@ MIN_RANGE = 0.1  # least axis range, as a share of the coefficient's size
 MAX_LINES = 5  # number of the other parameters' values that are drawn
 FADED = 0.35  # opacity of a map's colours beyond the points that the law was fitted to
 WRONG = "#d00000"  # marks where the law says otherwise than the record; no colour of the map
-MARKERS = "os^Dv<>P"
+MARKERS = "os^Dv<>"  # seven, of eight colours: a pair recurs after 56
 PUBLISHED = "published"  # the kind of estimate that comes from a publication
 
 FILLED: dict[str, Any] = {"marker": "o", "ms": 3.5}
@@ -225,15 +225,16 @@ def cycle_figure(
             ax.set_ylabel(title)
             entries = _draw_line(ax, rows, names[0], quantity)
         for of, mark, _ in kinds:
-            face = colours.to_rgba(of[quantity].to_numpy(float)) if is_map else GREY
+            face = colours.to_rgba(of[quantity].to_numpy(float)) if is_map else DATA
             at = of[names] if is_map else of[[*names, quantity]]
             ax.scatter(*at.to_numpy(float).T, zorder=4, **{"facecolor": face, **mark})
     marks = [
-        axes[0].scatter([], [], label=label, **{"facecolor": GREY, **mark})
+        axes[0].scatter([], [], label=label, **{"facecolor": GREY if is_map else DATA, **mark})
         for _, mark, label in kinds
     ]
     if not rows["inside"].all():
-        entries.append(Patch(color=COLOURS[0], alpha=FADED, label="beyond the points fitted"))
+        label = "faded: beyond the points fitted"
+        entries.append(Patch(color=style.SIGN, alpha=FADED, label=label))
     style.legend_above(figure, [*marks, *entries])
     return figure
 

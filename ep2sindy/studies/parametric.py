@@ -94,8 +94,8 @@ WORDS = {
 }
 UNITS = "Units are SI, unless a name ends in another, such as mdot_mg_s."
 CAPTION = (
-    "Quantities of the fit {}, against one parameter with the others held: filled marks with 95 % "
-    "intervals, which are smaller than the marks where no bars show"
+    "Quantities of the fit {}, against one parameter with the others held, with 95 % intervals, "
+    "which are smaller than the marks where no bars show"
 )
 
 
@@ -305,8 +305,12 @@ class Outcome:
         theirs = theirs.assign(low=theirs["value"], high=theirs["value"], kind=PUBLISHED)
         table = pd.concat([ours.assign(kind=ours["fit"].map(kinds)), theirs])
         laws = self.laws.get(best, {})
-        published = "; open what the thesis found in its data" if len(theirs) else ""
-        lines = f"; lines are the control laws of the fit {_spoken(best)}" if laws else ""
+        published = "; beside them what the thesis found in its data" if len(theirs) else ""
+        lines = (
+            f"; lines are the control laws of the filled marks, the fit {_spoken(best)}"
+            if laws
+            else ""
+        )
         draw = partial(trends_figure, table, laws, trends=self.along, labels=self.labels)
         return Captioned(draw, f"{CAPTION.format(_spoken(case))}{published}{lines}.")
 

@@ -77,25 +77,26 @@ TRIED = (
     "standard error of the least."
 )
 CAPTIONS = {
-    "laws": "Coefficients over the operating parameters: refined at each point alone (open, with "
-    "95 % intervals) and by the law that all points share (lines), at up to five values of the "
-    "other parameters. Where the open points leave the lines by more than their bars, other "
-    "coefficients make up for it: points are sloppy in some directions, and the law is fitted to "
-    "the records, not to them.",
+    "laws": "Coefficients over the operating parameters, with 95 % intervals: by the law that all "
+    "points share (lines, filled at its points) and refined at each point alone (open), at up to "
+    "five values of the other parameters. The law is fitted to the records, not to the open "
+    "points: where these leave the lines by more than their bars, other coefficients make up for "
+    "it, as points are sloppy in some directions.",
     "left_out": "Points left out, each read off the law of the others. Left: frequency of the free "
     "run over the record's, the band 1 %. Right: errors of amplitude and waveform of each "
     "state, those beyond the panel filled on its edge; band and line are the bounds of a "
     "model that lives.",
     "map": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
-    "over the operating parameters, and of the records in the same colours (circles); crosses: "
-    "points that do not oscillate; diamonds: records of another cycle, not fitted here. Black "
-    "line: where the model's cycle ends; dashed: where its fixed point turns stable; grey: what "
-    "the points that the law was fitted to enclose, beyond which it is extrapolated. White: no "
-    "cycle.",
+    "over the operating parameters, white without a cycle, and of the records in the same colours "
+    "(circles); crosses: points that do not oscillate; diamonds: records of another cycle, not "
+    "fitted here. Red: the law says otherwise than the record. Black line: where the law's cycle "
+    "ends; dashed: where its fixed point turns stable. Faded: beyond what the points that the law "
+    "was fitted to enclose, where it is extrapolated.",
     "line": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
     "over the operating parameter (line, ending where the cycle does), and of the records "
-    "(circles); crosses: points that do not oscillate; diamonds: records of another cycle, not "
-    "fitted here. Shaded: between the points that the law was fitted to.",
+    "(circles); crosses at zero amplitude: points that do not oscillate; diamonds: records of "
+    "another cycle, not fitted here. Red: the law says otherwise than the record. Faded: beyond "
+    "the points that the law was fitted to, where it is extrapolated.",
 }
 
 
