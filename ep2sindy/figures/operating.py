@@ -161,7 +161,7 @@ def _draw_frequencies(ax: Axes, rows: pd.DataFrame) -> None:
         mark = {"mec": COLOURS[0], "mfc": COLOURS[0] if enclosed else "white", "label": words}
         ax.plot(*known[rows["enclosed"] == enclosed].T, "o", ms=6, zorder=3, **mark)
     ends = np.array([0.96, 1.04]) * [np.nanmin(known), np.nanmax(known)]
-    band = {"color": GREY, "alpha": 0.3, "lw": 0.0, "zorder": 0, "label": "1 %"}
+    band: dict[str, Any] = {"color": GREY, "alpha": 0.3, "lw": 0.0, "zorder": 0, "label": "1 %"}
     ax.plot(ends, ends, color=GREY, lw=1.0, zorder=1)
     ax.fill_between(ends, 0.99 * ends, 1.01 * ends, **band)
     ax.set(xlabel=f"frequency of the record ({unit})", ylabel=f"of the free run ({unit})")
@@ -262,10 +262,10 @@ def _draw_map(
 ) -> list[Artist]:
     """Draw the map, and lines where its cycle ends; returns their legend entries."""
     x, y = (np.unique(rows[name].to_numpy(float)) for name in names)
-    alive, faded = (rows["fate"] == "oscillates") - 0.5, FADED + (1.0 - FADED) * rows["inside"]
+    fate, faded = (rows["fate"] == "oscillates") - 0.5, FADED + (1.0 - FADED) * rows["inside"]
     values, opacity, alive, growth = (
         of.to_numpy(float).reshape(len(x), len(y)).T
-        for of in (rows[quantity], faded, alive, rows["growth_per_s"])
+        for of in (rows[quantity], faded, fate, rows["growth_per_s"])
     )
     ax.pcolormesh(
         x, y, values, norm=colours.norm, alpha=opacity, shading="nearest", rasterized=True
@@ -313,7 +313,7 @@ def trends_figure(
     panels each, (parameter, values of the others). labels: names of parameters, quantities and
     kinds on axes and in the legend; by default their own.
     """
-    marks = {
+    marks: dict[str, dict[str, Any]] = {
         kind: {"color": colour, "marker": marker, "ms": 5, "mfc": "none" if k else colour}
         for k, (kind, colour, marker) in enumerate(
             zip(dict.fromkeys(estimates["kind"]), cycle(COLOURS), cycle(MARKERS), strict=False)
