@@ -158,8 +158,9 @@ def _draw_frequencies(ax: Axes, rows: pd.DataFrame) -> None:
     factor, unit = frequency_scale(rows["f_kHz"])
     known = factor * rows[["f_kHz", "f_model_kHz"]].to_numpy(float)
     for enclosed, words in ((True, "enclosed by the others"), (False, "outside them")):
-        mark = {"mec": COLOURS[0], "mfc": COLOURS[0] if enclosed else "white", "label": words}
-        ax.plot(*known[rows["enclosed"] == enclosed].T, "o", ms=6, zorder=3, **mark)
+        face = COLOURS[0] if enclosed else "white"
+        mark: dict[str, Any] = {"color": COLOURS[0], "mfc": face, "ms": 6, "label": words}
+        ax.plot(*known[rows["enclosed"] == enclosed].T, "o", zorder=3, **mark)
     ends = np.array([0.96, 1.04]) * [np.nanmin(known), np.nanmax(known)]
     band: dict[str, Any] = {"color": GREY, "alpha": 0.3, "lw": 0.0, "zorder": 0, "label": "1 %"}
     ax.plot(ends, ends, color=GREY, lw=1.0, zorder=1)
@@ -267,9 +268,8 @@ def _draw_map(
         of.to_numpy(float).reshape(len(x), len(y)).T
         for of in (rows[quantity], faded, fate, rows["growth_per_s"])
     )
-    ax.pcolormesh(
-        x, y, values, norm=colours.norm, alpha=opacity, shading="nearest", rasterized=True
-    )
+    mesh: dict[str, Any] = {"norm": colours.norm, "alpha": opacity, "rasterized": True}
+    ax.pcolormesh(x, y, values, shading="nearest", **mesh)
     entries: list[Artist] = []
     for field, dash, label in (
         (alive, "-", "the law's cycle ends"),
