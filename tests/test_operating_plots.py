@@ -55,7 +55,8 @@ def drawn(figure: Figure) -> list[str]:
         for text, box in boxes:
             assert not meet(box, ax.get_window_extent()), (text, ax.get_title())
     for text, box in boxes:
-        assert box.x0 >= 0.0 and box.x1 <= figure.bbox.x1, text
+        assert box.x0 >= 0.0, text
+        assert box.x1 <= figure.bbox.x1, text
     return [text.get_text() for text in entries]
 
 
@@ -148,7 +149,7 @@ def test_a_mark_on_a_map_has_its_own_colour_and_is_red_where_the_law_errs() -> N
     assert drawn(figure) == [
         "record", "record, no cycle by the law", "not oscillating",
         "not oscillating, unlike the law", "record of another cycle", "the law's cycle ends",
-        "its fixed point turns stable", "beyond the points fitted",
+        "its fixed point turns stable", "faded: beyond the points fitted",
     ]  # fmt: skip
     ax = figure.axes[0]
     of, map_ = spots(ax), ax.collections[0]
@@ -167,14 +168,16 @@ def test_a_map_is_faded_beyond_the_fitted_points_and_white_without_a_cycle() -> 
     np.testing.assert_array_equal(opacity, np.where(rows["inside"], 1.0, FADED))
     shown = np.ma.masked_invalid(map_.get_array()).T.ravel()
     np.testing.assert_array_equal(shown.mask, rows["fate"] == "rests")
-    assert "beyond the points fitted" not in drawn(cycles(rows.assign(inside=True), "a", "b"))
+    assert "faded: beyond the points fitted" not in drawn(
+        cycles(rows.assign(inside=True), "a", "b")
+    )
 
 
 def test_one_parameter_has_a_line_that_ends_with_the_cycle() -> None:
     rows = grid(11)
     rows = rows[rows["b"] == 0.0].assign(inside=rows["a"] < 1.45)
     figure = cycles(rows, "a")
-    words = {"the law's cycle", "record", "not oscillating", "beyond the points fitted"}
+    words = {"the law's cycle", "record", "not oscillating", "faded: beyond the points fitted"}
     assert words <= set(drawn(figure))
     whole, inside = figure.axes[0].lines
     np.testing.assert_array_equal(whole.get_ydata(), rows["f_kHz"])
@@ -189,7 +192,7 @@ def example_law(n: int, parameters: Sequence[str]) -> tuple[OperatingLaw, pd.Dat
     names = ["x", "x^2", LONG, f"x*{LONG}", "x*n_i", "n_i*n_n"] * 2
     pairs = tuple((("n_i", "n_n")[k // 6], name) for k, name in enumerate(names[:n]))
     functions = polynomial(parameters, degree=1)
-    values = [np.linspace(1.0, 6.0, 6), np.linspace(100.0, 300.0, 3)]
+    values = [np.linspace(1.0, 5.0, 5), np.linspace(100.0, 300.0, 3)]
     points = np.array(np.meshgrid(*values[: len(parameters)])).reshape(len(parameters), -1).T
     law = OperatingLaw(
         functions=functions,
@@ -213,11 +216,11 @@ def example_law(n: int, parameters: Sequence[str]) -> tuple[OperatingLaw, pd.Dat
 
 
 @pytest.mark.parametrize("parameters", [["m"], ["V", "m"]])
-@pytest.mark.parametrize("n", [1, 2, 5, 12])
+@pytest.mark.parametrize("n", [1, 2, 12])
 def test_filled_marks_lie_on_the_line_of_their_law(n: int, parameters: list[str]) -> None:
     law, rows = example_law(n, parameters)
     figure = laws_figure(rows, law, parameters=parameters, labels={"V": "$V_D$ (V)"})
-    assert len(drawn(figure)) == 2 + 3 * (len(parameters) - 1)
+    assert len(drawn(figure)) == 2 + 5 * (len(parameters) - 1)
     assert len(figure.axes) == n
     for ax, pair in zip(figure.axes, law.coefficients, strict=True):
         lines = [
@@ -233,11 +236,11 @@ def test_filled_marks_lie_on_the_line_of_their_law(n: int, parameters: list[str]
             )
             for mark in (filled, open_):
                 assert set(mark.get_xdata()) <= set(rows["m"])
-            on_line = np.interp(filled.get_xdata(), line.get_xdata(), line.get_ydata())
-            np.testing.assert_allclose(filled.get_ydata(), on_line, rtol=1e-9)
+            on_line = np.interp(filled.get_xdata(orig=False), line.get_xdata(), line.get_ydata())
+            np.testing.assert_allclose(filled.get_ydata(orig=False), on_line, rtol=1e-9)
         own = rows[(rows["state"] == pair[0]) & (rows["term"] == pair[1])]
-        alone = np.concatenate([mark.get_ydata() for mark in marks[1::2]])
-        np.testing.assert_allclose(np.sort(alone), np.sort(own["alone"]))
+        alone = np.concatenate([mark.get_ydata(orig=False) for mark in marks[1::2]])
+        np.testing.assert_allclose(np.sort(alone), np.sort(own["alone"].to_numpy()))
 
 
 def test_a_coefficient_that_is_constant_looks_constant_and_has_its_unit() -> None:
@@ -268,7 +271,7 @@ def test_a_coefficient_that_is_constant_looks_constant_and_has_its_unit() -> Non
 KINDS = ("refined", "least squares", PUBLISHED)
 
 
-@pytest.mark.parametrize("n", [1, 4, 8])
+@pytest.mark.parametrize("n", [1, 8])
 @pytest.mark.parametrize("name", ["q", "an efficiency of ionization (m$^3$ s$^{-1}$)"])
 def test_estimates_of_all_kinds_stand_at_their_points(n: int, name: str) -> None:
     points = np.array([[200, 5], [300, 2], [300, 4], [300, 5], [300, 6], [400, 5]], dtype=float)
@@ -298,4 +301,4 @@ def test_estimates_of_all_kinds_stand_at_their_points(n: int, name: str) -> None
         assert (line.get_xdata()[[0, -1]] == [along[0], along[-1]]).all()
         assert line.get_color() == marks[0].get_color()
         there = np.interp(along, line.get_xdata(), line.get_ydata())
-        np.testing.assert_allclose(marks[0].get_ydata(), there, rtol=1e-9)
+        np.testing.assert_allclose(marks[0].get_ydata(orig=False), there, rtol=1e-9)

@@ -35,7 +35,7 @@ MIN_RANGE = 0.1  # least axis range, as a share of the coefficient's size
 MAX_LINES = 5  # number of the other parameters' values that are drawn
 FADED = 0.35  # opacity of a map's colours beyond the points that the law was fitted to
 WRONG = "#d00000"  # marks where the law says otherwise than the record; no colour of the map
-MARKERS = "os^Dv<>P"
+MARKERS = "os^Dv<>"  # seven, of eight colours: a pair recurs after 56
 PUBLISHED = "published"  # the kind of estimate that comes from a publication
 
 FILLED: dict[str, Any] = {"marker": "o", "ms": 3.5}
@@ -158,10 +158,11 @@ def _draw_frequencies(ax: Axes, rows: pd.DataFrame) -> None:
     factor, unit = frequency_scale(rows["f_kHz"])
     known = factor * rows[["f_kHz", "f_model_kHz"]].to_numpy(float)
     for enclosed, words in ((True, "enclosed by the others"), (False, "outside them")):
-        mark = {"mec": COLOURS[0], "mfc": COLOURS[0] if enclosed else "white", "label": words}
-        ax.plot(*known[rows["enclosed"] == enclosed].T, "o", ms=6, zorder=3, **mark)
+        face = COLOURS[0] if enclosed else "white"
+        mark: dict[str, Any] = {"color": COLOURS[0], "mfc": face, "ms": 6, "label": words}
+        ax.plot(*known[rows["enclosed"] == enclosed].T, "o", zorder=3, **mark)
     ends = np.array([0.96, 1.04]) * [np.nanmin(known), np.nanmax(known)]
-    band = {"color": GREY, "alpha": 0.3, "lw": 0.0, "zorder": 0, "label": "1 %"}
+    band: dict[str, Any] = {"color": GREY, "alpha": 0.3, "lw": 0.0, "zorder": 0, "label": "1 %"}
     ax.plot(ends, ends, color=GREY, lw=1.0, zorder=1)
     ax.fill_between(ends, 0.99 * ends, 1.01 * ends, **band)
     ax.set(xlabel=f"frequency of the record ({unit})", ylabel=f"of the free run ({unit})")
@@ -225,15 +226,16 @@ def cycle_figure(
             ax.set_ylabel(title)
             entries = _draw_line(ax, rows, names[0], quantity)
         for of, mark, _ in kinds:
-            face = colours.to_rgba(of[quantity].to_numpy(float)) if is_map else GREY
+            face = colours.to_rgba(of[quantity].to_numpy(float)) if is_map else DATA
             at = of[names] if is_map else of[[*names, quantity]]
             ax.scatter(*at.to_numpy(float).T, zorder=4, **{"facecolor": face, **mark})
     marks = [
-        axes[0].scatter([], [], label=label, **{"facecolor": GREY, **mark})
+        axes[0].scatter([], [], label=label, **{"facecolor": GREY if is_map else DATA, **mark})
         for _, mark, label in kinds
     ]
     if not rows["inside"].all():
-        entries.append(Patch(color=COLOURS[0], alpha=FADED, label="beyond the points fitted"))
+        label = "faded: beyond the points fitted"
+        entries.append(Patch(color=style.SIGN, alpha=FADED, label=label))
     style.legend_above(figure, [*marks, *entries])
     return figure
 
@@ -261,14 +263,13 @@ def _draw_map(
 ) -> list[Artist]:
     """Draw the map, and lines where its cycle ends; returns their legend entries."""
     x, y = (np.unique(rows[name].to_numpy(float)) for name in names)
-    alive, faded = (rows["fate"] == "oscillates") - 0.5, FADED + (1.0 - FADED) * rows["inside"]
+    fate, faded = (rows["fate"] == "oscillates") - 0.5, FADED + (1.0 - FADED) * rows["inside"]
     values, opacity, alive, growth = (
         of.to_numpy(float).reshape(len(x), len(y)).T
-        for of in (rows[quantity], faded, alive, rows["growth_per_s"])
+        for of in (rows[quantity], faded, fate, rows["growth_per_s"])
     )
-    ax.pcolormesh(
-        x, y, values, norm=colours.norm, alpha=opacity, shading="nearest", rasterized=True
-    )
+    mesh: dict[str, Any] = {"norm": colours.norm, "alpha": opacity, "rasterized": True}
+    ax.pcolormesh(x, y, values, shading="nearest", **mesh)
     entries: list[Artist] = []
     for field, dash, label in (
         (alive, "-", "the law's cycle ends"),
@@ -312,7 +313,7 @@ def trends_figure(
     panels each, (parameter, values of the others). labels: names of parameters, quantities and
     kinds on axes and in the legend; by default their own.
     """
-    marks = {
+    marks: dict[str, dict[str, Any]] = {
         kind: {"color": colour, "marker": marker, "ms": 5, "mfc": "none" if k else colour}
         for k, (kind, colour, marker) in enumerate(
             zip(dict.fromkeys(estimates["kind"]), cycle(COLOURS), cycle(MARKERS), strict=False)
