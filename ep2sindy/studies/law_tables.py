@@ -61,25 +61,26 @@ TRIED = (
     "Chosen: the fewest numbers within a standard error of the least."
 )
 CAPTIONS = {
-    "laws": "Coefficients over the operating parameters: refined at each point alone (open, with "
-    "95 % intervals) and by the law that is fitted to these points (lines), at up to five values "
-    "of the other parameters. Where the open points leave the lines by more than their bars, other "
-    "coefficients make up for it: points are sloppy in some directions, and those count little.",
+    "laws": "Coefficients over the operating parameters, with 95 % intervals: by the law that all "
+    "points share (lines, filled at its points) and refined at each point alone (open), at up to "
+    "five values of the other parameters. Where the open points leave the lines by more than their "
+    "bars, other coefficients make up for it: points are sloppy in some directions, and those "
+    "count little.",
     "left_out": "Points left out, each read off the law of the others. Left: frequency of the free "
     "run over the record's, the band 1 %. Right: errors of amplitude and waveform of each "
     "state, those beyond the panel filled on its edge; band and line are the bounds of a "
     "model that lives.",
     "map": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
-    "over the operating parameters, and of the records in the same colours (circles); crosses: "
-    "points that do not oscillate, red where the law says that they do; diamonds: records of "
-    "another cycle, not fitted here. Black line: where the model's cycle ends; dashed: where its "
-    "fixed point turns stable. Beyond the points that the law was fitted to it is extrapolated, "
-    "and the map is faded. White: no cycle.",
+    "over the operating parameters, white without a cycle, and of the records in the same colours "
+    "(circles); crosses: points that do not oscillate; diamonds: records of another cycle, not "
+    "fitted here. Red: the law says otherwise than the record. Black line: where the law's cycle "
+    "ends; dashed: where its fixed point turns stable. Faded: beyond what the points that the law "
+    "was fitted to enclose, where it is extrapolated.",
     "line": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
-    "over the operating parameter (line, ending where the cycle does, faded beyond the points "
-    "that the law was fitted to), and of the records (circles); crosses: points that do not "
-    "oscillate, red where the law says that they do; diamonds: records of another cycle, not "
-    "fitted here.",
+    "over the operating parameter (line, ending where the cycle does), and of the records "
+    "(circles); crosses at zero amplitude: points that do not oscillate; diamonds: records of "
+    "another cycle, not fitted here. Red: the law says otherwise than the record. Faded: beyond "
+    "the points that the law was fitted to, where it is extrapolated.",
 }
 
 

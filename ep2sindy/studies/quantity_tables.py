@@ -57,8 +57,8 @@ CONTROL = (
     "point that they predict; and of terms searched without it too, the honest one of the two."
 )
 CAPTION = (
-    "Quantities of the fit {}, against one parameter with the others held: filled marks with 95 % "
-    "intervals, which are smaller than the marks where no bars show"
+    "Quantities of the fit {}, against one parameter with the others held, with 95 % intervals, "
+    "which are smaller than the marks where no bars show"
 )
 WORDS = {
     "n_points": "points",
@@ -225,10 +225,12 @@ class FoundQuantities:
         theirs = theirs.assign(low=theirs["value"], high=theirs["value"], kind=PUBLISHED)
         table = pd.concat([ours.assign(kind=ours["fit"].map(kinds)), theirs])
         laws = self.laws.get(best, {})
-        published = "; open what the thesis found in its data" if len(theirs) else ""
-        lines = f"; lines are the control laws of the fit {spoken(best)}" if laws else ""
+        published = "; beside them what the thesis found in its data" if len(theirs) else ""
+        lines = f"; lines are the control laws of the filled marks, the fit {spoken(best)}"
         draw = partial(trends_figure, table, laws, trends=self.lines, labels=self.labels)
-        return Captioned(draw, f"{CAPTION.format(spoken(model))}{published}{lines}.")
+        return Captioned(
+            draw, f"{CAPTION.format(spoken(model))}{published}{lines if laws else ''}."
+        )
 
     def _units(self, fit: str) -> dict[str, str]:
         """Unit of every quantity of a fit."""
