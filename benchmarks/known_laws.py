@@ -32,32 +32,25 @@ NOISES, N_PERIODS, PER_PERIOD = (0.01, 0.05), 30, 50  # noise in each state's st
 # State -> term -> function of the operating point -> its factor.
 LAWS = {
     "brusselator": {
-        "x": {
-            "1": {"1": 0.6, "u": 0.4},
-            "x": {"1": -3.0, "u^2": -0.5},
-            "x^2*y": {"1": 0.5, "1/u": 0.6},
-        },
+        "x": {"1": {"1": 0.6, "u": 0.4}, "x": {"1": -3.0, "u^2": -0.5},
+              "x^2*y": {"1": 0.5, "1/u": 0.6}},
         "y": {"x": {"1": 2.0, "u^2": 0.5}, "x^2*y": {"1": -0.5, "1/u": -0.6}},
     },
-    "breathing": {  # ions leave, seed electrons, ionization that rises with the ions, inflow
+    "breathing": {  # ions leave; seed electrons; ionization that rises with the ions; inflow
         "n_i": {
-            "n_i": {"1/V_D_V": -3.96e7},
-            "n_n": {"1": 3840.0, "mdot_mg_s": 1212.6},
+            "n_i": {"1/V_D_V": -3.96e7}, "n_n": {"1": 3840.0, "mdot_mg_s": 1212.6},
             "n_i^2*n_n": {"1": 2.811e-32, "V_D_V": -1.104e-34, "V_D_V^2": 1.972e-37},
         },
         "n_n": {
-            "1": {"mdot_mg_s": 4.58e22},
-            "n_n": {"1": -3840.0, "mdot_mg_s": -1212.6},
+            "1": {"mdot_mg_s": 4.58e22}, "n_n": {"1": -3840.0, "mdot_mg_s": -1212.6},
             "n_i^2*n_n": {"1": -2.811e-32, "V_D_V": 1.104e-34, "V_D_V^2": -1.972e-37},
         },
     },
-}
+}  # fmt: skip
+VOLTAGES, FLOWS = (290.0, 317.0, 343.0, 370.0), (4.4, 4.75, 5.1)
 POINTS = {
     "brusselator": [{"u": u} for u in np.linspace(0.9, 2.0, 12).tolist()],
-    "breathing": [
-        {"V_D_V": v, "mdot_mg_s": m}
-        for v, m in product((290.0, 317.0, 343.0, 370.0), (4.4, 4.75, 5.1))
-    ],
+    "breathing": [{"V_D_V": v, "mdot_mg_s": m} for v, m in product(VOLTAGES, FLOWS)],
 }
 FINER = replace(SETTINGS, method=MultipleShooting(step=RungeKutta(4)))  # a pulse in few samples
 STARTS = {"brusselator": ((1.0, 1.0), 6.0), "breathing": ((3e18, 3e18), 8e-5)}  # and a period in s
