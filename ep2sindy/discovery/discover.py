@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -24,7 +25,8 @@ from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_kind
 
-LawFunctions = int | Library  # the degree of polynomials of the parameters, or functions of them
+# The degree of polynomials of the parameters, functions of them, or those chosen of many.
+LawFunctions = int | Library | Literal["auto"]
 
 
 @one_thread()
@@ -66,10 +68,11 @@ def discover(
     Runs whose `parameters` differ are of several operating points, and each point is searched
     alone, by the workers; `points` of the result holds what was found there. shared: True finds one
     support for all points, with coefficients of each. law: finds one support whose coefficients are
-    functions of the parameters: polynomials of this degree, or those of a library such as
-    ep.named_terms(["V"], ["1", "1/V"]); of a list, the functions whose law errs least at points
-    left out. Supports of several points are found by rows (`search_shared`), or under roles at the
-    most central point; a TrajectorySearch then refines the coefficients of every point on its
+    functions of the parameters: polynomials of this degree, those of a library such as
+    ep.named_terms(["V"], ["1", "1/V"]), or "auto", those whose law errs least at points left out,
+    of each parameter p, p^2 and 1/p (`PointFits.choose_functions`); or a list of these, of which
+    one is chosen. Supports of several points are found by rows (`search_shared`), or under roles at
+    the most central point; a TrajectorySearch then refines the coefficients of every point on its
     trajectories. known: coefficients that are known functions of the parameters, in SI, such as
     {"n_n": {"1": {"mdot_mg_s": 4.6e22}}}.
     Raises ValueError for a relation, term or role that the library or the states do not have, roles

@@ -236,7 +236,7 @@ class Discovery:
         """True if the supports of all points were compared together: their scores are one."""
         first, *others = self.points.values()
         return all(
-            np.array_equal(first.scores[state], own.scores.get(state))
+            state in own.scores and np.array_equal(first.scores[state], own.scores[state])
             for own in others
             for state in first.scores
         )

@@ -14,6 +14,7 @@ from ep2sindy.discovery.choice import as_in
 from ep2sindy.discovery.method import DiscoveryMethod, Regression, TrajectorySearch
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.discovery.shared_support import SharedFront, check_shared, search_shared
+from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation
 from ep2sindy.operating.law import (
     Known,
@@ -200,7 +201,7 @@ def choose_law(fits: PointFits, law: LawFunctions | Sequence[LawFunctions]) -> O
     Laws whose errors cannot be told apart count as equal, and that of fewest functions is taken.
     Raises ValueError if the points do not suffice for any.
     """
-    if not isinstance(law, Sequence):
+    if isinstance(law, int | str | Library):
         return fits.law(fits.functions(law))
     laws, reasons = [], ["law=[...] must name degrees or functions"]
     for each in law:

@@ -14,7 +14,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.law import LawConstraint
-from ep2sindy.operating.point_fits import PointFits, information_of
+from ep2sindy.operating.point_fits import FAILED, PointFits, information_of
 from ep2sindy.operating.quantities import Quantity, QuantityEstimate, estimate_quantities
 from ep2sindy.operating.records import Point, group_by_point, name_point, read_points
 from ep2sindy.refinement.problem import RefinementSettings
@@ -32,7 +32,7 @@ from ep2sindy.signals.spectrum import (
     samples_in_periods,
 )
 
-FITTED, FAILED = "fitted", ("non_finite", "flat")
+FITTED = "fitted"
 REFINED = "_refined"  # suffix of the name of a model's refinement
 
 # Rows depend on each other over a cycle, which repeats itself: blocks of intervals hold two.
@@ -224,15 +224,12 @@ class _FittedPoint:
 
 
 def fits_of(name: str, given: GivenModel, results: Sequence[PointResult]) -> PointFits:
-    """One fit of every point, as the data of laws. Raises ValueError if it finished at none."""
-    used = [result for result in results if result.is_usable(name)]
-    if not used:
-        raise ValueError(f"a law needs points at which {name!r} was fitted: it was fitted at none")
-    names = list(used[0].parameters)
-    fits = [result.fits[name] for result in used]
+    """One fit of every point, as the data of laws; those that failed have no information."""
+    names = list(results[0].parameters)
+    fits = [result.fits[name] for result in results]
     return PointFits(
         parameters=tuple(names),
-        points=read_points([result.parameters for result in used], names),
+        points=read_points([result.parameters for result in results], names),
         relations=given.relations,
         models=[fit.model for fit in fits],
         information=np.array([fit.information for fit in fits]),

@@ -1,23 +1,27 @@
-"""Laws tested at points left out: run freely there, and chosen by how they do."""
+"""Laws tested at points left out: over windows of their records, and run freely there."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
-from ep2sindy.model.comparison import FreeRunBounds, Verdict, deviation
+from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.operating.records import OperatingRecord
-from ep2sindy.regression.pooled import Basis
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.refine import smooth_batch
+from ep2sindy.refinement.steps import FusedRungeKutta
+from ep2sindy.refinement.windows import cut_windows, dominant_window
 
-MOST = 10.0  # upper bound on the reported deviation, also used if there is none
-CLOSE = 0.05  # deviation, as a share of its bound, that does not justify another term
+# Windows of every record that is left out, and steps of the integration in each of its samples.
+N_WINDOWS, N_SUBSTEPS = 20, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,63 +36,58 @@ class LeftOutRun:
     run: FreeRun
     inside: bool
 
-    @property
-    def error(self) -> float:
-        """Largest deviation from the record's cycle, in units of its bound; at most ten."""
-        run = self.run
-        amplitude, waveform = (
-            np.array(list(each.values())) for each in (run.amplitude_ratio, run.waveform_error)
-        )
-        found = deviation(run.f_error, amplitude, waveform, FreeRunBounds())
-        return MOST if np.isnan(found) else min(found, MOST)
-
 
 @dataclass(frozen=True, eq=False)
 class LawTrial:
-    """A model's fits at all points, with one kind of law, tested by leaving out each point in turn.
+    """One fit of all points, and its law of some functions, tested by leaving out each in turn.
 
-    name: of the model. rate_errors: as of `PointFits.rate_errors`. runs: of records with the law of
-    the others; empty for a model that inputs drive, which has no free runs.
+    name: of the fit. errors: for each point, the root mean square over windows of its record, in
+    standard deviations of the states, of what the law of the others leaves; see `window_errors`.
+    Fits of any kind can be compared by it, whatever bias their coefficients have.
     """
 
     name: str
     fits: PointFits
     functions: Library
-    rate_errors: Float[np.ndarray, " points"]
-    runs: Sequence[LeftOutRun]
+    errors: Float[np.ndarray, " points"]
 
     @property
     def n_numbers(self) -> int:
         """Number of fitted numbers: those of the law of the free coefficients."""
         return self.fits.n_free * len(self.functions)
 
-    @cached_property
-    def errors(self) -> Float[np.ndarray, " points"]:
-        """Errors by which laws are compared: of the runs, or of the rates if nothing ran freely.
 
-        Of runs, the largest deviation from the record's cycle in units of the bound, at most ten
-        and at least a twentieth: smaller deviations do not justify another term.
-        """
-        if not self.runs:
-            return self.rate_errors
-        return np.maximum([run.error for run in self.runs], CLOSE)
+def window_errors(models: Sequence[SparseModel], run: Trajectory) -> Float[np.ndarray, " models"]:
+    """Error of each model in windows of one period, over which only its starts are fitted.
 
-
-def try_law(
-    name: str, fits: PointFits, records: Sequence[OperatingRecord], functions: Library
-) -> LawTrial:
-    """Test the law of these functions at every point, each left out in turn.
-
-    Raises ValueError if the points do not suffice for a law without each of them.
+    It is the root mean square over windows, samples and states, each in its standard deviations; a
+    constant errs by about one, and so does by convention a model that blows up.
     """
-    errors, runs = fits.rate_errors(functions), []
-    if not fits.models[0].inputs:
-        for k, record in enumerate(records):
-            law = fits.law_without(k, functions)
-            point = {name: record.parameters[name] for name in law.parameters}
-            run = free_run(law.at(extrapolate=True, **point), record.from_slowest)
-            runs.append(LeftOutRun(record, run, law.is_inside(point)))
-    return LawTrial(name, fits, functions, errors, runs)
+    window = dominant_window([run], models[0].states, periods=1.0)
+    batch = cut_windows(
+        [run],
+        states=models[0].states,
+        inputs=models[0].inputs,
+        n_windows=N_WINDOWS,
+        window=window,
+        rng=0,
+        courses=models[0].courses,
+    )
+    method = MultipleShooting(step=FusedRungeKutta(N_SUBSTEPS))
+    paths = smooth_batch(models, batch, method=method)
+    squares = np.square(paths - batch.data).mean(axis=(2, 3))
+    return np.sqrt(np.where(squares < 1.0, squares, 1.0).mean(axis=1))
+
+
+def run_left_out(trial: LawTrial, records: Sequence[OperatingRecord]) -> list[LeftOutRun]:
+    """Run every record freely with the law of the others."""
+    runs = []
+    for k, record in enumerate(records):
+        law = trial.fits.law_without(k, trial.functions)
+        point = {name: record.parameters[name] for name in law.parameters}
+        run = free_run(law.at(extrapolate=True, **point), record.from_slowest)
+        runs.append(LeftOutRun(record, run, law.is_inside(point)))
+    return runs
 
 
 def fewest_of_least(trials: Sequence[tuple[Float[np.ndarray, " points"], int]]) -> int:
@@ -133,19 +132,3 @@ def error_statistics(left_out: Sequence[LeftOutRun]) -> dict[str, float | int]:
 def _median(values: Float[np.ndarray, " points"]) -> float:
     known = values[~np.isnan(values)]
     return float(np.median(known)) if known.size else float("nan")
-
-
-def interpolation_errors(
-    records: Sequence[OperatingRecord], basis: Basis
-) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:
-    """Leave-one-out errors of interpolating frequency and amplitude by functions of the parameters.
-
-    Both are interpolated directly, in logarithms.
-    Returns the relative error of the frequency, and the largest relative error of the standard
-    deviation over the states. They show how smoothly the records vary: no law of these functions
-    can be much better.
-    """
-    f = np.log([[record.cycle.frequency_Hz] for record in records])
-    logs = np.hstack([f, np.log([record.cycle.std for record in records])])
-    off = np.abs(np.expm1(basis.predict_left_out(logs) - logs))
-    return off[:, 0], off[:, 1:].max(axis=1)

@@ -3,28 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain, product
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.law import LawConstraint, OperatingLaw, make_basis, read_coefficients
+from ep2sindy.refinement.judge import RefinementStatus
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.regression.constrained import solve_constrained
-from ep2sindy.regression.pooled import Basis, invert_covariance, pool_coefficients
+from ep2sindy.regression.pooled import invert_covariance, pool_rows, root_of
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.progress import SILENT, Progress
 
 Problems = Sequence[Sequence[RegressionRows]]  # for each point, the rows of every equation
 
-LawFunctions = int | Library  # the degree of polynomials of the parameters, or functions of them
+# The degree of polynomials of the parameters, functions of them, or those chosen of many.
+LawFunctions = int | Library | Literal["auto"]
+
+# Of refinements whose coefficients tell nothing.
+FAILED = (RefinementStatus.NON_FINITE, RefinementStatus.FLAT, RefinementStatus.MAX_ITER)
+
+MANY = 3  # parameters up to which all combinations of their functions are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,27 +73,39 @@ class PointFits:
         common = self.relations.common
         return np.array([read_coefficients(model, common) for model in self.models])[:, common.free]
 
-    @property
-    def usable(self) -> PointFits:
-        """The points whose fit tells something of the coefficients."""
-        return self.take(np.flatnonzero(self.information.any(axis=(1, 2))).tolist())
-
-    def take(self, numbers: Sequence[int]) -> PointFits:
-        """The same for some of the points."""
-        return replace(
-            self,
-            points=self.points[list(numbers)],
-            models=[self.models[k] for k in numbers],
-            information=self.information[list(numbers)],
-        )
-
     def functions(self, law: LawFunctions) -> Library:
-        """Functions of the parameters that a law is made of: polynomials, if a degree is given."""
-        return polynomial(list(self.parameters), degree=law) if isinstance(law, int) else law
+        """Functions of the parameters that a law is made of; "auto" takes `choose_functions`."""
+        if law == "auto":
+            return self.choose_functions()
+        if isinstance(law, int):
+            return polynomial(list(self.parameters), degree=law)
+        assert isinstance(law, Library)
+        return law
 
-    def basis(self, functions: Library) -> Basis:
-        """The functions at the points. Raises ValueError if the points do not suffice for them."""
-        return make_basis(functions, self.columns(functions))
+    def choose_functions(self) -> Library:
+        """The functions whose law errs least at points left out, of those that records often need.
+
+        Of every parameter p these are p and, or not, p^2 and 1/p, or all products up to degree 2.
+        The errors are `rate_errors`, in the root mean square over the points.
+        Raises ValueError if the points do not suffice for a law that is linear in all parameters.
+        """
+        names = list(self.parameters)
+        own = [[(), (f"{p}^2",), (f"1/{p}",), (f"{p}^2", f"1/{p}")] for p in names]
+        sets = [[*chain(*more)] for more in product(*own)] if len(names) <= MANY else [[]]
+        candidates = [named_terms(names, ["1", *names, *more]) for more in sets]
+        candidates.append(polynomial(names, degree=2))
+        best, least, reason = None, np.inf, ""
+        for functions in candidates:
+            try:
+                error = float(np.square(self.rate_errors(functions)).mean())
+            except ValueError as problem:  # the points do not suffice for these
+                reason = reason or str(problem)
+                continue
+            if error < least:
+                best, least = functions, error
+        if best is None:
+            raise ValueError(reason)
+        return best
 
     def columns(self, functions: Library) -> Float[np.ndarray, "points variables"]:
         """The parameters of the points in the order of the functions' variables."""
@@ -101,21 +123,21 @@ class PointFits:
         if the points do not suffice for a law without each of them.
         Source: Efron & Stein 1981, doi:10.1214/aos/1176345462, for the jackknife.
         """
-        free, columns = self._pool(functions), self.columns(functions)
-        covariance, errors = None, None
-        laws = self._laws_without_each(functions)
-        if laws is not None:
+        free, covariance, errors = self._pool(functions), None, None
+        with suppress(ValueError):  # too few points to leave one out
+            laws = self._laws_without_each(functions)
             apart = (laws - laws.mean(axis=0)).reshape(len(laws), -1)
             covariance = (len(laws) - 1) / len(laws) * apart.T @ apart
-            errors = self._rate_errors(laws, functions)
+            errors = self.rate_errors(functions)
+        columns = self.columns(functions)
         return self.relations.make_law(
             self.models[0], functions, columns, free, covariance, self.how, errors
         )
 
     def law_without(self, number: int, functions: Library) -> OperatingLaw:
         """The law of all points but one, without covariance."""
-        others = self.take([k for k in range(len(self.models)) if k != number])
-        columns, free = others.columns(functions), others._pool(functions)
+        columns = np.delete(self.columns(functions), number, axis=0)
+        free = self._pool(functions, without=number)
         return self.relations.make_law(
             self.models[0], functions, columns, free, None, self.how, None
         )
@@ -125,40 +147,40 @@ class PointFits:
 
         With z_p and I_p of the point, and d_p what the law of the others misses z_p by, it is
         sqrt(d_p^T I_p d_p / z_p^T I_p z_p): for rows, the root mean square error of the rates by
-        that of the rates. It counts only what the record determines.
+        that of the rates. It counts only what the record determines. A point whose fit failed
+        counts as missed whole.
         Raises ValueError if the points do not suffice for a law without each of them.
         """
         laws = self._laws_without_each(functions)
-        if laws is None:
-            raise ValueError(
-                f"a law of {len(functions)} functions of {list(functions.variables)} needs more "
-                f"points than these, since each is left out in turn: {len(self.models)} came"
-            )
-        return self._rate_errors(laws, functions)
-
-    def _rate_errors(
-        self, laws: Float[np.ndarray, "points free functions"], functions: Library
-    ) -> Float[np.ndarray, " points"]:
         at_points = np.einsum("pcf,pf->pc", laws, functions.evaluate(self.columns(functions)))
         off, own = at_points - self.coefficients, self.coefficients
         missed = np.einsum("pc,pcd,pd->p", off, self.information, off)
         whole = np.einsum("pc,pcd,pd->p", own, self.information, own)
-        return np.sqrt(np.maximum(missed, 0.0) / zero_to_one(whole))
+        return np.where(whole > 0.0, np.sqrt(np.maximum(missed, 0.0) / zero_to_one(whole)), 1.0)
 
-    def _laws_without_each(
-        self, functions: Library
-    ) -> Float[np.ndarray, "points free functions"] | None:
-        """The factors of the law without each point; None if the points do not suffice."""
-        numbers = range(len(self.models))
-        try:
-            return np.stack(
-                [self.take([k for k in numbers if k != j])._pool(functions) for j in numbers]
-            )
-        except ValueError:
-            return None
+    def _laws_without_each(self, functions: Library) -> Float[np.ndarray, "points free functions"]:
+        """The factors of the law without each point."""
+        make_basis(functions, self.columns(functions), n_spare=1)
+        return np.stack([self._pool(functions, without=k) for k in range(len(self.models))])
 
-    def _pool(self, functions: Library) -> Float[np.ndarray, "free functions"]:
-        return pool_coefficients(self.coefficients, self.information, self.basis(functions))
+    def _pool(
+        self, functions: Library, *, without: int | None = None
+    ) -> Float[np.ndarray, "free functions"]:
+        kept = [k for k in range(len(self.models)) if k != without]
+        basis = make_basis(functions, self.columns(functions)[kept])
+        return pool_rows([self._rows[k] for k in kept], basis, self._size).law
+
+    @cached_property
+    def _size(self) -> Float[np.ndarray, " free"]:
+        """Root mean square of every coefficient over the points."""
+        return zero_to_one(np.sqrt(np.square(self.coefficients).mean(axis=0)))
+
+    @cached_property
+    def _rows(self) -> list[tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]]:
+        """For each point, rows R and R z with R^T R its scaled information."""
+        scale = np.outer(self._size, self._size)
+        roots = [root_of(own * scale) / self._size for own in self.information]
+        return [(root, root @ own) for root, own in zip(roots, self.coefficients, strict=True)]
 
 
 def fit_rows(
@@ -214,9 +236,9 @@ def of_refinements(
 
 
 def information_of(fit: Refinement, common: Constraint) -> Float[np.ndarray, "free free"]:
-    """Inverse covariance of the free coefficients; zero if the refinement failed."""
+    """Inverse covariance of the free coefficients; zero if the refinement did not converge."""
     free = common.free
-    if fit.covariance_naive is None:
+    if fit.covariance_naive is None or fit.status in FAILED:
         return np.zeros((len(free), len(free)))
     covariance = np.zeros((len(common.coefficients), len(common.coefficients)))
     moved = np.flatnonzero(read_coefficients(fit.model, common))

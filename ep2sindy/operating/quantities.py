@@ -116,7 +116,7 @@ def control_functions(names: Sequence[str], points: np.ndarray) -> Library:
     A parameter that is zero somewhere, or changes its sign, has no reciprocal.
     """
     library = polynomial(list(names), degree=2)
-    one_sign = (points > 0.0).all(axis=0) | (points < 0.0).all(axis=0)
+    one_sign = np.abs(np.sign(points).sum(axis=0)) == len(points)
     over = [f"1/{name}" for name, keeps in zip(names, one_sign, strict=True) if keeps]
     return library + named_terms(list(names), over) if over else library
 

@@ -124,27 +124,6 @@ def pool_rows(
     return PooledFit(fit, basis.to_law(size), basis.values.shape[1])
 
 
-def pool_coefficients(
-    coefficients: Float[np.ndarray, "points coefs"],
-    information: Float[np.ndarray, "points coefs coefs"] | None,
-    basis: Basis,
-) -> Float[np.ndarray, "coefs functions"]:
-    """Law whose coefficients are closest to those of the points, weighted by their information.
-
-    With the deviation miss at each point, the sum over the points of miss @ information @ miss is
-    minimised. Each information (an inverse covariance) is divided by its trace in relative
-    coefficients, so that points have equal weight. information: None weights all coefficients
-    equally.
-    """
-    n_points, n_coefs = coefficients.shape
-    size = zero_to_one(np.sqrt(np.square(coefficients).mean(axis=0)))
-    if information is None:
-        information = np.broadcast_to(np.diag(size**-2.0), (n_points, n_coefs, n_coefs))
-    roots = [_root(each * np.outer(size, size)) / size for each in information]
-    rows = [(root, root @ own) for root, own in zip(roots, coefficients, strict=True)]
-    return pool_rows(rows, basis, size).law
-
-
 def invert_covariance(
     covariance: Float[np.ndarray, "coefs coefs"],
 ) -> Float[np.ndarray, "coefs coefs"]:
@@ -153,8 +132,8 @@ def invert_covariance(
     return np.linalg.pinv(covariance / np.outer(size, size), hermitian=True) / np.outer(size, size)
 
 
-def _root(information: np.ndarray) -> np.ndarray:
-    """Root R with R^T R = information / trace; R is not triangular."""
+def root_of(information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Root R with R^T R = information / trace, so that all have one weight; R is no triangle."""
     values, vectors = np.linalg.eigh(information / zero_to_one(np.array(np.trace(information))))
     root: np.ndarray = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     return root

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -13,18 +13,18 @@ from jaxtyping import Float
 
 from ep2sindy.figures.operating import cycle_figure, frequency_scale, laws_figure, left_out_figure
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.given_models import GivenModel, PointResult, fits_of
+from ep2sindy.operating.given_models import REFINED
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.left_out import (
     LawTrial,
     LeftOutRun,
     error_statistics,
     fewest_of_least,
-    interpolation_errors,
-    try_law,
+    run_left_out,
+    window_errors,
 )
 from ep2sindy.operating.map import Fate, MapPoint, law_map, map_points
-from ep2sindy.operating.point_fits import LawFunctions
+from ep2sindy.operating.point_fits import LawFunctions, PointFits
 from ep2sindy.operating.records import OperatingRecord, Point
 from ep2sindy.report.document import (
     Block,
@@ -55,9 +55,9 @@ LEFT_OUT = (
     "enclosed: whether the others enclose it."
 )
 TRIED = (
-    "error: mean over the points left out; of models that run freely the largest deviation from "
-    "the cycle, in units of its bound (1 % of frequency, 10 % of amplitude, 0.2 of waveform), 10 "
-    "at most, else that of the rates, relative to them; f error: median; numbers: of the law. "
+    "error: mean over the points left out, by the law of the others, of what windows of one period "
+    "leave, in standard deviations of the states; nine in ten: of the points. It tells fits apart, "
+    "also if their coefficients have a bias that is as smooth as the truth. numbers: of the law. "
     "Chosen: the fewest numbers within a standard error of the least."
 )
 CAPTIONS = {
@@ -88,10 +88,9 @@ CAPTIONS = {
 class FoundLaw:
     """The law of the records on one cycle, and what was tried for it.
 
-    cycle: its name; "all" if there is only one. smooth: relative errors of frequency and amplitude
-    if these are themselves interpolated, at points left out, by the law's functions. at_points: the
-    law's models at all points of the study. map: the same over a grid that encloses these. Of a
-    model that inputs drive, which has no free runs, all three are empty.
+    cycle: its name; "all" if there is only one. runs: of the points left out, each with the law of
+    the others. at_points: the law's models at all points of the study. map: the same over a grid
+    that encloses these. Of a model that inputs drive, which has no free runs, all three are empty.
     """
 
     cycle: str
@@ -99,7 +98,7 @@ class FoundLaw:
     trials: Sequence[LawTrial]
     choice: LawTrial
     law: OperatingLaw
-    smooth: tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]] | None
+    runs: Sequence[LeftOutRun]
     at_points: Sequence[MapPoint]
     map: Sequence[MapPoint]
 
@@ -113,43 +112,48 @@ class FoundLaw:
 
     @cached_property
     def statistics(self) -> dict[str, float | int]:
-        """Of the points left out: of their free runs, or of their rates if nothing ran freely."""
-        if self.choice.runs:
-            return error_statistics(self.choice.runs)
-        errors = self.choice.rate_errors
-        return {"n": len(errors), "rates_median": float(np.median(errors))}
+        """Of the points left out: of their windows, and of their free runs if there are any."""
+        errors = self.choice.errors
+        windows = {"n": len(errors), "window_error": float(errors.mean())}
+        return windows | (error_statistics(self.runs) if self.runs else {})
 
     @property
     def text(self) -> str:
-        """How the law does at the points left out, in the median, and beside interpolation."""
+        """How the law does at the points left out."""
         found, text = self.statistics, percent(2)
-        if self.smooth is None:
-            return (
-                f"Left out one at a time, the law of the others misses the rates at "
-                f"{found['n']} points by {text(found['rates_median'])} in the median."
-            )
-        smooth_f, smooth_amplitude = (float(np.median(each)) for each in self.smooth)
+        windows = (
+            "Left out one at a time, windows of a period are followed to "
+            f"{found['window_error']:.3g} standard deviations"
+        )
+        if not self.runs:
+            return f"{windows}."
         most = f"nine in ten within {text(found['f_90'])}"
         if not np.isfinite(found["f_90"]):
             most = "more than one in ten do not oscillate"
         return (
-            f"Left out one at a time, {found['n_lives']} of {found['n']} points live, diverging: "
+            f"{windows}, and run freely {found['n_lives']} of {found['n']} points live, diverging: "
             f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} "
             f"({most}), the worst state's amplitude {text(found['amplitude_median'])} and waveform "
-            f"{places(found['waveform_median'], 3)}. The records' own frequencies and amplitudes, "
-            f"interpolated by the same functions, miss by {text(smooth_f)} and "
-            f"{text(smooth_amplitude)} in the median."
+            f"{places(found['waveform_median'], 3)}."
         )
+
+    @property
+    def compared(self) -> str:
+        """The fit of least error where left out, and what the others have."""
+        others = sorted((t for t in self.trials if t is not self.choice), key=_mean_error)
+        beside = ", ".join(f"{spoken(t.name)} {_mean_error(t):.3g}" for t in others)
+        own = f"{spoken(self.choice.name)} {_mean_error(self.choice):.3g}"
+        return f"Errors where left out: {own}" + (f"; other fits: {beside}" if beside else "")
 
     @property
     def advice(self) -> str:
         """What to try if no point left out lives; empty if one does."""
-        if not self.choice.runs or self.statistics["n_lives"]:
+        if not self.runs or self.statistics["n_lives"]:
             return ""
         return (
-            f"none of {len(self.choice.runs)} points left out lives by the law of the others, so "
-            "it predicts none between them: try points that lie closer together, laws of a lower "
-            "degree, other models, or models=null, longer records, and inputs that are states "
+            f"none of {len(self.runs)} points left out lives by the law of the others, so "
+            "it predicts none between them: try points that lie closer together, other models, or "
+            "models=null, longer records, and inputs that are states "
             "(docs/predict.md)"
         )
 
@@ -169,7 +173,7 @@ class FoundLaw:
             "laws": _laws_table(self.law),
             "coefficients": self.coefficients,
             "trials": ResultTable(self.trials, _trial_metrics(self.choice)).csv(),
-            "left_out": ResultTable(self.choice.runs, _left_out_metrics(self.choice.runs)).csv(),
+            "left_out": ResultTable(self.runs, _left_out_metrics(self.runs)).csv(),
             "map": pd.DataFrame([point.row for point in self.map]),
         }
 
@@ -196,7 +200,7 @@ class FoundLaw:
         """
         found: dict[str, Captioned] = {}
         left_out = self.tables()["left_out"]
-        if self.choice.runs and left_out["f_model_kHz"].notna().any():
+        if self.runs and left_out["f_model_kHz"].notna().any():
             found["left_out"] = Captioned(partial(left_out_figure, left_out), CAPTIONS["left_out"])
         draw = partial(
             laws_figure, self.coefficients, self.law, parameters=self.parameters, labels=labels
@@ -218,8 +222,8 @@ class FoundLaw:
         found = [Section("Model and order", [tried])] if len(self.trials) > 1 else []
         found.append(self._law())
         blocks: list[Block] = [Text(self.text)]
-        if runs := self.choice.runs:
-            table = ResultTable(runs, _left_out_metrics(runs)).screen()
+        if self.runs:
+            table = ResultTable(self.runs, _left_out_metrics(self.runs)).screen()
             blocks += [Table(table, note=LEFT_OUT), Picture("left_out")]
         found.append(Section("Points left out", blocks))
         if self.at_points:
@@ -266,30 +270,26 @@ class FoundLaw:
         """The law at the middle point, how it does at points left out, and what others do."""
         middle, numbers = self.middle, self.statistics
         model = self.model_at(middle.parameters)
-        best = {trial.name: trial for trial in sorted(self.trials, key=lambda t: -t.errors.mean())}
-        others = ", ".join(
-            f"{trial.name} {trial.errors.mean():.2g}"
-            for trial in reversed(best.values())
-            if trial.name != self.choice.name
-        )
-        lives = f"{numbers['n_lives']} of {numbers['n']} points live" if self.choice.runs else ""
+        lives = f"; left out one at a time, {numbers['n_lives']} of {numbers['n']} points live"
         blocks: list[Block] = [
             *(display_equation(model, s, lead=f"at {middle.label}") for s in model.states),
-            Text(self.text.partition(". The records")[0]),
+            Text(self.text),
+            Text(self.compared),
         ]
-        if others:
-            own = f"{self.choice.errors.mean():.2g}"
-            blocks.append(Text(f"Errors where left out: {self.choice.name} {own}; {others}"))
         if self.at_points:
             right, _ = self.agreement(statuses)
             blocks.append(Text(f"Oscillating or not, right at {right} of {len(statuses)} points"))
-        head = f"Found: a law over {', '.join(self.law.parameters)}, by the fit {self.choice.name}"
+        head = f"Found: a law over {', '.join(self.law.parameters)}, by {spoken(self.choice.name)}"
         return Result(
-            f"{head}; left out one at a time, {lives}" if lives else head,
+            head + (lives if self.runs else ""),
             blocks,
             load='ep.operating.OperatingLaw.load("{}/law.json")',
             picture=next(name for name in ("map", "left_out", "laws") if name in drawn),
         )
+
+    def errors_by_fit(self) -> dict[str, float]:
+        """For each fit, the mean error of its law at points left out."""
+        return {trial.name: _mean_error(trial) for trial in self.trials}
 
     def summary(self, statuses: Mapping[str, bool]) -> dict[str, Any]:
         fits = self.choice.fits
@@ -301,9 +301,7 @@ class FoundLaw:
             "exact": list(fits.relations.texts),
             "functions": list(self.choice.functions.names),
             "n_numbers": self.choice.n_numbers,
-            "errors": {
-                f"{t.name}, {len(t.functions)}": float(t.errors.mean()) for t in self.trials
-            },
+            "errors": self.errors_by_fit(),
             "left_out": self.statistics,
             "oscillating_or_not": {"right": right, "points": len(statuses), "quiet": quiet},
         }
@@ -315,10 +313,9 @@ class FoundLaw:
 
 
 def find_law(
-    results: Sequence[PointResult],
+    fits: Mapping[str, PointFits],
     records: Sequence[OperatingRecord],
-    models: Mapping[str, GivenModel],
-    laws: Sequence[LawFunctions],
+    functions: LawFunctions,
     points: Sequence[Point],
     *,
     cycle: str,
@@ -326,40 +323,49 @@ def find_law(
     workers: Workers,
     run: Run,
 ) -> FoundLaw:
-    """Find the law of the records, of the models and functions that do best at points left out.
+    """Find the law of the records, of the fit that does best at points left out.
 
-    results, records: of the points of one cycle. models: by the name of the fit. points: all points
-    of the study, which the map encloses.
-    Raises ValueError if the records do not suffice for any of the laws.
+    fits: of the records, by name. functions: of the law. points: all points of the study, which the
+    map encloses.
+    Raises ValueError if the records do not suffice for the law of any fit.
     """
-    pieces, reasons = [], []
-    for name, model in models.items():
-        fits = fits_of(name, model, results)
-        for each in laws:
-            functions = fits.functions(each)
-            try:
-                fits.rate_errors(functions)
-                pieces.append((name, fits, functions))
-            except ValueError as error:
-                reasons.append(str(error))
-    if not pieces:
-        raise ValueError(f"the {len(records)} points that oscillate get no law: {reasons[0]}")
-    stage = run.progress(len(pieces), "law", "laws at points left out")
-    trials = collect(workers, partial(_try_law, records=records), pieces, stage)
+    known, reason = {}, ""
+    for name, of_all in fits.items():
+        try:
+            own = of_all.functions(functions)
+            of_all.rate_errors(own)
+            known[name] = LawTrial(name, of_all, own, np.zeros(0))
+        except ValueError as error:
+            reason = str(error)
+    if not known:
+        raise ValueError(f"{n_points(len(records))} that oscillate get no law: {reason}")
+    stage = run.progress(len(records), "point", "laws at points left out")
+    trials, numbers = list(known.values()), list(enumerate(records))
+    errors = np.array(collect(workers, partial(_leave_out, trials=trials), numbers, stage))
+    trials = [replace(t, errors=own) for t, own in zip(trials, errors.T, strict=True)]
     best = trials[fewest_of_least([(trial.errors, trial.n_numbers) for trial in trials])]
-    law, smooth = best.fits.law(best.functions), None
+    law = best.fits.law(best.functions)
+    runs: list[LeftOutRun] = []
     at_points: list[MapPoint] = []
     grid: list[MapPoint] = []
-    if best.runs:
-        smooth = interpolation_errors(records, best.fits.basis(best.functions))
+    if not best.fits.models[0].inputs:
+        runs = run_left_out(best, records)
         at_points = _follow(law, records, points, workers, run)
         grid = _follow(law, records, map_points(points, n_map), workers, run) if n_map else []
-    return FoundLaw(cycle, records, trials, best, law, smooth, at_points, grid)
+    return FoundLaw(cycle, records, trials, best, law, runs, at_points, grid)
 
 
-def _try_law(piece: tuple[Any, ...], *, records: Sequence[OperatingRecord]) -> LawTrial:
-    name, fits, functions = piece
-    return try_law(name, fits, records, functions)
+def _leave_out(
+    numbered: tuple[int, OperatingRecord], *, trials: Sequence[LawTrial]
+) -> Float[np.ndarray, " trials"]:
+    """Errors of the laws of all fits at one point, each of the other points."""
+    number, record = numbered
+    models = []
+    for trial in trials:
+        law = trial.fits.law_without(number, trial.functions)
+        point = {name: record.parameters[name] for name in law.parameters}
+        models.append(law.at(extrapolate=True, **point))
+    return window_errors(models, record.run)
 
 
 def _follow(
@@ -392,10 +398,11 @@ def _number(row: Mapping[Any, Any]) -> str:
     return with_error(row["value"], reach) if reach else f"{row['value']:g}"
 
 
-def _trial_metrics(choice: LawTrial) -> list[Metric[LawTrial]]:
-    def f_error(trial: LawTrial) -> float:
-        return error_statistics(trial.runs)["f_median"] if trial.runs else np.nan
+def _mean_error(trial: LawTrial) -> float:
+    return float(trial.errors.mean())
 
+
+def _trial_metrics(choice: LawTrial) -> list[Metric[LawTrial]]:
     def terms(trial: LawTrial) -> str:
         common = trial.fits.relations.common
         return terms_text(
@@ -403,20 +410,37 @@ def _trial_metrics(choice: LawTrial) -> list[Metric[LawTrial]]:
         )
 
     def marked(trial: LawTrial) -> str:
-        return trial.name + ("  <- chosen" if trial is choice else "")
+        return spoken(trial.name) + ("  <- chosen" if trial is choice else "")
 
-    rates = View.FILES if choice.runs else View.SHOWN
     return [
         Metric("fit", lambda trial: trial.name),
         Metric("fit", marked, View.SCREEN),
         Metric("terms", terms),
         Metric("functions", lambda trial: ", ".join(trial.functions.names), View.SHOWN),
         Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
-        Metric("error", lambda trial: float(trial.errors.mean()), View.SHOWN),
-        Metric("f_error", f_error, View.SHOWN, format=percent(2)),
-        Metric("rate_error", lambda t: float(np.median(t.rate_errors)), rates, format=percent(2)),
+        Metric("error", _mean_error, View.SHOWN, format="{:.3g}"),
+        Metric(
+            "nine_in_ten",
+            lambda trial: float(np.quantile(trial.errors, 0.9)),
+            View.SHOWN,
+            format="{:.3g}",
+        ),
         Metric("chosen", lambda trial: trial is choice),
     ]
+
+
+def spoken(fit: str) -> str:
+    """A fit's name as it is said: `free (refined)`."""
+    return fit.removesuffix(REFINED) + (" (refined)" if fit.endswith(REFINED) else "")
+
+
+def n_points(n: int) -> str:
+    """`1 point`, `3 points`."""
+    return f"{n} point" if n == 1 else f"{n} points"
+
+
+def _parameter(name: str) -> Metric[LeftOutRun]:
+    return Metric(name, lambda p: p.record.parameters[name], View.SHOWN, name, "{:g}")
 
 
 def _left_out_metrics(runs: Sequence[LeftOutRun]) -> list[Metric[LeftOutRun]]:
@@ -427,7 +451,7 @@ def _left_out_metrics(runs: Sequence[LeftOutRun]) -> list[Metric[LeftOutRun]]:
     relative = percent(2, sign=True)
     names = list(runs[0].record.parameters) if runs else []
     return [
-        *(Metric(n, lambda p, n=n: p.record.parameters[n], View.SHOWN, n, "{:g}") for n in names),
+        *(_parameter(name) for name in names),
         Metric(
             "enclosed",
             lambda p: p.inside,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -22,8 +22,10 @@ from ep2sindy.operating.given_models import (
     GivenModel,
     PointResult,
     fit_models,
+    fits_of,
 )
 from ep2sindy.operating.law import Known, constrain_law, make_basis
+from ep2sindy.operating.point_fits import LawFunctions
 from ep2sindy.operating.quantities import Quantity
 from ep2sindy.operating.records import OperatingRecord, branches_of, read_points
 from ep2sindy.regression.rows import Formulation
@@ -32,6 +34,7 @@ from ep2sindy.report.results import json_rows
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.spectrum import Oscillation
+from ep2sindy.signals.trace import MIN_PERIODS
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.law_tables import FoundLaw, find_law
 from ep2sindy.studies.point_sources import (
@@ -72,9 +75,6 @@ class RefiningWindows:
     periods: Positive
 
 
-Laws = Sequence[Count | Sequence[str]]  # degrees, or lists of functions of the parameters
-
-
 @dataclass(frozen=True, eq=False)
 class Study:
     """Fit models at all operating points that oscillate, and find how they depend on the point.
@@ -84,8 +84,9 @@ class Study:
     from the data group; or the pattern of files, which names the parameters.
     models: by name; None searches products of the states up to a degree for terms that are the same
     at all points. windows: of the
-    refinements. laws: of whole models, of which one is selected at points left out; None: none.
-    map_points: number of points along each parameter, of a map over these laws; None: no map.
+    refinements. law: functions of the parameters that give all coefficients: the degree of
+    polynomials, or names such as ["1", "V_D_V"]; None chooses them at points left out. map_points:
+    number of points along each parameter, of a map over the law; None: no map.
     labels: names of parameters and quantities in figures. thesis: published quantities by model.
     keep: whether a run goes on with the finished pieces of one that was broken off.
     """
@@ -97,7 +98,7 @@ class Study:
     points: Points
     models: Mapping[str, ModelSettings] | None
     windows: RefiningWindows
-    laws: Laws | None
+    law: Count | Sequence[str] | None
     labels: Mapping[str, str]
     map_points: CountOrNone = None
     degree: Count = 2
@@ -109,11 +110,13 @@ class Study:
         check_published(self.thesis or {}, self._given.names)
         sources, names = self._given.sources(self.source), self._given.names
         points = read_points([source.parameters for source in sources], names)
-        if self.laws:
-            # Points too few for a law, even if all oscillate, are refused before any simulation.
-            smallest = min((self._functions(law) for law in self.laws), key=len)
-            remedy = "give it more values, or leave it out (~parameters.{name})"
-            make_basis(smallest, points, n_spare=1, remedy=remedy)
+        if any(model.quantities for model in (self.models or {}).values()):
+            return
+        # Points too few for a law, even if all oscillate, are refused before any simulation.
+        law = self._functions()
+        smallest = law if isinstance(law, Library) else polynomial(names, degree=1)
+        remedy = "give it more values, or leave it out (~parameters.{name})"
+        make_basis(smallest, points, n_spare=1, remedy=remedy)
 
     def compute(self, run: Run) -> Outcome:
         self._given.tell(run)
@@ -143,13 +146,21 @@ class Study:
         ]
         if not any(result.fits for result in results):
             run.warn("none of the operating points oscillates, so there is no fit: " + QUIET)
-        quantities = None
-        if any(model.quantities for model in given.values()):
-            quantities = FoundQuantities(library, given, results, self.thesis or {}, self.labels)
-        cycles, law = dict[str, str](), None
-        if self.laws:
+        found = Outcome(opened, results, given, None, {}, None, self.labels)
+        has_quantities = any(model.quantities for model in given.values())
+        try:
             cycles, law = self._law(opened, results, given, workers, run)
-        return Outcome(opened, results, given, quantities, cycles, law, self.labels)
+            found = replace(found, cycles=cycles, law=law)
+        except ValueError as error:
+            if not has_quantities:
+                raise
+            run.warn(f"no law of whole models: {error}")
+        if has_quantities:
+            errors = found.law.errors_by_fit() if found.law else {}
+            published = self.thesis or {}
+            quantities = FoundQuantities(library, given, results, errors, published, self.labels)
+            found = replace(found, quantities=quantities)
+        return found
 
     def _law(
         self,
@@ -171,7 +182,7 @@ class Study:
                     run.warn(str(error))
         if not records:
             raise ValueError(
-                "a law needs operating points that oscillate: none of these does; " + QUIET
+                f"a law needs records of {MIN_PERIODS:g} periods or more: none has them"
             )
         cycles = dict(zip(records, name_cycles([r for r, _ in records.values()]), strict=True))
         main, n_main = Counter(cycles.values()).most_common(1)[0]
@@ -184,10 +195,13 @@ class Study:
         run.say(f"fitting a law to {n_main} points ...")
         used = [pair for label, pair in records.items() if cycles[label] == main]
         law = find_law(
-            [result for _, result in used],
+            {
+                name + end: fits_of(name + end, model, [result for _, result in used])
+                for name, model in given.items()
+                for end in ("", REFINED)
+            },
             [record for record, _ in used],
-            {name + REFINED: model for name, model in given.items()},
-            [self._functions(each) for each in self.laws or ()],
+            self._functions(),
             [point.parameters for point in opened],
             cycle=main, n_map=self.map_points, workers=workers, run=run,
         )  # fmt: skip
@@ -205,11 +219,14 @@ class Study:
         found = discover(
             runs, library, Regression(), shared=True, seed=run.seed, progress=run.watch
         )
-        return {FOUND: ModelSettings({s: front.chosen for s, front in found.fronts.items()})}
+        terms = {state: list(found.fronts[state].best.terms) for state in found.fronts}
+        return {FOUND: ModelSettings(terms)}
 
-    def _functions(self, law: int | Sequence[str]) -> Library:
-        names = self._given.names
-        return polynomial(names, degree=law) if isinstance(law, int) else named_terms(names, law)
+    def _functions(self) -> LawFunctions:
+        """The functions of a law: a degree, named ones, or those that are chosen."""
+        if self.law is None or isinstance(self.law, int):
+            return self.law or "auto"
+        return named_terms(self._given.names, self.law)
 
     @cached_property
     def _given(self) -> GivenPoints:
@@ -351,11 +368,11 @@ class Outcome:
         return {point.label: result.status == Oscillation.OSCILLATING for point, result in pairs}
 
     def in_short(self) -> Result:
-        """What was found: by the law where models run freely, else by quantities."""
+        """What was found: the laws of quantities, if any are asked for, else that of the model."""
+        if self.quantities is not None:
+            return self.quantities.in_short(self.law.compared if self.law else "")
         if self.law is not None:
             return self.law.in_short(self._oscillates, self._law_figures)
-        if self.quantities is not None:
-            return self.quantities.in_short()
         n = sum(bool(result.fits) for result in self.results)
         return Result(f"Found: {len(self.given)} models at {n} operating points that oscillate", [])
 

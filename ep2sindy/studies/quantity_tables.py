@@ -34,6 +34,7 @@ from ep2sindy.report.document import (
     pictures,
 )
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
+from ep2sindy.studies.law_tables import spoken
 from ep2sindy.studies.views import with_error
 
 MOST_LAWS = 3  # on the screen
@@ -82,13 +83,15 @@ CONTROL_LAW: Metrics[tuple[str, str, ControlLaw]] = [
 class FoundQuantities:
     """Quantities of every model at every point, by least squares and refined.
 
-    models: by name. published: values by fit -> points with their parameters and quantities.
-    labels: of parameters, quantities and publications on axes and in legends.
+    models: by name. errors: for each fit, the mean error of its law at points left out; empty if
+    the points do not suffice for laws. published: values by fit -> points with their parameters and
+    quantities. labels: of parameters, quantities and publications on axes and in legends.
     """
 
     library: Library
     models: Mapping[str, GivenModel]
     results: Sequence[PointResult]
+    errors: Mapping[str, float]
     published: Mapping[str, Sequence[Mapping[str, float]]]
     labels: Mapping[str, str]
 
@@ -122,25 +125,10 @@ class FoundQuantities:
             }
         return found
 
-    @cached_property
-    def errors(self) -> dict[str, float]:
-        """For each fit, the mean error of its control laws at points left out of their search."""
-        return {
-            fit: float(np.mean([law.search_error for law in laws.values()]))
-            for fit, laws in self.laws.items()
-        }
-
     @property
     def best(self) -> str | None:
-        """The fit whose laws miss points left out least, of those that finished at most points."""
-        if not self.errors:
-            return None
-        most = max(self._n_done(fit) for fit in self.errors)
-        done = [fit for fit in self.errors if self._n_done(fit) > most / 2]
-        return min(done, key=lambda fit: np.nan_to_num(self.errors[fit], nan=np.inf))
-
-    def _n_done(self, fit: str) -> int:
-        return sum(result.is_usable(fit) for result in self.results)
+        """The fit of least error at points left out, of those that have control laws."""
+        return min(self.laws, key=lambda fit: self.errors.get(fit, np.inf), default=None)
 
     def tables(self) -> dict[str, pd.DataFrame]:
         laws = [(fit, name, law) for fit, of in self.laws.items() for name, law in of.items()]
@@ -217,8 +205,7 @@ class FoundQuantities:
     def _figure(self, model: str) -> Captioned:
         """Quantities of one model: of least squares, refined, and published."""
         kinds = {model: "least squares", model + REFINED: "refined"}
-        known = {fit: error for fit, error in self.errors.items() if fit in kinds}
-        best = min(known, key=known.__getitem__, default=model)
+        best = min(kinds, key=lambda fit: self.errors.get(fit, np.inf))
         ours = self.estimates.query("usable and fit in @kinds")
         ours = ours.sort_values("fit", key=lambda fit: fit != best, kind="stable")
         theirs = rows_at(self._published, {"fit": model})
@@ -237,30 +224,31 @@ class FoundQuantities:
         units = next(each.fits[fit].model.units for each in self.results if each.fits)
         return {n: q.unit(self.library, units) for n, q in self.fits[fit].quantities.items()}
 
-    def in_short(self) -> Result:
-        """The laws of the fit that predicts left-out points best, and how the others do."""
-        best = self.best
-        shown = [
-            Equation(
-                name,
-                law.coef_by_term,
-                rate=False,
-                unit=self._units(best)[name],
-                mark=f" ({percent(2)(law.search_error)} off where left out)",
-                on_screen=True,
-            )
-            for name, law in (self.laws[best].items() if best else ())
-        ]
-        others = {fit: error for fit, error in self.errors.items() if fit != best}
-        beside = ", ".join(f"{spoken(fit)} {percent(1)(e)}" for fit, e in others.items())
-        text = f"in the mean {percent(1)(self.errors[best])} off where left out" if best else ""
-        words = [Text(f"{text}; other fits: {beside}" if beside else text)] if best else []
-        end = f", by the fit of least error where left out: {spoken(best)}" if best else ""
+    def in_short(self, compared: str) -> Result:
+        """The control laws of the fit that does best at points left out.
+
+        compared: the errors of all fits, in words.
+        """
+        best, shown = self.best, list[Block]()
+        if best is not None:
+            units = self._units(best)
+            shown += [
+                Equation(
+                    name,
+                    law.coef_by_term,
+                    rate=False,
+                    unit=units[name],
+                    mark=f" ({percent(2)(law.search_error)} off where left out)",
+                    on_screen=True,
+                )
+                for name, law in self.laws[best].items()
+            ]
+        end = f", by the fit {spoken(best)}" if best else ""
         n_fitted = sum(bool(result.fits) for result in self.results)
         return Result(
             f"Found: {len(shown) or 'no'} control laws over {n_fitted} operating points that "
             f"oscillate{end}",
-            [*shown[:MOST_LAWS], *words],
+            [*shown[:MOST_LAWS], *([Text(compared)] if compared else [])],
             load='pandas.read_csv("{}/tables/control_laws.csv")',
             picture=next(iter(self.figures()), ""),
         )
@@ -315,10 +303,6 @@ def check_published(
                     f"thesis must give {list(parameters)} and quantities at every point, or be "
                     f"null: {point} came"
                 )
-
-
-def spoken(fit: str) -> str:
-    return fit.replace("_", ", ")
 
 
 def _values(used: Sequence[PointResult], fit: str, name: str) -> np.ndarray:
