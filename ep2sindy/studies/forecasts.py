@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -49,43 +47,6 @@ def skill_of(
     if not starts or model.inputs or is_short(run, n_fitted) or not model.coef.any():
         return None
     return forecast_skill(model, run, n_fitted=n_fitted, starts=starts, progress=progress)
-
-
-@dataclass(frozen=True)
-class TypicalSkill:
-    """Skill of one model for each of several records: medians, half a period ahead.
-
-    nrmse: by who forecasts. coverage_90: the mean share of samples that the bands of 90 % hold.
-    """
-
-    nrmse: Mapping[str, float]
-    better_until_periods: float
-    coverage_90: float
-    n_records: int
-
-    @staticmethod
-    def of(skills: Iterable[ForecastSkill | None]) -> TypicalSkill | None:
-        """None if no record of them has a period."""
-        known = [each for each in skills if each is not None and np.isfinite(each.period_s)]
-        if not known:
-            return None
-        errors = pd.DataFrame([each.at(0.5 * each.period_s) for each in known]).median()
-        return TypicalSkill(
-            {str(name): float(error) for name, error in errors.items()},
-            float(np.median([each.better_until_periods for each in known])),
-            float(np.mean([each.coverage_90 for each in known])),
-            len(known),
-        )
-
-    @property
-    def text(self) -> str:
-        model, *others = self.nrmse.items()
-        beside = ", ".join(f"{name} {error:.3f}" for name, error in others)
-        return (
-            f"Forecasts half a period ahead, each from the past alone, err by {model[1]:.3f} "
-            f"standard deviations in the median of {self.n_records} points ({beside}); the bands "
-            f"of 90 % hold {100.0 * self.coverage_90:.0f} % of the samples"
-        )
 
 
 def forecast_section(

@@ -29,7 +29,7 @@ from ep2sindy.operating.point_fits import LawFunctions
 from ep2sindy.operating.quantities import Quantity
 from ep2sindy.operating.records import OperatingRecord, branches_of, read_points
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Block, Captioned, Result, Section, Text
+from ep2sindy.report.document import Captioned, Result, Section, Text
 from ep2sindy.report.results import json_rows
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
@@ -49,7 +49,7 @@ from ep2sindy.studies.quantity_tables import FoundQuantities, check_published
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import Source, compile_kernels
 from ep2sindy.studies.study import Count, CountOrNone, Positive
-from ep2sindy.studies.views import coefficients, display_equation
+from ep2sindy.studies.views import coefficients
 
 FOUND = "found"  # name of the model whose terms were searched for
 
@@ -83,11 +83,11 @@ class Study:
     each with one value or a list of values for all parameters, and `data` for other differences
     from the data group; or the pattern of files, which names the parameters.
     models: by name; None searches products of the states up to a degree for terms that are the same
-    at all points. windows: of the
-    refinements. law: functions of the parameters that give all coefficients: the degree of
-    polynomials, or names such as ["1", "V_D_V"]; None chooses them at points left out. map_points:
-    number of points along each parameter, of a map over the law; None: no map.
-    labels: names of parameters and quantities in figures. thesis: published quantities by model.
+    at all points. windows: of the refinements. law: functions of the parameters that give all
+    coefficients: the degree of polynomials, or names such as ["1", "V_D_V"]; None chooses them at
+    points left out. map_points: number of points along each parameter, of a map over the law; None:
+    no map. labels: names of parameters and quantities in figures. thesis: published quantities by
+    model.
     keep: whether a run goes on with the finished pieces of one that was broken off.
     """
 
@@ -149,8 +149,8 @@ class Study:
         found = Outcome(opened, results, given, None, {}, None, self.labels)
         has_quantities = any(model.quantities for model in given.values())
         try:
-            cycles, law = self._law(opened, results, given, workers, run)
-            found = replace(found, cycles=cycles, law=law)
+            records, law = self._law(opened, results, given, workers, run)
+            found = replace(found, records=records, law=law)
         except ValueError as error:
             if not has_quantities:
                 raise
@@ -169,31 +169,30 @@ class Study:
         given: Mapping[str, GivenModel],
         workers: Workers,
         run: Run,
-    ) -> tuple[dict[str, str], FoundLaw]:
-        """The cycle of every record by its label, and the law of those on the main one."""
-        records = {}
+    ) -> tuple[dict[str, tuple[OperatingRecord, str]], FoundLaw]:
+        """Every record with its cycle, by its label, and the law of those on the main cycle."""
+        known: dict[str, tuple[OperatingRecord, PointResult]] = {}
         for point, result in zip(opened, results, strict=True):
             if point.run is not None and result.fits:
                 try:
                     record = OperatingRecord(point.run)
                     _ = record.cycle
-                    records[point.label] = record, result
+                    known[point.label] = record, result
                 except ValueError as error:
                     run.warn(str(error))
-        if not records:
+        if not known:
             raise ValueError(
                 f"a law needs records of {MIN_PERIODS:g} periods or more: none has them"
             )
-        cycles = dict(zip(records, name_cycles([r for r, _ in records.values()]), strict=True))
-        main, n_main = Counter(cycles.values()).most_common(1)[0]
-        if len(records) > n_main:
-            others = ", ".join(label for label, cycle in cycles.items() if cycle != main)
+        cycles = name_cycles([record for record, _ in known.values()])
+        main, n_main = Counter(cycles).most_common(1)[0]
+        used = [pair for pair, cycle in zip(known.values(), cycles, strict=True) if cycle == main]
+        if others := [p for p, cycle in zip(known, cycles, strict=True) if cycle != main]:
             run.warn(
                 f"two cycles coexist: the law is that of the {n_main} points on the {main} one; "
-                f"on the other are {others}"
+                f"on the other are {', '.join(others)}"
             )
         run.say(f"fitting a law to {n_main} points ...")
-        used = [pair for label, pair in records.items() if cycles[label] == main]
         law = find_law(
             {
                 name + end: fits_of(name + end, model, [result for _, result in used])
@@ -208,7 +207,8 @@ class Study:
         run.write("law.json", law.law.save)
         if law.advice:
             run.warn(law.advice)
-        return cycles, law
+        pairs = zip(known.items(), cycles, strict=True)
+        return {label: (record, cycle) for (label, (record, _)), cycle in pairs}, law
 
     def _search(self, opened: Sequence[OpenedPoint], run: Run) -> dict[str, ModelSettings]:
         """The terms that a search of all points finds, as one model."""
@@ -289,14 +289,15 @@ def name_cycles(records: Sequence[OperatingRecord]) -> list[str]:
 class Outcome:
     """Results of all points, and what depends on the point: quantities, and the law of models.
 
-    cycles: of the records of a law, by label. labels: names in figures.
+    records: with the name of their cycle, by label; none without a law. One of quantities and law
+    is not None. labels: names in figures.
     """
 
     opened: Sequence[OpenedPoint]
     results: Sequence[PointResult]
     given: Mapping[str, GivenModel]
     quantities: FoundQuantities | None
-    cycles: Mapping[str, str]
+    records: Mapping[str, tuple[OperatingRecord, str]]
     law: FoundLaw | None
     labels: Mapping[str, str]
 
@@ -315,21 +316,18 @@ class Outcome:
     @cached_property
     def _points(self) -> pd.DataFrame:
         """One row per operating point: status of its record, its cycle, and what the law says."""
-        known = {} if self.law is None else {r.label: r for r in self.law.records}
         rows = []
         for k, (point, result) in enumerate(zip(self.opened, self.results, strict=True)):
-            record = known.get(point.label)
+            record, cycle = self.records.get(point.label, (None, ""))
             row: dict[str, Any] = {
                 **point.parameters,
                 "status": result.status,
-                "branch": self.cycles.get(point.label, ""),
+                "branch": cycle,
                 "f_kHz": 1e-3 * (record.cycle.frequency_Hz if record else result.f_Hz),
                 "n_samples": result.n_samples,
                 "dt_s": result.dt_s,
                 **{f"spread_{state}": value for state, value in result.spread.items()},
             }
-            if record is None and point.run is not None and point.label in self.cycles:
-                record = OperatingRecord(point.run)
             row["relative_amplitude"] = record.relative_amplitude if record else np.nan
             if self.law is not None and self.law.at_points:
                 row["law"] = str(self.law.at_points[k].fate)
@@ -371,21 +369,12 @@ class Outcome:
         """What was found: the laws of quantities, if any are asked for, else that of the model."""
         if self.quantities is not None:
             return self.quantities.in_short(self.law.compared if self.law else "")
-        if self.law is not None:
-            return self.law.in_short(self._oscillates, self._law_figures)
-        n = sum(bool(result.fits) for result in self.results)
-        return Result(f"Found: {len(self.given)} models at {n} operating points that oscillate", [])
+        assert self.law is not None
+        return self.law.in_short(self._oscillates, self._law_figures)
 
     def sections(self) -> list[Section]:
-        fitted = [result for result in self.results if result.fits]
         found = [Section("Operating points", [Text(line) for line in self._lines()])]
-        for name in self.given if fitted and self.law is None else ():
-            model = fitted[0].fits[name].model
-            blocks: list[Block] = [
-                display_equation(model, state, on_screen=False) for state in model.states
-            ]
-            found.append(Section(f"{name}, at {point_label(fitted[0].parameters)}", blocks))
-        if self.quantities is not None and fitted:
+        if self.quantities is not None and any(result.fits for result in self.results):
             found += self.quantities.sections()
         if self.law is not None:
             found += self.law.sections(self._oscillates, self._law_figures)
