@@ -1,7 +1,7 @@
 """One law from one signal at each operating point, every point left out in turn and run freely.
 
     python -m benchmarks.currents
-    python -m benchmarks.currents grid --noise 0.02 --periods 2
+    python -m benchmarks.currents grid line --noise 0.02 --periods 2
 
 Records of one signal: the discharge current of the package's thruster, 6 ms at twelve points (grid:
 voltage and mass flow; line: voltage), with white noise in shares of its mean; and the pressure of
@@ -9,8 +9,7 @@ an oscillator of six terms at eleven powers of its heater (tube), with 1.5 % noi
 signal and its rate, whose first equation is known. One search over the rows of all records finds
 the best supports of the second; each is refined at every record on long windows, and the law of the
 others is run freely at the point left out. The chosen one is refined over all records. A line per
-support: the free runs, and how many end on a cycle that attracts; other cycles have the amplitude
-of the start.
+support: the free runs, and how many end on a cycle that attracts, not on one set by the start.
 """
 
 import argparse
