@@ -262,6 +262,7 @@ def _assemble(
         units=dict(zip(names, units, strict=False)),
         label=signal.name,
         clock=signal.clock,
+        parameters=signal.parameters,
     )
     relations = tuple(f"{state}: {term} == 1" for state, term in chain.items())
     terms = {state: (term,) for state, term in chain.items()}
