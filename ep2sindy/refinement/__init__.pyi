@@ -10,4 +10,3 @@ from ep2sindy.refinement.steps import FusedRungeKutta as FusedRungeKutta  # for 
 from ep2sindy.refinement.steps import HermiteSimpson as HermiteSimpson  # for configs
 from ep2sindy.refinement.ode import ODE as ODE
 from ep2sindy.refinement.correction import Corrected as Corrected
-from ep2sindy.refinement.law import refine_law as refine_law
