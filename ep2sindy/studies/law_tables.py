@@ -19,13 +19,13 @@ from ep2sindy.operating.left_out import (
     LawTrial,
     LeftOutRun,
     error_statistics,
-    fewest_of_least,
     run_left_out,
     window_errors,
 )
 from ep2sindy.operating.map import Fate, MapPoint, law_map, map_points
 from ep2sindy.operating.point_fits import LawFunctions, PointFits
 from ep2sindy.operating.records import OperatingRecord, Point
+from ep2sindy.regression.pooled import fewest_of_least
 from ep2sindy.report.document import (
     Block,
     Captioned,
