@@ -14,7 +14,7 @@ from jaxtyping import Float
 from ep2sindy.figures.operating import cycle_figure, frequency_scale, laws_figure, left_out_figure
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.given_models import REFINED
-from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.law import LawFunctions, OperatingLaw
 from ep2sindy.operating.left_out import (
     LawTrial,
     LeftOutRun,
@@ -23,7 +23,7 @@ from ep2sindy.operating.left_out import (
     window_errors,
 )
 from ep2sindy.operating.map import Fate, MapPoint, law_map, map_points
-from ep2sindy.operating.point_fits import LawFunctions, PointFits
+from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.operating.records import OperatingRecord, Point
 from ep2sindy.regression.pooled import fewest_of_least
 from ep2sindy.report.document import (

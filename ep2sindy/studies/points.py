@@ -26,8 +26,7 @@ from ep2sindy.operating.given_models import (
     fit_models,
     fits_of,
 )
-from ep2sindy.operating.law import Known, constrain_law, make_basis
-from ep2sindy.operating.point_fits import LawFunctions
+from ep2sindy.operating.law import Known, LawFunctions, constrain_law, make_basis
 from ep2sindy.operating.quantities import Quantity
 from ep2sindy.operating.records import OperatingRecord, branches_of, read_points
 from ep2sindy.regression.formulations import Differential, RandomSplit, WeightedWeak
