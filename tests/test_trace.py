@@ -241,6 +241,19 @@ def test_three_states_of_a_signal_are_a_chain_of_derivatives():
     assert before.run.state_names == ("x", "x_before", "x_before2")
 
 
+def test_signals_of_several_runs_get_one_embedding():
+    high, low = (ep.signals.prepare_signal(sine(mean=mean)) for mean in (3.0, 0.0))
+    assert [type(each.embedding) for each in map(ep.signals.embed, (high, low))] == [
+        ep.signals.LogRate,
+        ep.signals.Rate,
+    ]
+    assert {each.embedding for each in ep.signals.embed([high, high])} == {ep.signals.LogRate()}
+    both = ep.signals.embed([high, low], n_states=3)
+    assert {each.embedding for each in both} == {ep.signals.Rate(n_states=3)}
+    with pytest.raises(ValueError, match="a signal or more: an empty list"):
+        ep.signals.embed([])
+
+
 def test_neighbours_tell_how_many_states_there_are():
     lorenz = ep.lorenz().trajectory()
     signal = ep.signals.prepare_signal(recorded(lorenz.t, lorenz.states[:, 0]))

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.free_run import FreeRun, cycle_of, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.operating.records import OperatingRecord
@@ -22,6 +22,9 @@ from ep2sindy.refinement.windows import cut_windows, dominant_window
 
 # Windows of every record that is left out, and steps of the integration in each of its samples.
 N_WINDOWS, N_SUBSTEPS = 20, 4
+
+# Largest Floquet multiplier of a cycle that attracts.
+PULL = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +38,12 @@ class LeftOutRun:
     record: OperatingRecord
     run: FreeRun
     inside: bool
+
+    @property
+    def attracts(self) -> bool:
+        """True if the run ends on a cycle that attracts, and so sets the amplitude by itself."""
+        cycle = cycle_of(self.run)
+        return cycle is not None and cycle.largest_multiplier < PULL
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +66,15 @@ class LawTrial:
         return self.fits.n_free * len(self.functions)
 
 
-def window_errors(models: Sequence[SparseModel], run: Trajectory) -> Float[np.ndarray, " models"]:
-    """Error of each model in windows of one period, over which only its starts are fitted.
+def window_errors(
+    models: Sequence[SparseModel], run: Trajectory, *, periods: float = 1.0
+) -> Float[np.ndarray, " models"]:
+    """Error of each model in windows of some periods, over which only its starts are fitted.
 
     It is the root mean square over windows, samples and states, each in its standard deviations; a
     constant errs by about one, and so does by convention a model that blows up.
     """
-    window = dominant_window([run], models[0].states, periods=1.0)
+    window = dominant_window([run], models[0].states, periods=periods)
     batch = cut_windows(
         [run],
         states=models[0].states,

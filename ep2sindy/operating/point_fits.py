@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from numpy.linalg import norm
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
@@ -151,12 +152,10 @@ class PointFits:
         counts as missed whole.
         Raises ValueError if the points do not suffice for a law without each of them.
         """
-        laws = self._laws_without_each(functions)
-        at_points = np.einsum("pcf,pf->pc", laws, functions.evaluate(self.columns(functions)))
-        off, own = at_points - self.coefficients, self.coefficients
-        missed = np.einsum("pc,pcd,pd->p", off, self.information, off)
-        whole = np.einsum("pc,pcd,pd->p", own, self.information, own)
-        return np.where(whole > 0.0, np.sqrt(np.maximum(missed, 0.0) / zero_to_one(whole)), 1.0)
+        basis = make_basis(functions, self.columns(functions), n_spare=1)
+        missed = pool_rows(self._rows, basis, self._size).left_out(self._rows, basis)
+        pairs = zip(missed, self._rows, strict=True)
+        return np.array([norm(off) / norm(y) if y.any() else 1.0 for off, (_, y) in pairs])
 
     def _laws_without_each(self, functions: Library) -> Float[np.ndarray, "points free functions"]:
         """The factors of the law without each point."""

@@ -18,7 +18,7 @@ from ep2sindy.signals.trace import MIN_PERIODS
 
 Point = Mapping[str, float]  # parameter -> value
 
-# Two cycles coexist if the relative amplitudes of the records, less a plane over the parameters,
+# Two cycles coexist if the logarithms of the records' amplitudes, less a plane over the parameters,
 # form two groups. The gap between these must exceed the spread in a group by the factor APART, and
 # the logarithm of the amplitude must differ by MIN_STEP; a trend alone makes no branches.
 APART, MIN_STEP = 3.0, 0.3
@@ -169,11 +169,11 @@ def most_central(points: Float[np.ndarray, "points parameters"]) -> int:
 def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records"]:
     """Cycle of each record: 0 on the stronger (or only) cycle, 1 on the weaker.
 
-    The logarithm of the relative amplitude is fitted robustly by a plane over the parameters, and
-    its residuals are sorted. Two cycles coexist if the residuals show a gap that is wide compared
-    with the spread on either side of it.
+    The logarithm of the standard deviation, in the mean over the states, is fitted robustly by a
+    plane over the parameters, and its residuals are sorted. Two cycles coexist if the residuals
+    show a gap that is wide compared with the spread on either side of it.
     """
-    amplitude = np.log([record.relative_amplitude for record in records])
+    amplitude = np.array([np.log(record.cycle.std).mean() for record in records])
     values = read_points([r.parameters for r in records], list(records[0].parameters))
     left = _off_plane(values, amplitude)
     order = np.argsort(left)

@@ -90,11 +90,39 @@ class Basis:
 
 @dataclass(frozen=True, eq=False)
 class PooledFit:
-    """A law fitted by `pool_rows`: `fit` of the unknowns, and their matrix `to_law`."""
+    """A law fitted by `pool_rows`: `fit` of the unknowns, and their matrix `to_law`.
+
+    size: of the coefficients, in which the unknowns are.
+    """
 
     fit: LeastSquares
+    size: Float[np.ndarray, " coefs"]
     to_law: Float[np.ndarray, "unknowns unknowns"]
     n_functions: int
+
+    def left_out(
+        self, rows: Sequence[tuple[np.ndarray, np.ndarray]], basis: Basis
+    ) -> list[Float[np.ndarray, " _"]]:
+        """Residuals of every point's rows by the law of the other points.
+
+        They are (1 - H_p)^-1 r_p, with r_p the residuals of the point in the fit of all points and
+        H_p its block of the hat matrix.
+        Raises ValueError if a point is indispensable: without it the others do not tell the
+        functions apart.
+        """
+        found = []
+        for (theta, y), q in zip(rows, basis.orthonormal, strict=True):
+            block = np.kron(theta * self.size, q[None])
+            hat = block @ self.fit.root
+            kept = np.eye(len(y)) - hat @ hat.T
+            if np.linalg.eigvalsh(kept)[0] < 1.0 - FULL_LEVERAGE:
+                raise ValueError(
+                    "a law that is tested by leaving out points must not hang on one of them: "
+                    "without it the others do not tell its functions apart; add points, or take a "
+                    "law of fewer functions"
+                )
+            found.append(np.linalg.solve(kept, y - block @ self.fit.coef))
+        return found
 
     @property
     def law(self) -> Float[np.ndarray, "coefs functions"]:
@@ -121,7 +149,7 @@ def pool_rows(
     blocks = zip(rows, basis.orthonormal, strict=True)
     design = np.concatenate([np.kron(theta * size, q[None]) for (theta, _), q in blocks])
     fit = LeastSquares.of_rows(design, np.concatenate([y for _, y in rows]))
-    return PooledFit(fit, basis.to_law(size), basis.values.shape[1])
+    return PooledFit(fit, size, basis.to_law(size), basis.values.shape[1])
 
 
 def invert_covariance(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Protocol, runtime_checkable
+from typing import Protocol, overload, runtime_checkable
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -190,21 +190,40 @@ EMBEDDINGS: Mapping[str, Callable[..., AnyEmbedding]] = MappingProxyType(
 )
 
 
-def embed(signal: Trace, *, n_states: int = 2, harmonics: float = HARMONICS) -> Embedded:
+@overload
+def embed(signal: Trace, *, n_states: int = 2, harmonics: float = HARMONICS) -> Embedded: ...
+@overload
+def embed(
+    signal: Sequence[Trace], *, n_states: int = 2, harmonics: float = HARMONICS
+) -> list[Embedded]: ...
+def embed(
+    signal: Trace | Sequence[Trace], *, n_states: int = 2, harmonics: float = HARMONICS
+) -> Embedded | list[Embedded]:
     """Embed a signal as states by the embedding that its sign and its noise ask for.
 
-    n_states, harmonics: of the embedding, see `LogRate`.
+    signal: one, or the same signal of several runs. These all get one embedding, so that equations
+    of one form can hold for all: the growth rate if the signal is positive in every run, and delays
+    if noise drowns the derivative in one. n_states, harmonics: of the embedding, see `LogRate`.
+    Raises ValueError for no signal.
     """
-    if signal.is_positive:
-        positive = LogRate(harmonics, n_states).embed(signal)
-        return replace(positive, reason=f"{signal.name} is positive")
-    either, rate = f"{signal.name} takes either sign", Rate(harmonics, n_states).embed(signal)
-    share = rate.noise_std / float(signal.x.std())
+    if isinstance(signal, Trace):
+        return embed([signal], n_states=n_states, harmonics=harmonics)[0]
+    if not signal:
+        raise ValueError("an embedding needs a signal or more: an empty list came")
+    name = signal[0].name
+    if all(each.is_positive for each in signal):
+        log_rate = LogRate(harmonics, n_states)
+        return [replace(log_rate.embed(each), reason=f"{name} is positive") for each in signal]
+    either, rate = f"{name} takes either sign", Rate(harmonics, n_states)
+    found = [replace(rate.embed(each), reason=either) for each in signal]
+    share = max(
+        own.noise_std / float(each.x.std()) for own, each in zip(found, signal, strict=True)
+    )
     if share <= DROWNED:
-        return replace(rate, reason=either)
-    delays = Delays(harmonics, n_states).embed(signal)
+        return found
+    delays = Delays(harmonics, n_states)
     reason = f"{either}, and noise is {share:.2f} of its standard deviation"
-    return replace(delays, reason=reason)
+    return [replace(delays.embed(each), reason=reason) for each in signal]
 
 
 def _smooth(signal: Trace, harmonics: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -243,6 +262,7 @@ def _assemble(
         units=dict(zip(names, units, strict=False)),
         label=signal.name,
         clock=signal.clock,
+        parameters=signal.parameters,
     )
     relations = tuple(f"{state}: {term} == 1" for state, term in chain.items())
     terms = {state: (term,) for state, term in chain.items()}

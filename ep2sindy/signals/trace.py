@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -59,7 +60,7 @@ class Trace:
     x: (samples,) in `unit`. frequency_Hz: of its cycle, or the mean rate at which it rises through
     its mean. cycle: None for a signal that oscillates without repeating itself, such as chaos.
     done: processing already applied to the samples, in words. advice: processing that is
-    recommended.
+    recommended. parameters: the operating point.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -71,6 +72,7 @@ class Trace:
     done: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
     clock: Clock = SECONDS
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "t", read_only(self.t))
@@ -148,6 +150,7 @@ def prepare_signal(
         done=(*evened, *straightened, *averaged),
         advice=drifting,
         clock=run.clock,
+        parameters=run.parameters,
     )
     _check_oscillation(found)
     return found

@@ -55,10 +55,11 @@ LEFT_OUT = (
     "enclosed: whether the others enclose it."
 )
 TRIED = (
-    "error: mean over the points left out, by the law of the others, of what windows of one period "
+    "error: mean over the points left out, by the law of the others, of what windows of the record "
     "leave, in standard deviations of the states; nine in ten: of the points. It tells fits apart, "
     "also if their coefficients have a bias that is as smooth as the truth. numbers: of the law. "
-    "Chosen: the fewest numbers within a standard error of the least."
+    "Chosen: the fewest numbers within a standard error of the least, of models whose cycles "
+    "attract at points left out."
 )
 CAPTIONS = {
     "laws": "Coefficients over the operating parameters, with 95 % intervals: by the law that all "
@@ -122,7 +123,7 @@ class FoundLaw:
         """How the law does at the points left out."""
         found, text = self.statistics, percent(2)
         windows = (
-            "Left out one at a time, windows of a period are followed to "
+            "Left out one at a time, windows of the records are followed to "
             f"{found['window_error']:.3g} standard deviations"
         )
         if not self.runs:
@@ -319,14 +320,17 @@ def find_law(
     points: Sequence[Point],
     *,
     cycle: str,
+    periods: float,
     n_map: int | None,
     workers: Workers,
     run: Run,
 ) -> FoundLaw:
     """Find the law of the records, of the fit that does best at points left out.
 
+    Of models that run freely, it is the best of those that attract at more than half of the points
+    left out, if there are any: a neutral cycle keeps the amplitude of its start.
     fits: of the records, by name. functions: of the law. points: all points of the study, which the
-    map encloses.
+    map encloses. periods: length of the windows that are followed where left out.
     Raises ValueError if the records do not suffice for the law of any fit.
     """
     known, reason = {}, ""
@@ -341,22 +345,38 @@ def find_law(
         raise ValueError(f"{n_points(len(records))} that oscillate get no law: {reason}")
     stage = run.progress(len(records), "point", "laws at points left out")
     trials, numbers = list(known.values()), list(enumerate(records))
-    errors = np.array(collect(workers, partial(_leave_out, trials=trials), numbers, stage))
+    one = partial(_leave_out, trials=trials, periods=periods)
+    errors = np.array(collect(workers, one, numbers, stage))
     trials = [replace(t, errors=own) for t, own in zip(trials, errors.T, strict=True)]
-    best = trials[fewest_of_least([(trial.errors, trial.n_numbers) for trial in trials])]
+    best, runs = _choose(trials, records)
     law = best.fits.law(best.functions)
-    runs: list[LeftOutRun] = []
     at_points: list[MapPoint] = []
     grid: list[MapPoint] = []
-    if not best.fits.models[0].inputs:
-        runs = run_left_out(best, records)
+    if runs:
         at_points = _follow(law, records, points, workers, run)
         grid = _follow(law, records, map_points(points, n_map), workers, run) if n_map else []
     return FoundLaw(cycle, records, trials, best, law, runs, at_points, grid)
 
 
+def _choose(
+    trials: Sequence[LawTrial], records: Sequence[OperatingRecord]
+) -> tuple[LawTrial, list[LeftOutRun]]:
+    """The best fit, and its free runs at points left out; none of a model that inputs drive."""
+    left, first = list(trials), None
+    while left:
+        best = left.pop(fewest_of_least([(trial.errors, trial.n_numbers) for trial in left]))
+        if best.fits.models[0].inputs:
+            return best, []
+        runs = run_left_out(best, records)
+        first = first or (best, runs)
+        if 2 * sum(run.attracts for run in runs) > len(runs):
+            return best, runs
+    assert first is not None
+    return first
+
+
 def _leave_out(
-    numbered: tuple[int, OperatingRecord], *, trials: Sequence[LawTrial]
+    numbered: tuple[int, OperatingRecord], *, trials: Sequence[LawTrial], periods: float
 ) -> Float[np.ndarray, " trials"]:
     """Errors of the laws of all fits at one point, each of the other points."""
     number, record = numbered
@@ -365,7 +385,7 @@ def _leave_out(
         law = trial.fits.law_without(number, trial.functions)
         point = {name: record.parameters[name] for name in law.parameters}
         models.append(law.at(extrapolate=True, **point))
-    return window_errors(models, record.run)
+    return window_errors(models, record.run, periods=periods)
 
 
 def _follow(

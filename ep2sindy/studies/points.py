@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -28,13 +30,16 @@ from ep2sindy.operating.law import Known, constrain_law, make_basis
 from ep2sindy.operating.point_fits import LawFunctions
 from ep2sindy.operating.quantities import Quantity
 from ep2sindy.operating.records import OperatingRecord, branches_of, read_points
+from ep2sindy.regression.formulations import Differential, RandomSplit, WeightedWeak
 from ep2sindy.regression.rows import Formulation
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.report.document import Captioned, Result, Section, Text
 from ep2sindy.report.results import json_rows
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
+from ep2sindy.signals.embedding import Embedded, embed
 from ep2sindy.signals.spectrum import Oscillation
-from ep2sindy.signals.trace import MIN_PERIODS
+from ep2sindy.signals.trace import MIN_PERIODS, prepare_signal
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.law_tables import FoundLaw, find_law
 from ep2sindy.studies.point_sources import (
@@ -51,7 +56,9 @@ from ep2sindy.studies.source import Source, compile_kernels
 from ep2sindy.studies.study import Count, CountOrNone, Positive
 from ep2sindy.studies.views import coefficients
 
-FOUND = "found"  # name of the model whose terms were searched for
+# Name of models whose terms were searched for; most of them, and sizes of their supports: of every
+# state's, and of a signal's second state's.
+FOUND, MOST_FOUND, SIZES, SIGNAL_SIZES = "found", 27, (2, 3, 4), (4, 5, 6)
 
 
 @dataclass(frozen=True)
@@ -75,6 +82,9 @@ class RefiningWindows:
     periods: Positive
 
 
+WINDOWS = {False: RefiningWindows(20, 2.0), True: RefiningWindows(10, 8.0)}  # of a signal: True
+
+
 @dataclass(frozen=True, eq=False)
 class Study:
     """Fit models at all operating points that oscillate, and find how they depend on the point.
@@ -83,12 +93,14 @@ class Study:
     each with one value or a list of values for all parameters, and `data` for other differences
     from the data group; or the pattern of files, which names the parameters.
     models: by name; None searches products of the states up to a degree for terms that are the same
-    at all points. windows: of the refinements. law: functions of the parameters that give all
-    coefficients: the degree of polynomials, or names such as ["1", "V_D_V"]; None chooses them at
-    points left out. map_points: number of points along each parameter, of a map over the law; None:
-    no map. labels: names of parameters and quantities in figures. thesis: published quantities by
-    model.
-    keep: whether a run goes on with the finished pieces of one that was broken off.
+    at all points. Of one state, a signal, a second is made, its growth rate or derivative. degree:
+    None means 2, and 3 of a signal. windows: of the refinements; None means 20 of two periods, and
+    of a signal, whose second state is less certain, 10 of eight. law: functions of the parameters
+    that give all coefficients: the degree of polynomials, or names such as ["1", "V_D_V"]; None
+    chooses them at points left out. map_points: number of points along each parameter, of a map
+    over the law; None: no map. labels: names of parameters and quantities in figures. thesis:
+    published quantities by model. keep: whether a run goes on with the finished pieces of one that
+    was broken off.
     """
 
     source: Source
@@ -97,11 +109,11 @@ class Study:
     parameters: Mapping[str, str | None]
     points: Points
     models: Mapping[str, ModelSettings] | None
-    windows: RefiningWindows
+    windows: RefiningWindows | None
     law: Count | Sequence[str] | None
     labels: Mapping[str, str]
     map_points: CountOrNone = None
-    degree: Count = 2
+    degree: CountOrNone = None
     thesis: Mapping[str, Sequence[Mapping[str, float]]] | None = None
     keep: bool = True
 
@@ -131,9 +143,12 @@ class Study:
             return self._found(opened, workers, run)
 
     def _found(self, opened: Sequence[OpenedPoint], workers: Workers, run: Run) -> Outcome:
-        models = self.models or self._search(opened, run)
+        signal = None
+        if self._is_signal:
+            opened, signal = embed_points(opened)
+        models = self.models or self._search(opened, signal, run)
         library, given = self._given_models(models)
-        windows = self.windows
+        windows = self.windows or WINDOWS[self._is_signal]
         how = FittingSettings(library, self.formulation, windows.n_windows, windows.periods)
         (rng, _) = np.random.default_rng(run.seed).spawn(2)
         fitted = fit_models(
@@ -202,7 +217,8 @@ class Study:
             [record for record, _ in used],
             self._functions(),
             [point.parameters for point in opened],
-            cycle=main, n_map=self.map_points, workers=workers, run=run,
+            cycle=main, periods=max(1.0, (self.windows or WINDOWS[self._is_signal]).periods),
+            n_map=self.map_points, workers=workers, run=run,
         )  # fmt: skip
         run.write("law.json", law.law.save)
         if law.advice:
@@ -210,17 +226,46 @@ class Study:
         pairs = zip(known.items(), cycles, strict=True)
         return {label: (record, cycle) for (label, (record, _)), cycle in pairs}, law
 
-    def _search(self, opened: Sequence[OpenedPoint], run: Run) -> dict[str, ModelSettings]:
-        """The terms that a search of all points finds, as one model."""
+    @property
+    def _is_signal(self) -> bool:
+        return len(self.source.states) == 1
+
+    def _search(
+        self, opened: Sequence[OpenedPoint], signal: Embedded | None, run: Run
+    ) -> dict[str, ModelSettings]:
+        """Models of the terms that a search of all points finds; points left out choose of them.
+
+        They are all combinations of the best supports of some sizes. Of a signal, the first
+        equation is known, and the rows of the second are those of smoothed samples.
+        """
         runs = [point.run for point in opened if point.run is not None]
         if not runs:
             raise ValueError("a search needs points that oscillate: none of these does; " + QUIET)
-        library = polynomial(self.source.states, degree=self.degree)
+        sizes, n_best = (SIGNAL_SIZES, 2) if signal else (SIZES, 1)
+        known = signal.terms if signal else {}
+        library = polynomial(runs[0].state_names, degree=self.degree or (3 if signal else 2))
+        search = BestSubset(max_terms=sizes[-1], n_best=n_best)
+        rows = Differential(split=RandomSplit(test_fraction=0.0)) if signal else WeightedWeak()
         found = discover(
-            runs, library, Regression(), shared=True, seed=run.seed, progress=run.watch
-        )
-        terms = {state: list(found.fronts[state].best.terms) for state in found.fronts}
-        return {FOUND: ModelSettings(terms)}
+            runs, library, Regression(rows, search, depth=n_best), shared=True, seed=run.seed,
+            terms=known, relations=signal.relations if signal else (),
+            progress=run.watch,
+        )  # fmt: skip
+        supports = {
+            state: [known[state]]
+            if state in known
+            else [c.terms for c in front.candidates if c.n_terms in sizes]
+            for state, front in found.fronts.items()
+        }
+        if prod(map(len, supports.values())) > MOST_FOUND:
+            supports = {state: [front.best.terms] for state, front in found.fronts.items()}
+        return {
+            f"{FOUND}_{k}": ModelSettings(
+                dict(zip(supports, map(list, terms), strict=True)),
+                relations=list(signal.relations) if signal else (),
+            )
+            for k, terms in enumerate(product(*supports.values()), start=1)
+        }
 
     def _functions(self) -> LawFunctions:
         """The functions of a law: a degree, named ones, or those that are chosen."""
@@ -237,6 +282,8 @@ class Study:
     ) -> tuple[Library, dict[str, GivenModel]]:
         """The models, and a library that holds the terms of all of them."""
         states, parameters = self.source.states, self._given.names
+        if self._is_signal and models:  # and the state that is made of it
+            states = list(next(iter(models.values())).terms)
         terms = {name: terms_of(own.terms, states=states, key=f"models.{name}.terms")[1]
                  for name, own in models.items()}  # fmt: skip
         together = {
@@ -244,7 +291,7 @@ class Study:
             for s in states
         }
         if not models:
-            return polynomial(states, degree=self.degree), {}
+            return polynomial(states, degree=1), {}
         library, _ = terms_of(together, states=states, key="models")
         found = {}
         for name, own in models.items():
@@ -277,6 +324,30 @@ class Study:
             "that of the package's thruster; set it to that of yours, for each model that has one, "
             f"or leave such models out: ~models.{places[-1].split('.')[1]}"
         )
+
+
+def embed_points(opened: Sequence[OpenedPoint]) -> tuple[list[OpenedPoint], Embedded]:
+    """The signal of every point with the states that one embedding makes of it at all points.
+
+    A record that does not oscillate for long enough has no part in it; its status says so.
+    """
+    traces, quiet = {}, {}
+    for k, point in enumerate(opened):
+        if point.run is not None:
+            try:
+                traces[k] = prepare_signal(point.run)
+            except ValueError as error:
+                quiet[k] = replace(
+                    point, run=None, status=Oscillation.NO_PERIOD, notes=[*point.notes, str(error)]
+                )
+    if not traces:
+        raise ValueError("no signal oscillates for six periods: record for longer")
+    states = dict(zip(traces, embed(list(traces.values())), strict=True))
+    made = [
+        replace(point, run=states[k].run) if k in states else quiet.get(k, point)
+        for k, point in enumerate(opened)
+    ]
+    return made, next(iter(states.values()))
 
 
 def name_cycles(records: Sequence[OperatingRecord]) -> list[str]:
