@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import yaml
-from jaxtyping import Float
 
 import ep2sindy as ep
 from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
@@ -41,7 +40,7 @@ from ep2sindy.operating.given_models import (
     fits_of,
 )
 from ep2sindy.operating.law import constrain_law, make_basis
-from ep2sindy.operating.left_out import LawTrial, run_left_out, window_errors
+from ep2sindy.operating.left_out import LawTrial, run_left_out
 from ep2sindy.operating.records import OperatingRecord, read_points
 from ep2sindy.runtime.parallel import Loky, Workers
 
@@ -183,16 +182,7 @@ def left_out(
         fits = fits_of(name + end, given, results)
         trial = LawTrial(name + end, fits, QUADRATIC, np.zeros(0))
         runs = [each.run for each in run_left_out(trial, records)]
-        models = [each.model for each in runs]
-        errors = windows(models, records)
-        print(f"{line(name + end, runs)}; windows {errors.mean():.3f}; {fits.n_free} free")
-
-
-def windows(
-    models: Sequence[ep.SparseModel], records: Sequence[OperatingRecord]
-) -> Float[np.ndarray, " records"]:
-    pairs = zip(models, records, strict=True)
-    return np.array([window_errors([model], record.run)[0] for model, record in pairs])
+        print(f"{line(name + end, runs)}; {fits.n_free} free")
 
 
 def grid() -> None:
