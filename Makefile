@@ -74,7 +74,7 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.intervals
 	$(BIN)/python -m benchmarks.pointwise
 	$(BIN)/python -m benchmarks.regimes
-	$(BIN)/python -m benchmarks.joint
+	$(BIN)/python -m benchmarks.points family
 	$(BIN)/python -m benchmarks.trajectory_scores
 
 clean:

@@ -13,10 +13,9 @@ from shutil import which
 
 import numpy as np
 import pytest
-import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 import ep2sindy as ep
 from benchmarks.regions import three_regions
@@ -112,11 +111,6 @@ def check_config(config: str, page: str) -> str:
         own = composed_with("exp", name, config, f"+exp={name}", *DATA.get(name, ()))
         study_of(study_class(own.study), own)
         return name
-    if package == header:  # part of the experiment of its page
-        (group,) = yaml.safe_load(config)
-        changed = OmegaConf.merge(composed("+exp=predict"), {group: None}, yaml.safe_load(config))
-        study_of(study_class(changed.study), changed)
-        return group
     name = package.rpartition(".")[2]
     Path("B.csv").write_text("z_mm,B_G\n0,50\n25,150\n50,40\n")
     own = composed_with(name, "mine", config, "+exp=breathing", f"{name}=mine")

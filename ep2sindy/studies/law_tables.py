@@ -155,7 +155,7 @@ class FoundLaw:
             f"none of {len(self.runs)} points left out lives by the law of the others, so "
             "it predicts none between them: try points that lie closer together, other models, or "
             "models=null, longer records, and inputs that are states "
-            "(docs/predict.md)"
+            "(docs/parametric.md)"
         )
 
     def agreement(self, statuses: Mapping[str, bool]) -> tuple[int, int]:
