@@ -59,7 +59,7 @@ def test_the_summary_has_every_point_fit_and_quantity(folder: Path) -> None:
     assert points == [(200, 5), (300, 2), (300, 4), (300, 5), (400, 5)]
     for point in summary["points"]:
         assert point["status"] == "oscillating"
-        assert 8.0 < point["f_kHz"] < 20.0
+        assert 8.0 < point["f_kHz"] < 25.0
     assert [each["fit"] for each in summary["fits"]] == FITS * 5
     for each in summary["fits"]:
         assert max(each["r2_n_i"], each["r2_n_n"]) <= 1.0
