@@ -220,7 +220,7 @@ def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:
     folder = run_config(composed(*own_files(tmp_path, still), "trajectory.zone=null"))
     assert not (folder / "figures").exists()
     log = " ".join((folder / "run.log").read_text().split())
-    assert "none of the operating points oscillates, so there is no fit" in log
+    assert "none of the 1 operating points oscillates (steady), so there is no fit" in log
     assert "Found: no control laws over 0 operating points" in log
     assert summary_of(folder)["points"][0]["status"] == "steady"
 

@@ -125,8 +125,8 @@ def test_a_study_of_points_finds_the_same_numbers_on_dask(address: str, tmp_path
         table.to_csv(tmp_path / f"a{a}.csv", index_label="time [s]")
     given = [
         "+exp=predict", "data=recognised", f"points.files={tmp_path}/a{{a}}.csv", "~models",
-        "+models.own.terms={n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}", "law=1", "windows.n_windows=4",
-        "map_points=3", "keep=false", f"output={tmp_path}",
+        "+models.own.terms={n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}", "law=1", "map_points=3",
+        "windows={n_windows: 4, periods: 2.0}", "keep=false", f"output={tmp_path}",
     ]  # fmt: skip
     dask = ["parallel=dask", f"parallel.address='{address}'", f"parallel.timeout_s={PATIENCE_S}"]
     apart, alone = (computed(composed(*given, *own)) for own in (dask, ["parallel=serial"]))
