@@ -8,7 +8,6 @@ from scipy.signal import fftconvolve
 
 import ep2sindy as ep
 from ep2sindy.signals.attractor import (
-    _factorise,
     _fourier_columns,
     _moving_average,
     best_shift,
@@ -180,5 +179,5 @@ def test_what_does_not_repeat_has_no_mean_cycle() -> None:
 def test_triangles_are_those_of_reflections_also_where_samples_cluster(reach: float) -> None:
     columns, triangle = _fourier_columns(np.linspace(0.0, reach, 400), 4)
     plain = np.linalg.qr(columns, mode="r")
-    signs = np.sign(np.diagonal(plain) * np.diagonal(_factorise(columns)))
-    np.testing.assert_allclose(_factorise(columns), signs[:, None] * plain, rtol=1e-11, atol=1e-11)
+    signs = np.sign(np.diagonal(plain) * np.diagonal(triangle))
+    np.testing.assert_allclose(triangle, signs[:, None] * plain, rtol=1e-11, atol=1e-11)

@@ -105,10 +105,8 @@ def law(names: list[str], points: list[list[float]]) -> ep.operating.OperatingLa
 
 
 def point(*values: float) -> ep.operating.OperatingRecord:
-    names = ("w", "b", "c")[: len(values)]
-    return ep.operating.OperatingRecord.of(
-        dict(zip(names, values, strict=True)), record(values[0], n=2000)
-    )
+    at = dict(zip(("w", "b", "c"), values, strict=False))
+    return ep.operating.OperatingRecord(replace(record(values[0], n=2000), parameters=at))
 
 
 def test_a_law_of_one_parameter_is_drawn_as_a_line_of_its_frequency() -> None:

@@ -22,7 +22,9 @@ from ep2sindy.trust import memory
 
 LAW = {
     "format": "ep2sindy.OperatingLaw/1", "parameters": ["V"], "functions": ["1"],
-    "variables": ["x"], "library": ["x"], "states": ["x"],
+    "variables": ["x"], "library": ["x"], "states": ["x"], "coefficients": [["x", "x"]],
+    "coef": [[1.0]], "points": [[2.0]], "covariance": [[0.5]], "units": {}, "provenance": {},
+    "left_out": [0.1],
 }  # fmt: skip
 
 
@@ -59,12 +61,27 @@ def test_a_damaged_file_is_named(name: str, content: bytes, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    "change", [{}, {"states": [1]}, {"library": "x"}, {"library": ["x^9999"]}, {"units": [[]]}]
+    "change",
+    [
+        {"states": [1]},
+        {"library": "x"},
+        {"library": ["x^9999"]},
+        {"units": [[]]},
+        {"coefficients": [["x"]]},
+        {"coef": [[None]]},
+        {"points": []},
+        {"covariance": [[1.0, 0.0]]},
+        {"left_out": [0.1, 0.2]},
+        {"left_out": "none"},
+        {"format": "ep2sindy.OperatingLaw/2"},
+    ],
 )
 def test_a_law_that_cannot_be_is_refused(change: dict, tmp_path: Path) -> None:
     path = tmp_path / "law.json"
+    path.write_text(json.dumps(LAW))
+    assert ep.operating.OperatingLaw.load(path).at(V=2.0).terms("x") == {"x": 1.0}
     path.write_text(json.dumps(LAW | change))
-    with pytest.raises(ValueError, match="law.json: a law file must hold"):
+    with pytest.raises(ValueError, match=r"law\.json: .*a law file must hold"):
         ep.operating.OperatingLaw.load(path)
 
 

@@ -128,10 +128,10 @@ class PointFits:
         """
         free, covariance, errors = self._pool(functions), None, None
         with suppress(ValueError):  # too few points to leave one out
+            errors = self.rate_errors(functions)
             laws = self._laws_without_each(functions)
             apart = (laws - laws.mean(axis=0)).reshape(len(laws), -1)
             covariance = (len(laws) - 1) / len(laws) * apart.T @ apart
-            errors = self.rate_errors(functions)
         columns = self.columns(functions)
         return self.relations.make_law(
             self.models[0], functions, columns, free, covariance, self.how, errors

@@ -132,7 +132,7 @@ class PooledFit:
             block = np.kron(theta * self.size, q[None])
             hat = block @ self.fit.root
             kept = np.eye(len(y)) - hat @ hat.T
-            if np.linalg.eigvalsh(kept)[0] < 1.0 - FULL_LEVERAGE:
+            if np.linalg.eigvalsh(kept).min(initial=1.0) < 1.0 - FULL_LEVERAGE:
                 raise ValueError(
                     "a law that is tested by leaving out points must not hang on one of them: "
                     "without it the others do not tell its functions apart; add points, or take a "
