@@ -17,6 +17,7 @@ from ep2sindy.refinement.problem import Iteration, Method
 from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
 from ep2sindy.refinement.windows import cut_windows, dominant_window
 from ep2sindy.systems.systems import System
+from tests.models import model_of
 from tests.single_shooting import SingleShooting
 
 PREY, LORENZ = ep.lotka_volterra(), ep.lorenz()
@@ -423,6 +424,23 @@ def test_stiff_model_is_right_or_says_that_it_is_not(
         assert (np.abs(errors(found, model) * used) < allowed).all()
     if k_dt <= 2.0 or (k_dt == 5.0 and noise and isinstance(step, HermiteSimpson)):
         assert found.status == "converged"
+
+
+@pytest.mark.parametrize("u", [1.9, 2.0])  # the sharpest pulses of `benchmarks.known_laws`
+def test_sharp_pulses_are_fitted_by_steps_short_enough(u: float) -> None:
+    """By one step per sample the fit does not settle, with coefficients off by 14 and 18 %."""
+    inflow, outflow, gain = 0.6 + 0.4 * u, 2.0 + 0.5 * u**2, 0.5 + 0.6 / u
+    model = model_of({
+        "x": {"1": inflow, "x": -1.0 - outflow, "x^2*y": gain},
+        "y": {"x": outflow, "x^2*y": -gain},
+    })  # fmt: skip
+    t = np.arange(1500) * 0.127  # 50 samples to a period, of which a pulse takes five
+    run = ep.Trajectory(t, model.simulate(t, [1.0, 1.0]).states, model.states)
+    noise = 0.01 * run.states.std(axis=0) * np.random.default_rng(0).normal(size=run.states.shape)
+    data = replace(run, states=run.states + noise)
+    found = ep.refine(ep.discover(data, model.library).model, data)
+    assert found.status == "converged"
+    np.testing.assert_allclose(errors(found, model), 0.0, atol=0.01)
 
 
 @pytest.mark.slow
