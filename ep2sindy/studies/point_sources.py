@@ -31,6 +31,13 @@ Points = Annotated[
         lambda value: isinstance(value, list | str) and bool(value),
     ),
 ]
+Functions = Annotated[
+    int | Sequence[str] | None,
+    Check(
+        "a degree of one or more, names of functions like ['1',V_D_V], or null for a choice",
+        lambda value: isinstance(value, list | None) or (type(value) is int and value > 0),
+    ),
+]
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ from ep2sindy.signals.trace import MIN_PERIODS, prepare_signal
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.law_tables import FoundLaw, find_law
 from ep2sindy.studies.point_sources import (
+    Functions,
     GivenPoints,
     OpenedPoint,
     Points,
@@ -109,7 +110,7 @@ class Study:
     points: Points
     models: Mapping[str, ModelSettings] | None
     windows: RefiningWindows | None
-    law: Count | Sequence[str] | None
+    law: Functions
     labels: Mapping[str, str]
     map_points: CountOrNone = None
     degree: CountOrNone = None
