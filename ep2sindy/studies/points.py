@@ -235,8 +235,9 @@ class Study:
     ) -> dict[str, ModelSettings]:
         """Models of the terms that a search of all points finds; points left out choose of them.
 
-        They are all combinations of the best supports of some sizes. Of a signal, the first
-        equation is known, and the rows of the second are those of smoothed samples.
+        They are all combinations of the best supports of some sizes, or of a state whose front ends
+        before these, as that of x' = y does, of the best support. Of a signal, the first equation
+        is known, and the rows of the second are those of smoothed samples.
         """
         runs = [point.run for point in opened if point.run is not None]
         if not runs:
@@ -254,7 +255,7 @@ class Study:
         supports = {
             state: [known[state]]
             if state in known
-            else [c.terms for c in front.candidates if c.n_terms in sizes]
+            else [c.terms for c in front.candidates if c.n_terms in sizes] or [front.best.terms]
             for state, front in found.fronts.items()
         }
         if prod(map(len, supports.values())) > MOST_FOUND:
