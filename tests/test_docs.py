@@ -118,6 +118,7 @@ def check_config(config: str, page: str) -> str:
     return "mine"
 
 
+@pytest.mark.slow
 def test_the_config_of_a_study_of_ones_own_runs(here: Path) -> None:
     """That of docs/parametric.md, on short, coarse simulations."""
     (config,) = (b.text for b in blocks(ROOT / "docs" / "parametric.md") if b.language == "yaml")

@@ -194,7 +194,7 @@ class Study:
                 except ValueError as error:
                     run.warn(str(error))
         if not any(result.fits for result in results):
-            raise ValueError(nothing_moves(results))
+            raise ValueError(nothing_moves([result.status for result in results]))
         if not known:
             raise ValueError(
                 f"a law needs records of {MIN_PERIODS:g} periods or more: none has them"
@@ -241,7 +241,7 @@ class Study:
         """
         runs = [point.run for point in opened if point.run is not None]
         if not runs:
-            raise ValueError(nothing_moves(opened))
+            raise ValueError(nothing_moves([point.status for point in opened]))
         sizes, n_best = (SIGNAL_SIZES, 2) if signal else (SIZES, 1)
         known = signal.terms if signal else {}
         library = polynomial(runs[0].state_names, degree=self.degree or (3 if signal else 2))
