@@ -285,11 +285,9 @@ def test_a_law_is_least_squares_over_the_rows_of_points_that_weigh_alike() -> No
     parts = [(r.theta[:, :2], r.target[:, 0]) for r in rows.values()]
 
     def pooled(kept: Sequence[int]) -> np.ndarray:
-        weights = [1.0 / np.linalg.norm(parts[k][0] * size) for k in kept]
-        design = [
-            w * np.kron(parts[k][0], [[1.0, p[k]]]) for w, k in zip(weights, kept, strict=True)
-        ]
-        target = [w * parts[k][1] for w, k in zip(weights, kept, strict=True)]
+        weight = {k: 1.0 / np.linalg.norm(parts[k][0] * size) for k in kept}
+        design = [weight[k] * np.kron(parts[k][0], [[1.0, p[k]]]) for k in kept]
+        target = [weight[k] * parts[k][1] for k in kept]
         return np.linalg.lstsq(np.concatenate(design), np.concatenate(target))[0].reshape(2, 2)
 
     every = range(len(p))
@@ -415,7 +413,8 @@ def test_relations_and_known_coefficients_are_exact_at_points_and_in_laws(
         exclude={"n_i": ["n_n"]},
     )  # fmt: skip
     at = {"V_D": 310.0, "mdot_mgs": 4.4}
-    places = [(own.model, PARAMETERS[p]) for own, p in zip(found.points.values(), PARAMETERS)]
+    models = [own.model for own in found.points.values()]
+    places = list(zip(models, PARAMETERS.values(), strict=True))
     for model, point in [*places, (found.law.at(**at), at)]:
         n_i, n_n = model.terms("n_i"), model.terms("n_n")
         assert (set(n_i), set(n_n)) == ({"n_i", "n_i*n_n"}, {"1", "n_i*n_n"})
