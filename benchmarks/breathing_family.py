@@ -8,6 +8,7 @@ flow by a known law. Records hold about one pulse, so that one point often does 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -51,15 +52,15 @@ def system_at(parameters: Mapping[str, float]) -> System:
 
 
 def realization(noise: float, number: int, *, seed: int = 0) -> dict[str, list[Trajectory]]:
-    """One noisy record per point, from a random start; noise levels share starts and pattern.
+    """One noisy record for each point, from a random start; noise levels share starts and pattern.
 
     noise: standard deviation of the white noise, in RMS of each state.
     """
     rng = np.random.default_rng([seed, number])
     starts = rng.uniform(*INITIAL, size=(len(PARAMETERS), len(TRUTH)))
-    return {
-        point: [system_at(parameters).trajectory(initial=start, noise=noise, rng=stream)]
-        for (point, parameters), start, stream in zip(
-            PARAMETERS.items(), starts, rng.spawn(len(PARAMETERS)), strict=True
-        )
-    }
+    found = {}
+    streams = rng.spawn(len(PARAMETERS))
+    for (point, parameters), start, stream in zip(PARAMETERS.items(), starts, streams, strict=True):
+        run = system_at(parameters).trajectory(initial=start, noise=noise, rng=stream)
+        found[point] = [replace(run, parameters=parameters)]
+    return found

@@ -1,65 +1,58 @@
 """One law from one signal at each operating point, every point left out in turn and run freely.
 
-    python -m benchmarks.currents [grid voltage flow tube] [--noise 0.02] [--periods 2]
+    python -m benchmarks.currents [grid voltage flow tube] [--noise 0.02]
 
 Records of one signal: the discharge current of the package's thruster, 6 ms at twelve points, with
 white noise in shares of its mean; and the pressure of an oscillator of six terms at eleven powers
-of its heater (tube), with 1.5 % noise. States are the signal and its rate, whose first equation is
-known. One search over the rows of all records finds the best supports of the second; each is
-refined at every record on long windows, and the law of the others is run freely at the point left
-out. Of laws whose cycles attract, instead of keeping the start's amplitude, one is chosen and
-refined over all records. A line per support and degree of the law.
+of its heater (tube), with 1.5 % noise. They are written as files, and `+exp=predict` is run over
+them as a user would: it makes a second state, searches its equation over all records, and chooses
+at points left out. A line per set: the equation, and how the models of the others live there.
 """
 
 import argparse
+import json
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 import ep2sindy as ep
-from benchmarks.predict import DEFAULT_SPEED, line
-from ep2sindy.model.free_run import cycle_of
-from ep2sindy.operating.branch import BranchSettings, StructureCase, choose, try_structures
-from ep2sindy.operating.fit import SETTINGS, LeaveOneOut, leave_one_out
-from ep2sindy.operating.records import OperatingRecord
-from ep2sindy.operating.shared_support import discover_shared
-from ep2sindy.selection.free_run import PULL
-
-Signals = Sequence[tuple[Mapping[str, float], ep.Trajectory]]
 
 POINTS: dict[str, list[dict[str, float]]] = {
     "grid": [{"V_D_V": v, "mdot_mg_s": m} for v, m in product((300, 320, 340, 360), (4, 4.5, 5))],
     "voltage": [{"V_D_V": v} for v in range(290, 401, 10)],
     "flow": [{"mdot_mg_s": m} for m in np.linspace(3.8, 5.45, 12).round(2).tolist()],
 }
-VOLTAGE, FLOW = 320.0, 4.5  # of what does not vary, in V and mg/s
+VOLTAGE, FLOW, SPEED = 320.0, 4.5, 338.0  # of what does not vary, in V, mg/s and m/s
 POWERS_kW, TUBE_NOISE = np.linspace(1.0, 2.0, 11), 0.015
-MIN_TERMS, MAX_TERMS, N_BEST = 4, 6, 2  # of the second equation, and supports of each size
-N_WINDOWS, DEGREES = 10, (2, 3)  # at every point, and of the laws
+
+Signal = tuple[Mapping[str, float], pd.DataFrame]
 
 
-def currents(points: Sequence[Mapping[str, float]], noise: float) -> Signals:
+def currents(points: Sequence[Mapping[str, float]], noise: float) -> list[Signal]:
     rng, found = np.random.default_rng(0), []
     for point in points:
         at = point.get("V_D_V", VOLTAGE), point.get("mdot_mg_s", FLOW)
         field = ep.thruster.simulate(
-            ep.thruster.Thruster(), ep.thruster.OperatingPoint(*at, neutral_speed=DEFAULT_SPEED),
+            ep.thruster.Thruster(), ep.thruster.OperatingPoint(*at, neutral_speed=SPEED),
             cache=True, duration_s=6e-3, progress=False,
         )  # fmt: skip
         x = field["I_d"].values
         x = x + noise * x.mean() * rng.standard_normal(len(x))
-        run = ep.Trajectory(field["time"].values, x[:, None], ("I_d",), units={"I_d": "A"})
-        found.append((point, run))
+        found.append((point, pd.DataFrame({"time (s)": field["time"].values, "I (A)": x})))
     return found
 
 
-def tube() -> Signals:
-    """A pressure p, in units of its own, with t in ms: 180 to 230 Hz, sixty periods."""
+def tube() -> list[Signal]:
+    """A pressure, with t in ms: 180 to 230 Hz, sixty periods."""
     library, rng, found = ep.polynomial(["p", "v"], degree=3), np.random.default_rng(0), []
-    for power in POWERS_kW:
+    for power in POWERS_kW.tolist():
         w = 2.0 * np.pi * 0.18 * (0.94 + 0.06 * power)
         second = {
             "p": -(w**2), "v": w * (0.25 * power - 0.1), "p^2": w**2 * (0.084 + 0.036 * power),
@@ -70,60 +63,49 @@ def tube() -> Signals:
         model = ep.SparseModel(library, ["p", "v"], coef)
         x = model.simulate(np.arange(4200) / 10.8, [0.5, 0.0]).states[600:, 0]
         x = x + TUBE_NOISE * x.std() * rng.standard_normal(len(x))
-        run = ep.Trajectory(np.arange(len(x)) / 10.8e3, x[:, None], ("p",))
-        found.append(({"P_kW": float(power)}, run))
+        t = np.arange(len(x)) / 10.8e3
+        found.append(({"P_kW": power}, pd.DataFrame({"time (s)": t, "p (Pa)": x})))
     return found
 
 
-def n_attracting(left_out: Sequence[LeaveOneOut]) -> int:
-    cycles = [cycle_of(each.run) for each in left_out]
-    return sum(cycle is not None and cycle.largest_multiplier < PULL for cycle in cycles)
-
-
-def tell(name: str, found: Sequence[LeaveOneOut]) -> None:
-    print(f"{line(name, [e.run for e in found])}; attract {n_attracting(found)}", flush=True)
-
-
-def measure(signals: Signals, *, periods: float) -> None:
-    points, runs = zip(*signals, strict=True)
-    states = ep.signals.embed([ep.signals.prepare_signal(run) for run in runs])
-    records = [OperatingRecord.of(p, each.run) for p, each in zip(points, states, strict=True)]
-    (searched,), told = states[0].searched, states[0].relations
-    library = ep.polynomial(records[0].run.state_names, degree=3)
-    method = ep.Regression(ep.Differential(), ep.BestSubset(MAX_TERMS, n_best=N_BEST), depth=N_BEST)
-    front = discover_shared({each.label: [each.run] for each in records}, library, method).fronts
-    cases = [
-        StructureCase(library, {**states[0].terms, searched: support}, told)
-        for support in front[searched].supports
-        if len(support) >= MIN_TERMS
-    ]
-    settings = replace(SETTINGS, periods=periods, n_windows=N_WINDOWS)
-    how = BranchSettings(library, cases, MAX_TERMS, DEGREES, settings, n_map=0, seed=0)
-    trials = try_structures(records, cases, how)
-    for trial in trials:
-        tell(f"{', '.join(trial.case.structure[searched])} ({trial.degree})", trial.left_out)
-    pulled = [each for each in trials if 2 * n_attracting(each.left_out) > len(records)]
-    chosen = choose(pulled or trials)
-    functions = chosen.fit.functions(chosen.degree)
-    law, found = chosen.fit.refine_law(functions)
-    tell(
-        f"refined, degree {chosen.degree}: {found.status}",
-        leave_one_out(chosen.fit, functions, start=law),
+def measure(name: str, signals: Sequence[Signal], folder: Path) -> str:
+    for point, samples in signals:
+        words = "_".join(f"{key}={value:g}" for key, value in point.items())
+        samples.to_csv(folder / f"{words}.csv", index=False)
+    parameters = list(signals[0][0])
+    pattern = "_".join(f"{key}={{{key}}}" for key in parameters)
+    state = signals[0][1].columns[1].partition(" ")[0]
+    run = subprocess.run(
+        [sys.executable, "-m", "experiments.run", "+exp=predict", "models=null", "data=recognised",
+         f"points.files='{folder / pattern}.csv'", f"trajectory.states=[{state}]",
+         f"output={folder}", "map_points=null"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if run.returncode:
+        return f"{name}: {run.stderr.strip() or run.stdout.strip()}"
+    (path,) = folder.glob("predict/*/summary.json")
+    law = json.loads(path.read_text())["law"]
+    left_out = law["left_out"]
+    (searched,) = [terms for terms in law["terms"].values() if len(terms) > 1]
+    return (
+        f"{name}: {', '.join(searched)} by {', '.join(law['functions'])}; "
+        f"{left_out['n_lives']} of {left_out['n']} live, frequency "
+        f"{left_out['f_median']:.2%} in the median, {left_out['f_90']:.2%} for nine in ten, "
+        f"amplitude {left_out['amplitude_median']:.1%}"
     )
-    print(law.model_at(records[len(records) // 2].parameters).text())
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="one law from one signal at each operating point")
     parser.add_argument("sets", nargs="*", default=[*POINTS, "tube"])
     parser.add_argument("--noise", type=float, default=0.0)
-    parser.add_argument("--periods", type=float, default=8.0, help="of a window")
     arguments = parser.parse_args()
     for name in arguments.sets:
         known = tube() if name == "tube" else currents(POINTS[name], arguments.noise)
-        start = time.process_time()
-        measure(known, periods=arguments.periods)
-        print(f"{name}: {time.process_time() - start:.0f} CPU-s after simulation", flush=True)
+        start = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            print(measure(name, known, Path(folder)), flush=True)
+        print(f"{time.perf_counter() - start:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

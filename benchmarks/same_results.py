@@ -3,9 +3,9 @@
     python -m benchmarks.same_results OTHER_CHECKOUT
 
 What no experiment computes is a small program instead, run in both checkouts: the (z, r)
-simulator and a neural correction. Compares summaries, models and tables, but for times. What only
-this checkout writes is named and allowed; anything that differs, or that it lacks, ends the
-program with status 1.
+simulator, a law over operating points and a neural correction. Compares summaries, models and
+tables, but for times. What only this checkout writes is named and allowed; anything that differs,
+or that it lacks, ends the program with status 1.
 """
 
 from __future__ import annotations
@@ -58,15 +58,14 @@ TOYS: dict[str, list[str]] = {
     ],
     "parametric": [
         "+exp=parametric", "data.cache={cache}", "data.duration_s=2.0e-3", "data.warm_up_s=0.5e-3",
-        "data.n_cells=30", "parallel=serial", "bootstraps.n=2", "bootstrap.n_draws=40",
-        "refining.n_windows=20", "library.variables=[n_i,n_n,R_ion]",
+        "data.n_cells=30", "parallel=serial", "windows.n_windows=20",
         "points=[{{V_D_V: 200.0, mdot_mg_s: 5.0, "
         "data: {{operating_point: {{neutral_speed: 320.0}}}}}}, {{V_D_V: 300.0, mdot_mg_s: 5.0}},"
         "{{V_D_V: 300.0, mdot_mg_s: 2.0, data: {{operating_point: {{neutral_speed: 195.0}}}}}}]",
     ],
     "predict": [
         "+exp=predict", "data.cache={cache}", "data.duration_s=2.0e-3", "data.warm_up_s=1.0e-3",
-        "data.n_cells=30", "parallel=serial", "degrees=[1]", "windows.n_windows=4",
+        "data.n_cells=30", "parallel=serial", "law=1", "windows.n_windows=4",
         "windows.periods=1.0", "map_points=3",
         "points=[{{V_D_V: [280.0, 300.0, 320.0], mdot_mg_s: [5.0, 5.5]}}]",
     ],
@@ -93,6 +92,16 @@ import ep2sindy as ep
 field = ep.thruster.simulate_2d(duration_s=3e-5, warm_up_s=5e-6, n_z=24, n_r=10, progress=False)
 values = {str(name): field[name].values.ravel().tolist() for name in field.data_vars}
 Path(sys.argv[1], "field.json").write_text(json.dumps(values | {"status": field.attrs["status"]}))
+""",
+    "law": """
+import sys
+from dataclasses import replace
+from pathlib import Path
+import ep2sindy as ep
+growth = (0.5, 0.7, 0.9, 1.1)
+runs = [ep.lotka_volterra(a=a).trajectory(noise=0.02, rng=0) for a in growth]
+runs = [replace(run, parameters={"a": a}) for run, a in zip(runs, growth)]
+ep.discover(runs, law="auto").law.save(Path(sys.argv[1], "law.json"))
 """,
     "correction": """
 import json, sys

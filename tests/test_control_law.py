@@ -14,7 +14,7 @@ LIBRARY = polynomial(["V_D_V", "mdot_mg_s"], degree=2)
 
 def test_a_law_without_noise_is_recovered() -> None:
     values = 0.02 + 3e-3 * POINTS[:, 1] - 4e-8 * POINTS[:, 0] ** 2
-    law = fit_control_law(values, POINTS, LIBRARY)
+    law = fit_control_law(values, POINTS, LIBRARY, max_terms=3)
     assert law.coef_by_term == pytest.approx({"1": 0.02, "mdot_mg_s": 3e-3, "V_D_V^2": -4e-8})
     assert law.r2 == pytest.approx(1.0)
     assert law.loo_error < 1e-9
@@ -78,11 +78,13 @@ def test_units_of_quantity_and_parameters_change_nothing_else() -> None:
     assert there.predict(POINTS * [1e-3, 1e-6]) == pytest.approx(1e25 * here.predict(POINTS))
 
 
-def test_two_points_more_than_terms_are_asked_for() -> None:
-    rng = np.random.default_rng(0)
-    three = POINTS[[0, 1, 5]]
-    assert len(fit_control_law(rng.normal(size=3), three, LIBRARY).functions) == 1
-    assert len(fit_control_law(rng.normal(size=6), POINTS, LIBRARY).functions) <= 4
+@pytest.mark.parametrize(("n_points", "most"), [(3, 1), (5, 1), (6, 2), (8, 2), (9, 3)])
+def test_a_law_has_one_term_for_every_three_points(n_points: int, most: int) -> None:
+    points = np.random.default_rng(0).uniform(1.0, 2.0, size=(n_points, 2))
+    values = LIBRARY.evaluate(points) @ [1.0, -2.0, 3.0, 0.5, -1.0, 2.0]  # of six terms
+    assert len(fit_control_law(values, points, LIBRARY).functions) == most
+    largest = fit_control_law(values, points, LIBRARY, max_terms=6)
+    assert len(largest.functions) <= n_points - 2
 
 
 def test_a_term_that_one_point_alone_decides_is_out() -> None:

@@ -13,10 +13,9 @@ from shutil import which
 
 import numpy as np
 import pytest
-import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 import ep2sindy as ep
 from benchmarks.regions import three_regions
@@ -40,7 +39,7 @@ from tests.pages import (
     is_alike,
     quoted,
 )
-from tests.programs import EXPERIMENTS, composed
+from tests.programs import EXPERIMENTS, composed, computed
 from tests.rerun import ran_blocks, summary_of
 
 CONF = ROOT / "conf"
@@ -112,16 +111,26 @@ def check_config(config: str, page: str) -> str:
         own = composed_with("exp", name, config, f"+exp={name}", *DATA.get(name, ()))
         study_of(study_class(own.study), own)
         return name
-    if package == header:  # part of the experiment of its page
-        (group,) = yaml.safe_load(config)
-        changed = OmegaConf.merge(composed("+exp=predict"), {group: None}, yaml.safe_load(config))
-        study_of(study_class(changed.study), changed)
-        return group
     name = package.rpartition(".")[2]
     Path("B.csv").write_text("z_mm,B_G\n0,50\n25,150\n50,40\n")
     own = composed_with(name, "mine", config, "+exp=breathing", f"{name}=mine")
     study_of(study_class(own.study), own)
     return "mine"
+
+
+def test_the_config_of_a_study_of_ones_own_runs(here: Path) -> None:
+    """That of docs/parametric.md, on short, coarse simulations."""
+    (config,) = (b.text for b in blocks(ROOT / "docs" / "parametric.md") if b.language == "yaml")
+    own = composed_with(
+        "exp", "my_study", config, "+exp=my_study", "data.duration_s=2.0e-3",
+        "data.warm_up_s=0.5e-3", "data.n_cells=30", "data.cache=simulated", "parallel=serial",
+        "windows.n_windows=4", "map_points=2", "keep=false", "output=.",
+    )  # fmt: skip
+    found = computed(own)
+    assert [point["status"] for point in found.summary["points"]] == ["oscillating"] * 4
+    assert found.summary["control_laws"]
+    assert found.summary["law"]["fit"] in found.summary["law"]["errors"]
+    assert len(found.outcome.tables()["map"]) == 2
 
 
 DATA = {"my_spread": ("data=recognised", "data.path=run.csv", "trajectory.states=[x,y]")}

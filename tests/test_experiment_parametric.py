@@ -18,10 +18,11 @@ from tests.fields import along_channel
 from tests.programs import summary_of
 
 ESTIMATES = {"constrained": {"L_m", "g_inj", "eps"}, "free": {"L_m", "g_inj", "eps_i", "eps_n"}}
-THREE = (
+FITS = [name + end for name in ("free", "constrained") for end in ("", "_refined")]
+POINTS = (
     "points=[{V_D_V: 200.0, mdot_mg_s: 5.0, data: {operating_point: {neutral_speed: 320.0}}},"
-    "{V_D_V: 300.0, mdot_mg_s: 5.0},"
-    "{V_D_V: 300.0, mdot_mg_s: 2.0, data: {operating_point: {neutral_speed: 195.0}}}]"
+    "{V_D_V: 300.0, mdot_mg_s: 2.0, data: {operating_point: {neutral_speed: 195.0}}},"
+    "{V_D_V: 300.0, mdot_mg_s: [4.0, 5.0]}, {V_D_V: 400.0, mdot_mg_s: 5.0}]"
 )
 
 
@@ -38,93 +39,94 @@ def toy(output: Path) -> list[str]:
         "data.warm_up_s=0.5e-3",
         "data.n_cells=30",
         "parallel=serial",
-        "bootstraps.n=2",
-        "bootstrap.n_draws=40",
-        "refining.n_windows=20",
-        "library.variables=[n_i,n_n,R_ion]",
+        "windows.n_windows=20",
     ]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder of three operating points."""
-    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs")), THREE))
+    """The run folder of five operating points."""
+    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs")), POINTS))
 
 
-def test_the_summary_has_every_point(folder: Path) -> None:
+def of(fit: str) -> str:
+    return fit.removesuffix("_refined")
+
+
+def test_the_summary_has_every_point_fit_and_quantity(folder: Path) -> None:
     summary = summary_of(folder)
-    points = summary["points"]
-    assert [(p["V_D_V"], p["mdot_mg_s"]) for p in points] == [(200, 5), (300, 5), (300, 2)]
-    for point in points:
-        assert point["status"] == "oscillating"
-        assert 8.0 < point["f_kHz"] < 20.0
-        for case, names in ESTIMATES.items():
-            assert set(point[case]) == set(point["ci95"][case]) == names
-            for name, value in point[case].items():
-                low, high = point["ci95"][case][name]
-                assert low < value < high
-            assert set(point["r2"][case]) == {"n_i", "n_n"}
-            assert set(point["refined"][case]) == names | {"status", "loss", "ci95", "r2"}
-        assert set(point["searched"]["each point"]) == {"n_i", "n_n"}
-    assert points[2]["constrained"]["g_inj"] < points[1]["constrained"]["g_inj"]
-    assert set(summary["laws"]["constrained"]) == ESTIMATES["constrained"]
-    for law in summary["laws"]["constrained"].values():
-        assert len(law["terms"]) == 1  # of three points
-
-
-def test_the_headline_is_the_fit_that_misses_left_out_points_least(folder: Path) -> None:
-    usable = pd.read_csv(folder / "tables" / "quantities.csv").query("usable")
-    n_done = usable.groupby("fit").size() // usable.groupby("fit")["quantity"].nunique()
-    laws = summary_of(folder)["laws"]
-    errors = {
-        fit: np.mean([law["search_error"] for law in by_quantity.values()])
-        for fit, by_quantity in laws.items()
-        if n_done[fit] == n_done.max()
-    }
-    best = min(errors, key=lambda fit: errors[fit])
-    (said,) = re.findall(r"that oscillate, by the fit (.*)", (folder / "run.log").read_text())
-    assert said == best.replace("_", ", ")
-
-
-def test_one_support_serves_all_points(folder: Path) -> None:
-    summary = summary_of(folder)
-    joint = summary["joint"]
+    points = [(p["V_D_V"], p["mdot_mg_s"]) for p in summary["points"]]
+    assert points == [(200, 5), (300, 2), (300, 4), (300, 5), (400, 5)]
     for point in summary["points"]:
-        for state, terms in point["searched"]["all points"].items():
-            assert set(terms) == set(joint["terms"][state])
-    # Three points fix three coefficients of a law: it passes through all of them.
-    tied = pd.read_csv(folder / "tables" / "tied.csv")
-    assert len(tied) == 2 * 3
-    np.testing.assert_allclose(tied["r2_tied"], tied["r2_free"], rtol=1e-6)
-    law = joint["tied"]["n_n"]
-    assert all(set(of) == {"1", "V_D_V", "mdot_mg_s"} for of in law.values())
+        assert point["status"] == "oscillating"
+        assert 8.0 < point["f_kHz"] < 25.0
+    assert [each["fit"] for each in summary["fits"]] == FITS * 5
+    for each in summary["fits"]:
+        assert max(each["r2_n_i"], each["r2_n_n"]) <= 1.0
+        assert (each["loss"] is None) == (each["status"] == "fitted")
+    names = {(fit, q) for fit in FITS for q in ESTIMATES[of(fit)]}
+    at = {(q["V_D_V"], q["mdot_mg_s"], q["fit"], q["quantity"]): q for q in summary["quantities"]}
+    assert set(at) == {(*point, *name) for point in points for name in names}
+    for each in at.values():
+        assert each["low"] < each["value"] < each["high"]
+    injected = [at[300, m, "constrained", "g_inj"]["value"] for m in (2, 4, 5)]
+    assert injected == sorted(injected)
+
+
+def test_control_laws_have_one_term_of_five_points(folder: Path) -> None:
+    laws = summary_of(folder)["control_laws"]
+    assert {(law["fit"], law["quantity"]) for law in laws} == {
+        (fit, name) for fit in FITS for name in ESTIMATES[of(fit)]
+    }
+    for law in laws:
+        assert re.fullmatch(rf"{law['quantity']} = \S+( \S+)?", law["law"])
+        assert 0.0 < law["search_error"] < 1.0
+
+
+def test_the_headline_is_the_fit_that_errs_least_at_points_left_out(folder: Path) -> None:
+    """And what the other fits have there stands beside it."""
+    summary, log = summary_of(folder), (folder / "run.log").read_text()
+    errors = summary["law"]["errors"]
+    assert sorted(errors) == sorted(FITS)
+    best = min(errors, key=lambda fit: errors[fit])
+    assert summary["best_fit"] == best
+    spoken = {fit: of(fit) + " (refined)" * fit.endswith("_refined") for fit in FITS}
+    said = " ".join(log.split())
+    assert f"over 5 operating points that oscillate, by the fit {spoken[best]}" in said
+    _, _, compared = said.rpartition("Errors where left out: ")
+    for fit, error in errors.items():
+        assert f"{spoken[fit]} {error:.3g}" in compared
+    assert summary["law"]["left_out"]["window_error"] == errors[summary["law"]["fit"]]
 
 
 def test_each_point_is_simulated_where_it_operates(folder: Path) -> None:
     names = sorted(path.name[:19] for path in (folder.parents[1] / "cache").iterdir())
-    assert names == ["thruster_200V_5mgs_", "thruster_300V_2mgs_", "thruster_300V_5mgs_"]
+    points = ("200V_5", "300V_2", "300V_4", "300V_5", "400V_5")
+    assert names == [f"thruster_{point}mgs_" for point in points]
 
 
 def test_tables_figures_and_page_are_written(folder: Path) -> None:
     quantities = pd.read_csv(folder / "tables" / "quantities.csv")
-    at = quantities.set_index(["V_D_V", "mdot_mg_s", "fit", "quantity"])["thesis"]
-    assert at[200.0, 5.0, "constrained", "g_inj"] == 2.72e23
-    assert at[300.0, 2.0, "free", "eps_n"] == 0.67
-    assert np.isnan(at[300.0, 2.0, "free_refined", "eps_n"])
+    at = quantities.set_index(["V_D_V", "mdot_mg_s", "fit", "quantity"])
+    assert at["thesis"][200.0, 5.0, "constrained", "g_inj"] == 2.72e23
+    assert at["thesis"][300.0, 2.0, "free", "eps_n"] == 0.67
+    assert np.isnan(at["thesis"][300.0, 2.0, "free_refined", "eps_n"])
     trends = pd.read_csv(folder / "tables" / "trends.csv")
-    exponents = trends.set_index(["along", "fit", "quantity"])
-    # Between two points an exponent is a ratio of logarithms; the thesis's from all its points.
-    points = [p["free"]["g_inj"] for p in summary_of(folder)["points"]]
-    row = exponents.loc["mdot_mg_s", "free", "g_inj"]
-    assert row["exponent"] == pytest.approx(np.log(points[1] / points[2]) / np.log(2.5))
-    assert np.isnan([row["low"], row["high"], row["r2"]]).all()
+    row = trends.set_index(["along", "fit", "quantity"]).loc["mdot_mg_s", "free", "g_inj"]
+    # The line at 300 V, which has most points; the thesis's exponent is from all of its points.
+    values = [at["value"][300.0, m, "free", "g_inj"] for m in (2.0, 4.0, 5.0)]
+    slope, _ = np.polyfit(np.log([2.0, 4.0, 5.0]), np.log(values), 1)
+    assert (row["n_points"], row["exponent"]) == (3, pytest.approx(slope))
+    assert row["low"] < row["exponent"] < row["high"]
     assert row["thesis"] == pytest.approx(0.98, abs=0.01)
-    for name in ("points", "laws", "coefficients", "supports"):
+    for name in ("points", "fits", "coefficients_alone", "control_laws", "laws", "coefficients"):
         assert len(pd.read_csv(folder / "tables" / f"{name}.csv"))
+    trials = pd.read_csv(folder / "tables" / "trials.csv")
+    assert (trials["fit"].tolist(), trials["chosen"].sum()) == (FITS, 1)
     page, log = (folder / "report.html").read_text(), (folder / "run.log").read_text()
-    for case in ("free", "constrained"):
-        assert (folder / "figures" / f"trends_{case}.png").is_file()
-        assert f'id="figure-trends_{case}"' in page
+    for name in ("free", "constrained"):
+        assert (folder / "figures" / f"trends_{name}.png").is_file()
+        assert f'id="figure-trends_{name}"' in page
     assert re.search(r"g_inj = [^=\[]* \[m\^-3 s\^-1\] \(", " ".join(log.split()))
     assert "<msub><mi>L</mi><mrow><mi>m</mi></mrow></msub><mo>=</mo>" in page  # a law
 
@@ -202,14 +204,15 @@ def test_own_files_and_points_that_do_not_oscillate(tmp_path: Path) -> None:
     summary = found.summary
     assert [p["status"] for p in summary["points"]] == ["oscillating"] * 2 + ["steady"] * 2
     assert [p["dt_s"] for p in summary["points"][:3]] == pytest.approx([1.5e-6, 2e-6, 1.5e-6])
-    steady = summary["points"][2]
-    assert steady["constrained"] == {"L_m": None, "g_inj": None, "eps": None}
-    assert steady["ci95"]["free"] is None
-    assert summary["laws"] == {}
+    assert {each["V_D_V"] for each in summary["fits"]} == {200.0, 300.0}
+    assert {each["V_D_V"] for each in summary["quantities"]} == {200.0, 300.0}
+    assert summary["control_laws"] == []
+    (warning,) = [text for text in found.warnings if "no law of whole models" in text]
+    assert "2 points that oscillate get no law" in warning
     assert {row["n_points"] for row in summary["trends"] if row["along"] == "V_D_V"} == {2}
     said = " ".join(found.log.split())
-    assert "V_D_V=400, mdot_mg_s=5: steady; 1000 samples of 1.5 µs; left out of t" in said
-    assert "one: 2 points fitted; a law needs 3" in said
+    assert "2 oscillating 2 steady at V_D_V, mdot_mg_s = (400, 5), (500, 5)" in said
+    assert "None: a law needs 3 points, and all parameters to vary over them" in said
 
 
 def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:
@@ -217,7 +220,8 @@ def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:
     folder = run_config(composed(*own_files(tmp_path, still), "trajectory.zone=null"))
     assert not (folder / "figures").exists()
     log = " ".join((folder / "run.log").read_text().split())
-    assert "None: 0 points fitted; a law needs 3" in log
+    assert "none of the 1 operating points oscillates (steady), so there is no fit" in log
+    assert "Found: no control laws over 0 operating points" in log
     assert summary_of(folder)["points"][0]["status"] == "steady"
 
 

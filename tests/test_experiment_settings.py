@@ -11,7 +11,6 @@ from ep2sindy.app.runner import run_config
 from tests.programs import composed
 from tests.test_pages import TOYS
 
-LIBRARY_KEYS = "library may have ['degree', 'products', 'variables'] and needs variables and degree"
 TWICE = "points=[{V_D_V: 300, mdot_mg_s: 5},{V_D_V: 300.0, mdot_mg_s: 5}]"
 ALIKE = "points=[{V_D_V: 1, mdot_mg_s: 5},{V_D_V: 2, mdot_mg_s: 5}]"
 LINE = "{V_D_V: 300, mdot_mg_s: [4, 5, 6, 7]}"
@@ -48,16 +47,11 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
         ("parametric", [TWICE], "an operating point may come once: V_D_V=300, mdot_mg_s=5 comes"),
         ("parametric", ["parameters.V_D_V=null", ALIKE], "points must differ in their data: V_D"),
         ("parametric", ["parameters.V_D_V=operating_point.volts"], "volts must be there"),
-        ("parametric", ["cases=null"], "cases must be like {free: {relations: [], quantities:"),
-        ("parametric", ["cases.free.quantities.L_m.power=3"], "the power 1 or -1"),
-        ("parametric", ["bootstrap.n_draws=5"], "a 95 % interval needs 40 draws or more"),
-        ("parametric", ["+library.variables_if_present=[u_ir]"], LIBRARY_KEYS),
-        ("parametric", ["trends=[{along: V_D_V, at: {}}]"], "a trend goes along one parameter"),
-        (
-            "parametric",
-            ["+figures.panels=[[L]]"],
-            "figures may have ['labels'] and needs labels: ['labels', ",
-        ),
+        ("parametric", ["models.free.quantities.L_m.power=3"], "the power 1 or -1"),
+        ("parametric", ["models.free.quantities.L_m.coefficient='n_i: 1'"], "'1' is not in"),
+        ("parametric", ["windows.n_windows=0"], "windows.n_windows must be a whole number, one or"),
+        ("parametric", ["law=0"], "law must be a whole number, one or more: 0 came"),
+        ("parametric", ["thesis.free=[{V_D_V: 200}]"], "thesis must give ['V_D_V', 'mdot_mg_s']"),
         ("pointwise", ["bootstraps.n=0"], "a pointwise study needs bootstraps for its spread"),
         ("pointwise", ["outline.inner_radius=0.06"], "inner_radius must be below outer_radius"),
         ("pointwise", ["terms=[n_i-n_n]"], "a term is variables joined by *"),

@@ -11,7 +11,7 @@ import pytest
 from ep2sindy.app.arguments import mend
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.run_files import FilePattern, propose_pattern
-from ep2sindy.studies import parametric, predict
+from ep2sindy.studies.points import Study
 from tests.models import lienard
 from tests.programs import Computed, composed, computed, ended
 
@@ -132,8 +132,8 @@ def predicted(folder: Path, terms: str, *more: str) -> Computed:
     return computed(
         composed(
             "+exp=predict", "data=recognised", mend("points.files=a{a}.csv"), "~models",
-            f"+models.own.terms={terms}", "degrees=[1]", "windows.n_windows=4", "map_points=2",
-            "forecasts=0", "parallel=serial", f"output={folder}",
+            f"+models.own.terms={terms}", "law=1", "windows={n_windows: 4, periods: 2.0}",
+            "map_points=2", "parallel=serial", f"output={folder}",
             *more,
         )
     )  # fmt: skip
@@ -146,8 +146,8 @@ def test_files_make_a_law_over_the_quantity_of_their_names(here: Path) -> None:
         here, "{n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}", "+models.own.known={n_n:{n_i:{1:1.0}}}"
     )
     assert found.outcome.tables()["points"]["a"].tolist() == [0.6, 0.9, 1.2]
-    (branch,) = found.outcome.branches.values()
-    assert branch.law.model_at({"a": 1.0}).terms("n_i")["n_i"] == pytest.approx(1.0, abs=1e-3)
+    law = found.outcome.law.law
+    assert law.at(a=1.0).terms("n_i")["n_i"] == pytest.approx(1.0, abs=1e-3)
     assert "left out, for their names hold no number there: aold.csv" in found.log
     assert not [text for text in found.warnings if "lives by the law" in text]
     said = "models hold a known inflow, models.own.known.n_n.n_i.1=1, which as shipped is"
@@ -176,9 +176,9 @@ def test_an_inspection_of_a_glob_writes_the_list_and_the_command(
     assert "ep2sindy +exp=predict data=mine 'points.files=a{a}.csv'" in capsys.readouterr().out
     config = composed("+exp=predict", "data=recognised", mend("points.files=a{a}.csv"))
     with pytest.raises(ValueError, match="models.inflow cannot hold"):  # its inflow has mdot_mg_s
-        study_of(predict.Study, config)
+        study_of(Study, config)
     (line,) = re.findall(r"ep2sindy (\+exp=.*)", said)  # and no experiment on all as one system
-    study = study_of(predict.Study, composed(*map(mend, shlex.split(line))))
+    study = study_of(Study, composed(*map(mend, shlex.split(line))))
     assert list(study.models) == ["free"]
 
 
@@ -192,8 +192,7 @@ def test_points_of_a_thruster_are_proposed_to_both_studies_of_points(
         table.to_csv(here / f"V{V}_m5.csv", index=False)
     assert not ended("inspect", "V*.csv", "--plasma")
     assert re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out) == [
-        "+exp=parametric data=recognised 'points.files=V{V}_m5.csv' data.plasma=true "
-        "thesis=null 'trends=[]'",
+        "+exp=parametric data=recognised 'points.files=V{V}_m5.csv' data.plasma=true thesis=null",
         "+exp=predict data=recognised 'points.files=V{V}_m5.csv' data.plasma=true "
         "'~models.inflow' '~models.conserving' '~models.leaving'",
     ]
@@ -203,7 +202,7 @@ def test_points_of_a_thruster_are_proposed_to_both_studies_of_points(
     ("more", "message"),
     [
         ([], "points of files need data that are read from files: .*simulate came .* data=recogni"),
-        (["data=recognised"], r"a trend goes along one parameter .*\['a'\].* trends=\[\] leaves"),
+        (["data=recognised"], r"thesis must give \['a'\] and quantities at every point, or be"),
     ],
 )
 def test_settings_that_do_not_go_with_files_are_refused(
@@ -213,5 +212,5 @@ def test_settings_that_do_not_go_with_files_are_refused(
     typed = ["+exp=parametric", mend("points.files=a{a}.csv"), *more]
     config = composed(*typed)
     with pytest.raises(ValueError, match=message) as refused:
-        study_of(parametric.Study, config)
+        study_of(Study, config)
     assert not re.search(r"\?\?\?", str(refused.value))

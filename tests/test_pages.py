@@ -61,7 +61,7 @@ TOYS: dict[str, Toy] = {
     ],
     "ils": test_experiment_ils.toy,
     "parametric": lambda _, output: [
-        *test_experiment_parametric.toy(output), test_experiment_parametric.THREE,
+        *test_experiment_parametric.toy(output), test_experiment_parametric.POINTS,
     ],
     "pointwise": lambda path, output: [
         *test_experiment_pointwise.on_file(path, output), "data.r.name=null",

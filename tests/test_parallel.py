@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import psutil
 import pytest
 from threadpoolctl import threadpool_info
 
 from ep2sindy.runtime import parallel
 from ep2sindy.runtime.parallel import Dask, Loky, Serial, Workers, collect, rows_in_order, run_alike
+from tests.models import lienard
+from tests.programs import composed, computed
 
 PATIENCE_S = 300.0  # for what comes at once on an idle machine: only what hangs is longer
 PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
@@ -113,6 +116,25 @@ def test_results_come_in_the_order_of_their_pieces_and_are_told_as_they_come() -
 
 def test_a_piece_has_one_thread(workers: Workers) -> None:
     assert set(dict(workers.run(n_threads, range(2))).values()) == {1}
+
+
+def test_a_study_of_points_finds_the_same_numbers_on_dask(address: str, tmp_path: Path) -> None:
+    """Its fits, laws of the points left out, and the map of its law."""
+    for a in (0.6, 0.9, 1.2):
+        table = lienard(a).to_dataframe().set_axis(["n_i [m^-3]", "n_n [m^-3]"], axis=1)
+        table.to_csv(tmp_path / f"a{a}.csv", index_label="time [s]")
+    given = [
+        "+exp=predict", "data=recognised", f"points.files={tmp_path}/a{{a}}.csv", "~models",
+        "+models.own.terms={n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}", "law=1", "map_points=3",
+        "windows={n_windows: 4, periods: 2.0}", "keep=false", f"output={tmp_path}",
+    ]  # fmt: skip
+    dask = ["parallel=dask", f"parallel.address='{address}'", f"parallel.timeout_s={PATIENCE_S}"]
+    apart, alone = (computed(composed(*given, *own)) for own in (dask, ["parallel=serial"]))
+    assert {name for name, table in apart.outcome.tables().items() if len(table)} >= {
+        "fits", "trials", "left_out", "map",
+    }  # fmt: skip
+    for name, table in apart.outcome.tables().items():
+        pd.testing.assert_frame_equal(table, alone.outcome.tables()[name], check_exact=True)
 
 
 def test_the_error_of_a_piece_arrives(workers: Workers) -> None:

@@ -105,7 +105,7 @@ def test_whoever_is_not_asked_is_silent(prey: ep.Trajectory, capfd: pytest.Captu
     simulators = {name for name, default in asking.items() if default is True}
     assert simulators == {"simulate", "simulate_2d"}
     assert {asking[name] for name in set(asking) - simulators} == {False}
-    assert {"discover", "estimate", "refine", "pointwise", "discover_shared"} <= set(asking)
+    assert {"discover", "estimate", "refine", "pointwise"} <= set(asking)
     ep.discover(prey, LIBRARY, regression())
     assert capfd.readouterr() == ("", "")
 

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.nelder_mead import NelderMead
 from benchmarks.refine import START, STATES, TRUTH, breathing_states, contaminated
+from ep2sindy.refinement.judge import is_stationary
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import Iteration, Method
@@ -289,6 +290,21 @@ def test_terms_that_the_data_cannot_tell_apart_are_unidentifiable() -> None:
     states = (x + 1e-3 * rng.standard_normal(100))[:, None]
     data = ep.Trajectory(t, states, ["x"], x[:, None], ["u"])
     assert ep.refine(model, [data], window=20, n_windows=5, seed=rng).status == "unidentifiable"
+
+
+@pytest.mark.parametrize(
+    ("off", "change", "stationary"),
+    [
+        (1.0, 1e-2, False),  # one more step removes a part of the loss, and moves a scaling
+        (1.0, 1e-4, True),  # it removes some of the loss, but moves no scaling: a clean record
+        (1e-2, 1e-2, True),  # it moves a scaling without gain: one that the data do not determine
+    ],
+)
+def test_a_fit_is_stationary_in_its_loss_or_in_its_scalings(
+    off: float, change: float, stationary: bool
+) -> None:
+    rows = np.array([[[100.0 * off, 1.0]]])  # one window: derivative by the scaling, and residual
+    assert is_stationary(rows, np.array([change]), np.ones(1)) == stationary
 
 
 def test_start_that_blows_up_is_a_result() -> None:

@@ -144,7 +144,7 @@ def point_commands(
     """Commands that study the files as operating points. n_enough: of these, for a prediction."""
     lines = []
     if not found.lacking(NEEDS["parametric"]):
-        more = ["thesis=null", "trends=[]", *channel(found), *preparation(found)]
+        more = ["thesis=null", *channel(found), *preparation(found)]
         lines.append(["+exp=parametric", *data, *more])
     # Laws of degree one must fit, with each point left out in turn.
     if not found.lacking(NEEDS["predict"]) and n_points >= n_enough:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
@@ -18,15 +17,12 @@ from ep2sindy.discovery.result import Discovery
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.library.roles import Roles
-from ep2sindy.operating.law import NOTHING, Known
+from ep2sindy.operating.law import NOTHING, Known, LawFunctions
 from ep2sindy.operating.records import group_by_point, most_central, read_points
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_kind
-
-# The degree of polynomials of the parameters, functions of them, or those chosen of many.
-LawFunctions = int | Library | Literal["auto"]
 
 
 @one_thread()

@@ -19,15 +19,16 @@ from ep2sindy.library.relations import Constraint, Relation
 from ep2sindy.operating.law import (
     Known,
     LawConstraint,
+    LawFunctions,
     OperatingLaw,
     constrain_law,
     law_of_constraint,
 )
-from ep2sindy.operating.left_out import fewest_of_least
-from ep2sindy.operating.point_fits import LawFunctions, PointFits, fit_rows, fit_trajectories
+from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
 from ep2sindy.operating.records import most_central, read_points
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.regression.ambiguity import ambiguities
+from ep2sindy.regression.pooled import fewest_of_least
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.progress import Progress, count_pieces

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -34,6 +34,9 @@ FORMAT = "ep2sindy.OperatingLaw/1"
 # State -> term -> function of the parameters -> its factor, as in `OperatingLaw.numbers`.
 Known = Mapping[str, Mapping[str, Mapping[str, float]]]
 NOTHING: Known = MappingProxyType({})
+
+# The degree of polynomials of the parameters, functions of them, or those chosen of many.
+LawFunctions = int | Library | Literal["auto"]
 
 INSIDE = 1e-6  # tolerance of the hull, in ranges of the parameters
 

@@ -101,23 +101,6 @@ def run_left_out(trial: LawTrial, records: Sequence[OperatingRecord]) -> list[Le
     return runs
 
 
-def fewest_of_least(trials: Sequence[tuple[Float[np.ndarray, " points"], int]]) -> int:
-    """Index of the trial with fewest numbers whose mean error cannot be told from the least.
-
-    trials: errors at each point, and a count of numbers. The difference of the errors from the
-    least, point by point, must be within one standard error.
-    """
-    means = [float(errors.mean()) for errors, _ in trials]
-    best = min(range(len(trials)), key=lambda k: (means[k], trials[k][1]))
-    near = []
-    for k, (errors, _) in enumerate(trials):
-        apart = errors - trials[best][0]
-        reach = apart.std(ddof=1) / np.sqrt(len(apart)) if len(apart) > 1 else 0.0
-        if apart.mean() <= reach:
-            near.append(k)
-    return min(near, key=lambda k: (trials[k][1], means[k]))
-
-
 def error_statistics(left_out: Sequence[LeftOutRun]) -> dict[str, float | int]:
     """Statistics of the runs at points left out: counts, medians, and the 90 % quantile.
 

@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, product
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +17,13 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.law import LawConstraint, OperatingLaw, make_basis, read_coefficients
+from ep2sindy.operating.law import (
+    LawConstraint,
+    LawFunctions,
+    OperatingLaw,
+    make_basis,
+    read_coefficients,
+)
 from ep2sindy.refinement.judge import RefinementStatus
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine
@@ -28,9 +33,6 @@ from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.progress import SILENT, Progress
 
 Problems = Sequence[Sequence[RegressionRows]]  # for each point, the rows of every equation
-
-# The degree of polynomials of the parameters, functions of them, or those chosen of many.
-LawFunctions = int | Library | Literal["auto"]
 
 # Of refinements whose coefficients tell nothing.
 FAILED = (RefinementStatus.NON_FINITE, RefinementStatus.FLAT, RefinementStatus.MAX_ITER)

@@ -19,7 +19,7 @@ from ep2sindy.library.units import unit_product
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.records import check_varying
-from ep2sindy.regression.pooled import Basis
+from ep2sindy.regression.pooled import Basis, fewest_of_least
 from ep2sindy.runtime.values import check_count, read_only
 
 LEVEL = 0.95  # level of all intervals in this file
@@ -160,9 +160,10 @@ def fit_control_law(
 ) -> ControlLaw:
     """Find the terms of a library that predict best at points left out of their fit.
 
-    Minimises the mean square of r_p / (1 - h_p) over all supports of up to `max_terms` terms, with
-    r_p the residual of the point p in a least-squares fit, h_p its diagonal of the hat matrix, and
-    so r_p / (1 - h_p) its residual in the fit to the other points.
+    Minimises the mean of |r_p| / (1 - h_p) over all supports of up to `max_terms` terms, with r_p
+    the residual of the point p in a least-squares fit, h_p its diagonal of the hat matrix, and so
+    r_p / (1 - h_p) its residual in the fit to the other points. Of supports within one standard
+    error of the least, point by point, the one of fewest terms is taken.
     Assumes errors of equal variance at all points.
     max_terms: None allows one term for every three points; never more than leave two points over,
     nor more than the library has. A support to which one point is indispensable is left out.
@@ -208,22 +209,28 @@ def _check(
 def _search(
     values: np.ndarray, theta: np.ndarray, max_terms: int | None
 ) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Columns of least leave-one-out error, their coefficients, and values at points left out.
+    """Columns of a law, their coefficients, and values at points left out.
 
-    Of supports that are equal up to rounding, the one of fewest columns is taken.
+    Of all supports up to a size, one of fewest terms whose error cannot be told from the least.
     """
     n_points, n_terms = theta.shape
     largest = max(1, min(n_terms, n_points - 2, max_terms or n_points // POINTS_PER_TERM))
     floor = ROUNDING * np.sqrt(np.square(values).mean())
-    best, lowest = ([0], np.full_like(values, np.inf)), np.inf
+    found: list[tuple[list[int], np.ndarray]] = []
     for size in range(1, largest + 1):
         for support in map(list, combinations(range(n_terms), size)):
             with suppress(ValueError):  # the points do not tell these columns apart
                 left_out = Basis(theta[:, support]).predict_left_out(values)
-                error = max(_rms(values - left_out), floor)
-                if error < lowest:
-                    best, lowest = (support, left_out), error
-    return best[0], least_squares(theta[:, best[0]], values), best[1]
+                if np.isfinite(left_out).all():
+                    found.append((support, left_out))
+    if not found:
+        return [0], least_squares(theta[:, :1], values), np.full_like(values, np.inf)
+    errors = [np.maximum(np.abs(values - left_out), floor) for _, left_out in found]
+    best = fewest_of_least(
+        [(own, len(support)) for own, (support, _) in zip(errors, found, strict=True)]
+    )
+    support, left_out = found[best]
+    return support, least_squares(theta[:, support], values), left_out
 
 
 def _rms(errors: np.ndarray) -> float:

@@ -14,7 +14,7 @@ from scipy.special import ndtri, stdtrit
 from ep2sindy.estimation.noise import are_noise
 from ep2sindy.refinement.kernels import condense, propagate
 from ep2sindy.refinement.methods.multiple_shooting import least_change, step_maps
-from ep2sindy.refinement.problem import LawMap, Method, RefinementFit, RefinementProblem
+from ep2sindy.refinement.problem import Method, RefinementFit, RefinementProblem
 from ep2sindy.refinement.steps import integrate
 from ep2sindy.refinement.windows import WindowBatch
 
@@ -54,19 +54,23 @@ def status_of(
     finite: bool,
     flat: bool,
     unidentifiable: bool,
-    settled: bool,
     coarse: Callable[[], bool],
+    settled: bool,
 ) -> RefinementStatus:
-    """Most severe status that applies; the time step is checked only if nothing else is wrong."""
+    """The first status that applies, in the order of the arguments.
+
+    A coarse time step comes before a fit that has not settled: it may be why, and shorter steps
+    continue the fit. So max_iter says that the step is short enough.
+    """
     if not finite:
         return RefinementStatus.NON_FINITE
     if flat:
         return RefinementStatus.FLAT
     if unidentifiable:
         return RefinementStatus.UNIDENTIFIABLE
-    if not settled:
-        return RefinementStatus.MAX_ITER
-    return RefinementStatus.COARSE_STEP if coarse() else RefinementStatus.CONVERGED
+    if coarse():
+        return RefinementStatus.COARSE_STEP
+    return RefinementStatus.CONVERGED if settled else RefinementStatus.MAX_ITER
 
 
 def is_flat(
@@ -79,18 +83,17 @@ def is_flat(
 
 @dataclass(frozen=True, eq=False)
 class RefinementVerdict:
-    """Assessment of one operating point of a fit, or of all points of a law.
+    """Assessment of one point of a fit.
 
-    window_loss: mean square of (trajectory - data) / std in each window, point after point.
-    covariance, covariance_naive: covariances of the unknowns, which are the scalings of a point or
-    the theta of a law. explains: (n_states,), whether the residuals are noise; else intervals would
-    tell how far another stretch of the record moves a wrong model.
+    window_loss: mean square of (trajectory - data) / std in each window. covariance,
+    covariance_naive: covariances of the scalings. explains: (n_states,), whether the residuals are
+    noise; else intervals would tell how far another stretch of the record moves a wrong model.
     """
 
     status: RefinementStatus
     window_loss: Float[np.ndarray, " windows"]
-    covariance: Float[np.ndarray, "unknowns unknowns"]
-    covariance_naive: Float[np.ndarray, "unknowns unknowns"]
+    covariance: Float[np.ndarray, "free free"]
+    covariance_naive: Float[np.ndarray, "free free"]
     explains: Bool[np.ndarray, " n_states"]
 
 
@@ -99,88 +102,69 @@ def fit_and_judge(
 ) -> tuple[RefinementFit, list[RefinementVerdict]]:
     """Fit, halving the time step as long as necessary, and judge the integrated trajectories.
 
-    Returns the fit, and a verdict for each point or a single one if the points share a law.
+    Returns the fit, and a verdict for each point.
     """
-    fit = method.fit(problem)
-    closed, verdicts = judge(problem, fit)
+    fit, verdicts = judge(problem, method.fit(problem))
     while any(coarse := [v.status is RefinementStatus.COARSE_STEP for v in verdicts]):
-        points = np.flatnonzero(np.broadcast_to(coarse, len(problem.equations)))
-        again = method.finer(problem, closed if problem.law is None else fit, points)
+        again = method.finer(problem, fit, np.flatnonzero(coarse))
         if again is None:
             break
-        fit = again
-        closed, verdicts = judge(problem, fit)
-    return closed, verdicts
+        fit, verdicts = judge(problem, again)
+    return fit, verdicts
 
 
 def judge(
     problem: RefinementProblem, fit: RefinementFit
 ) -> tuple[RefinementFit, list[RefinementVerdict]]:
-    """Integrate the fit again, and return it with verdicts on its points.
-
-    There is one verdict for each point, or a single one if the points share a law. If one point
-    blows up, all points that share its law count as not finite.
-    """
+    """Integrate the fit again, and return it with a verdict on each point."""
     fit, maps = follow(problem, fit)
     sound = maps if fit.finite.all() else np.where(np.isfinite(maps), maps, 0.0)
     condensed = condense(sound, fit.nodes, problem.data, fit.weights, problem.n_start)
     triangles = condensed[:, :, problem.n_start :, problem.n_start :]
     overflown = ~np.isfinite(triangles).all(axis=(1, 2, 3))
     triangles[overflown] = 0.0
-    fit = replace(fit, finite=problem.agree(fit.finite & ~overflown, np.all))
-    bias = least_change(step_triangles(problem, fit, sound), problem.law)
-    change = least_change(triangles, problem.law)
-    points = np.arange(len(problem.equations))
-    if problem.law is not None:
-        rows = problem.law.rows(triangles)
-        rows = rows.reshape(-1, *rows.shape[2:])
-        return fit, [_judge_points(problem, fit, problem.law, points, rows, bias, change)]
+    fit = replace(fit, finite=fit.finite & ~overflown)
+    bias = least_change(step_triangles(problem, fit, sound))
+    change = least_change(triangles)
     verdicts = []
     for p, equations in enumerate(problem.equations):
         n_free = equations.n_free
         rows = triangles[p][..., np.append(np.arange(n_free), -1)]
-        law, unknowns = LawMap.identity(n_free), (bias[p, :n_free], change[p, :n_free])
-        verdicts.append(_judge_points(problem, fit, law, points[[p]], rows, *unknowns))
+        verdicts.append(_judge_point(problem, fit, p, rows, bias[p, :n_free], change[p, :n_free]))
     return fit, verdicts
 
 
-def _judge_points(
+def _judge_point(
     problem: RefinementProblem,
     fit: RefinementFit,
-    law: LawMap,
-    points: np.ndarray,
+    point: int,
     rows: Float[np.ndarray, "windows size columns"],
-    bias: Float[np.ndarray, " unknowns"],
-    change: Float[np.ndarray, " unknowns"],
+    bias: Float[np.ndarray, " free"],
+    change: Float[np.ndarray, " free"],
 ) -> RefinementVerdict:
-    """Verdict on points that share their unknowns.
+    """Verdict on one point.
 
-    rows: each window's condensed residuals by the unknowns, right-hand side last.
-    bias: change of the unknowns that the error of the time step causes, to first order.
-    change: change of the unknowns in one more Gauss-Newton step.
+    rows: each window's condensed residuals by the scalings, right-hand side last.
+    bias: change of the scalings that the error of the time step causes, to first order.
+    change: change of the scalings in one more Gauss-Newton step.
     """
-    data = problem.data[points]
-    n_residuals = data.size - problem.n_start * len(rows) - law.n_theta
-    batch = WindowBatch.join([problem.batches[p] for p in points])
+    data, batch, scaling = problem.data[point], problem.batches[point], fit.scaling[point]
+    scaling = scaling[: len(change)]
+    n_residuals = data.size - problem.n_start * len(rows) - len(change)
     robust, naive = covariances(rows, batch, n_residuals=max(n_residuals, 1))
     with np.errstate(invalid="ignore", over="ignore"):
-        left = np.concatenate([fit.nodes[p] - problem.data[p] for p in points])
+        left = fit.nodes[point] - data
         window_loss = np.square(left).mean(axis=(1, 2))
-        samples = np.concatenate([problem.data[p] for p in points])
-        n = samples.shape[0] * samples.shape[1] / batch.multiplicity
-        explains = are_noise(list(samples), list(left), n)
+        n = data.shape[0] * data.shape[1] / batch.multiplicity
+        explains = are_noise(list(data), list(left), n)
     loss = float(window_loss.mean())
-    scaling = fit.scaling[points, : law.n_free]
-    by_point = law.spread @ robust @ law.spread.transpose(0, 2, 1)
-    error = np.sqrt(np.maximum(np.diagonal(by_point, axis1=1, axis2=2), 0.0))
-    stationary = is_stationary(rows, change, scaling_change=law.scaling(change), scaling=scaling)
-    steps = zip(law.scaling(bias), by_point, scaling, strict=True)
+    error = np.sqrt(np.maximum(np.diag(robust), 0.0))
     status = status_of(
-        finite=bool(fit.finite[points].all() and np.isfinite(loss)),
+        finite=bool(fit.finite[point] and np.isfinite(loss)),
         flat=is_flat(loss, data, free_start=problem.free_start),
-        unidentifiable=bool((~(error < WIDE * np.abs(scaling))).all(axis=0).any()),
-        settled=bool(fit.finished[points].all()) and stationary,
-        coarse=lambda: any(is_coarse(*step) for step in steps),
+        unidentifiable=bool((~(error < WIDE * np.abs(scaling))).any()),
+        coarse=lambda: is_coarse(bias, error, scaling),
+        settled=bool(fit.finished[point]) and is_stationary(rows, change, scaling),
     )
     return RefinementVerdict(status, window_loss, robust, naive, explains)
 
@@ -296,24 +280,25 @@ def step_triangles(problem: RefinementProblem, fit: RefinementFit, maps: np.ndar
 
 def is_stationary(
     rows: Float[np.ndarray, "windows size columns"],
-    change: Float[np.ndarray, " unknowns"],
-    *,
-    scaling_change: Float[np.ndarray, "points free"],
-    scaling: Float[np.ndarray, "points free"],
+    change: Float[np.ndarray, " free"],
+    scaling: Float[np.ndarray, " free"],
 ) -> bool:
     """Return true if one more Gauss-Newton step changes the loss, or all scalings, by very little.
 
-    rows: each window's condensed residuals by the unknowns, right-hand side last.
+    rows: each window's condensed residuals by the scalings, right-hand side last. change: of the
+    scalings in that step.
     """
     gain = np.square(rows[..., :-1] @ change).sum()
     share = gain / max(np.square(rows[..., -1]).sum(), 1e-300)
-    relative = np.abs(scaling_change / scaling).max() if scaling.all() else np.inf
+    relative = np.abs(change / scaling).max() if scaling.all() else np.inf
     return bool(min(share, relative) < STATIONARY)
 
 
-def is_coarse(bias: np.ndarray, covariance: np.ndarray, scaling: np.ndarray) -> bool:
-    """Return true if the error of the time step causes a significant bias in any scaling."""
-    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+def is_coarse(bias: np.ndarray, error: np.ndarray, scaling: np.ndarray) -> bool:
+    """Return true if the error of the time step causes a significant bias in any scaling.
+
+    error: standard errors of the scalings.
+    """
     allowed = np.maximum(BIAS_PER_ERROR * error, MIN_BIAS * np.abs(scaling))
     return bool((~(np.abs(bias) <= allowed)).any())
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, TypedDict, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import nn
 
-from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
@@ -25,11 +24,8 @@ from ep2sindy.refinement.windows import (
     cut_windows,
     dominant_window,
 )
-from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.progress import Advance, nothing
-from ep2sindy.runtime.values import read_only, set_counts
-
-Values = TypeVar("Values", bound=np.ndarray)
+from ep2sindy.runtime.values import set_counts
 
 
 class RefinementChanges(TypedDict, total=False):
@@ -173,77 +169,13 @@ def ignore(iteration: Iteration) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class LawMap:
-    """Coefficients that follow a law, as scalings: scalings of point p are spread[p] @ theta.
-
-    With coefficients z_p = W f(p), the row of coefficient k in spread[p] holds size_k q(p) / z0_pk
-    for the factors of that coefficient, with q the orthonormal basis of f and z0 the coefficients
-    at a scaling of one. theta: factors of q, coefficient by coefficient, in units of the
-    coefficient's RMS over the points. to_law: W.ravel() = to_law @ theta, in SI. start: initial
-    theta of a fit.
-    """
-
-    spread: Float[np.ndarray, "points free theta"]
-    to_law: Float[np.ndarray, "theta theta"]
-    start: Float[np.ndarray, " theta"]
-
-    def __post_init__(self) -> None:
-        for name in ("spread", "to_law", "start"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
-
-    @staticmethod
-    def of(
-        free0: Float[np.ndarray, "points free"],
-        basis: Basis,
-        law: Float[np.ndarray, "free functions"],
-    ) -> LawMap:
-        """Map for a basis and the initial values of a fit.
-
-        free0: values of the free coefficients at a scaling of one. law: the initial law. Both are
-        in SI.
-        """
-        size = zero_to_one(np.sqrt(np.square(free0).mean(axis=0)))
-        pairs = zip(free0, basis.orthonormal, strict=True)
-        spread = np.stack([np.kron(np.diag(size / own), q) for own, q in pairs])
-        to_law = basis.to_law(size)
-        return LawMap(spread, to_law, np.linalg.solve(to_law, law.ravel()))
-
-    @staticmethod
-    def identity(n_free: int) -> LawMap:
-        """Map of a single point without a law, whose unknowns are its scalings."""
-        return LawMap(np.eye(n_free)[None], np.eye(n_free), np.ones(n_free))
-
-    @property
-    def n_free(self) -> int:
-        return self.spread.shape[1]
-
-    @property
-    def n_theta(self) -> int:
-        return self.spread.shape[-1]
-
-    def scaling(self, theta: Float[np.ndarray, " theta"]) -> Float[np.ndarray, "points free"]:
-        return self.spread @ theta
-
-    def rows(
-        self, triangles: Float[np.ndarray, "points windows size size"]
-    ) -> Float[np.ndarray, "points windows size columns"]:
-        """Convert triangles of condensed residuals by scaling to rows by theta.
-
-        The right-hand side is the last column.
-        """
-        by_theta = triangles[..., :-1] @ self.spread[:, None]
-        return np.concatenate([by_theta, triangles[..., -1:]], axis=-1)
-
-
-@dataclass(frozen=True, eq=False)
 class RefinementProblem:
     """Models of the same states, with a batch of windows for each, on one device.
 
     equations: of each model in the units of its windows; `ode` is their module. free_start: true if
     the initial state of each window is fitted; otherwise it is the data's. n_reweights: number of
-    passes with weights 1/std of the residuals, after weights 1/std of the data. law: gives the
-    scalings of all points by the few unknowns of a law; None gives each point its own scalings.
-    correction: a term that is trained along, of the only point.
+    passes with weights 1/std of the residuals, after weights 1/std of the data. correction: a term
+    that is trained along, of the only point.
     """
 
     equations: tuple[ScaledEquations, ...]
@@ -251,7 +183,6 @@ class RefinementProblem:
     free_start: bool
     n_reweights: int
     observe: Callable[[Iteration], None]
-    law: LawMap | None = None
     device: str = "cpu"
     correction: nn.Module | None = None
 
@@ -312,10 +243,6 @@ class RefinementProblem:
         """Problem of a single point."""
         return replace(self, equations=(self.equations[point],), batches=(self.batches[point],))
 
-    def agree(self, values: Values, reduce: Callable[[Values], Any]) -> Values:
-        """Values by point; if the points share a law, all get the value given by `reduce`."""
-        return values if self.law is None else np.full_like(values, reduce(values))
-
     def _drive(self, *, one: bool) -> Drive:
         steps = np.stack([batch.steps for batch in self.batches])
         inputs = np.stack([batch.inputs for batch in self.batches])
@@ -339,9 +266,8 @@ class RefinementFit:
     scaling: padded with ones beyond a model's own scalings. nodes: the fitted trajectories at the
     samples, in std. weights: the last ones used. finished: true if the method's own convergence
     test was met. finite: False for points that did not stay finite. step: time-step scheme from
-    node to node. theta: unknowns of the law that determines the scalings, if any. memory: samples,
-    the longest memory of a stage that left no gaps, if the method has stages. maps: one-step maps
-    at the nodes, if they are known.
+    node to node. memory: samples, the longest memory of a stage that left no gaps, if the method
+    has stages. maps: one-step maps at the nodes, if they are known.
     """
 
     scaling: Float[np.ndarray, "points free"]
@@ -350,7 +276,6 @@ class RefinementFit:
     finished: np.ndarray
     finite: np.ndarray
     step: Step = ONE_RUNGE_KUTTA
-    theta: Float[np.ndarray, " theta"] | None = None
     memory: Int[np.ndarray, " points"] | None = None
     maps: np.ndarray | None = None
 

@@ -51,9 +51,11 @@ class Refinement:
     covariance_naive: the same for white, independent residuals.
     window_loss: mean square of (trajectory - data) / std in each window, integrated again from
     the fitted starts. loss: its mean; a constant has a loss of one.
-    status: converged; max_iter; coarse_step: the error of the time step biases a coefficient
-    significantly; unidentifiable: the 95 % interval of a free coefficient reaches zero; flat: no
-    better than a constant; non_finite: the given model is returned, without covariance.
+    status: converged; max_iter: not converged, though the time step is short enough; coarse_step:
+    converged or not, the error of the time step biases a coefficient significantly, and the method
+    cannot halve the step again; unidentifiable: the 95 % interval of a free coefficient reaches
+    zero; flat: no better than a constant; non_finite: the given model is returned, without
+    covariance.
     history: one entry per iteration. trajectories: the fitted states in SI, in windows of `batch`.
     message: for non_finite, flat and max_iter, at which stage (by its memory in samples, see
     `MultipleShooting`) and in which window the refinement failed; else why there are no intervals.
@@ -145,7 +147,7 @@ def refine(
     """
     settings = settings.override(changes)
     models, records = _by_model(model, trajectories)
-    relations = resolve_constraints(settings, models, constraints)
+    relations = _resolve_constraints(settings, models, constraints)
     batches = settings.cut(models, records, np.random.default_rng(seed))
     with as_progress(progress).stage(None, "iteration", "refinement") as advance:
         refinements: list[Refinement] = []
@@ -178,7 +180,7 @@ def _by_model(
     return models, [[run.complete() for run in runs] for runs in records]
 
 
-def resolve_constraints(
+def _resolve_constraints(
     settings: RefinementSettings,
     models: Sequence[SparseModel],
     constraints: Sequence[Constraint | None] | None,

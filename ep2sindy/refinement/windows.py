@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,8 +18,6 @@ from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum, steps_
 PERIODS = 1.5  # default length of a window, in periods of the dominant frequency
 
 MIN_SAMPLES = 5  # fewest samples in a window; fewer do not determine the dynamics
-
-BY_WINDOW = ("steps", "data", "inputs", "trajectory", "start")  # fields with an entry per window
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,22 +58,11 @@ class WindowBatch:
 
     def split(self) -> list[WindowBatch]:
         """Split into batches of one window each, in the same scale."""
-        values = {name: getattr(self, name) for name in BY_WINDOW}
-        numbers = range(len(self.start))
-        return [replace(self, **{k: v[[w]] for k, v in values.items()}) for w in numbers]
-
-    @staticmethod
-    def join(batches: Sequence[WindowBatch]) -> WindowBatch:
-        """The windows of all batches, no two of which share trajectories; keeps the first scale."""
-        offsets = np.cumsum([0, *(batch.trajectory.max() + 1 for batch in batches)])
-        apart = [
-            replace(batch, trajectory=batch.trajectory + offset)
-            for batch, offset in zip(batches, offsets[:-1], strict=True)
+        names = ("steps", "data", "inputs", "trajectory", "start")  # with an entry per window
+        return [
+            replace(self, **{name: getattr(self, name)[[w]] for name in names})
+            for w in range(len(self.start))
         ]
-        joined: dict[str, Any] = {
-            name: np.concatenate([getattr(b, name) for b in apart]) for name in BY_WINDOW
-        }
-        return replace(batches[0], **joined)
 
 
 def cut_windows(

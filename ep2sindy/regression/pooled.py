@@ -88,6 +88,23 @@ class Basis:
         return values - (left.T / (1.0 - leverage)).T
 
 
+def fewest_of_least(trials: Sequence[tuple[Float[np.ndarray, " points"], int]]) -> int:
+    """Index of the trial with fewest numbers whose mean error cannot be told from the least.
+
+    trials: errors at each point, and a count of numbers. The difference of the errors from the
+    least, point by point, must be within one standard error.
+    """
+    means = [float(errors.mean()) for errors, _ in trials]
+    best = min(range(len(trials)), key=lambda k: (means[k], trials[k][1]))
+    near = []
+    for k, (errors, _) in enumerate(trials):
+        apart = errors - trials[best][0]
+        reach = apart.std(ddof=1) / np.sqrt(len(apart)) if len(apart) > 1 else 0.0
+        if apart.mean() <= reach:
+            near.append(k)
+    return min(near, key=lambda k: (trials[k][1], means[k]))
+
+
 @dataclass(frozen=True, eq=False)
 class PooledFit:
     """A law fitted by `pool_rows`: `fit` of the unknowns, and their matrix `to_law`.

@@ -14,18 +14,18 @@ from jaxtyping import Float
 from ep2sindy.figures.operating import cycle_figure, frequency_scale, laws_figure, left_out_figure
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.given_models import REFINED
-from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.law import LawFunctions, OperatingLaw
 from ep2sindy.operating.left_out import (
     LawTrial,
     LeftOutRun,
     error_statistics,
-    fewest_of_least,
     run_left_out,
     window_errors,
 )
 from ep2sindy.operating.map import Fate, MapPoint, law_map, map_points
-from ep2sindy.operating.point_fits import LawFunctions, PointFits
+from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.operating.records import OperatingRecord, Point
+from ep2sindy.regression.pooled import fewest_of_least
 from ep2sindy.report.document import (
     Block,
     Captioned,
@@ -155,7 +155,7 @@ class FoundLaw:
             f"none of {len(self.runs)} points left out lives by the law of the others, so "
             "it predicts none between them: try points that lie closer together, other models, or "
             "models=null, longer records, and inputs that are states "
-            "(docs/predict.md)"
+            "(docs/parametric.md)"
         )
 
     def agreement(self, statuses: Mapping[str, bool]) -> tuple[int, int]:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from ep2sindy.data.quantities import STEP_DOUBT
 from ep2sindy.data.run_files import FilePattern
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
+from ep2sindy.operating.given_models import PointResult
 from ep2sindy.operating.records import Point, name_point
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, collect
@@ -18,11 +19,6 @@ from ep2sindy.signals.spectrum import Oscillation
 from ep2sindy.studies.source import DivergedError, Source, amiss, is_simulation, quiet
 from ep2sindy.studies.study import Check, Deferred
 
-QUIET = (
-    "their statuses are above; try the part of the records behind the start-up "
-    "('prepare=[{_target_:ep2sindy.prepare.crop,start_s:...}]'), another zone "
-    "(trajectory.zone.z=...), or other points"
-)
 WITHOUT_BREATHING = (  # attributes of a simulation
     Oscillation.STEADY, Oscillation.DECAYING, Oscillation.TRANSIT, Oscillation.DIVERGED,
 )  # fmt: skip
@@ -203,6 +199,17 @@ def open_points(
         for note in point.notes:
             run.warn(f"{point.label}: {note}")
     return points
+
+
+def nothing_moves(points: Sequence[OpenedPoint] | Sequence[PointResult]) -> str:
+    """Why there is nothing to fit where no point oscillates, and what to try."""
+    statuses = ", ".join(sorted({str(point.status) for point in points}))
+    return (
+        f"none of the {len(points)} operating points oscillates ({statuses}), so there is no fit: "
+        "try the part of the records behind the start-up "
+        "('prepare=[{_target_:ep2sindy.prepare.crop,start_s:...}]'), another zone "
+        "(trajectory.zone.z=...), or other points"
+    )
 
 
 def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:

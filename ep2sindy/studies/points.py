@@ -26,8 +26,7 @@ from ep2sindy.operating.given_models import (
     fit_models,
     fits_of,
 )
-from ep2sindy.operating.law import Known, constrain_law, make_basis
-from ep2sindy.operating.point_fits import LawFunctions
+from ep2sindy.operating.law import Known, LawFunctions, constrain_law, make_basis
 from ep2sindy.operating.quantities import Quantity
 from ep2sindy.operating.records import OperatingRecord, branches_of, read_points
 from ep2sindy.regression.formulations import Differential, RandomSplit, WeightedWeak
@@ -43,11 +42,11 @@ from ep2sindy.signals.trace import MIN_PERIODS, prepare_signal
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.law_tables import FoundLaw, find_law
 from ep2sindy.studies.point_sources import (
-    QUIET,
     GivenPoints,
     OpenedPoint,
     Points,
     given_points,
+    nothing_moves,
     open_points,
 )
 from ep2sindy.studies.quantity_tables import FoundQuantities, check_published
@@ -159,8 +158,6 @@ class Study:
             fitted.get(k, PointResult(point.parameters, point.status))
             for k, point in enumerate(opened)
         ]
-        if not any(result.fits for result in results):
-            run.warn("none of the operating points oscillates, so there is no fit: " + QUIET)
         found = Outcome(opened, results, given, None, {}, None, self.labels)
         has_quantities = any(model.quantities for model in given.values())
         try:
@@ -195,6 +192,8 @@ class Study:
                     known[point.label] = record, result
                 except ValueError as error:
                     run.warn(str(error))
+        if not any(result.fits for result in results):
+            raise ValueError(nothing_moves(results))
         if not known:
             raise ValueError(
                 f"a law needs records of {MIN_PERIODS:g} periods or more: none has them"
@@ -240,7 +239,7 @@ class Study:
         """
         runs = [point.run for point in opened if point.run is not None]
         if not runs:
-            raise ValueError("a search needs points that oscillate: none of these does; " + QUIET)
+            raise ValueError(nothing_moves(opened))
         sizes, n_best = (SIGNAL_SIZES, 2) if signal else (SIZES, 1)
         known = signal.terms if signal else {}
         library = polynomial(runs[0].state_names, degree=self.degree or (3 if signal else 2))

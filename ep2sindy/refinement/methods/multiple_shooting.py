@@ -14,7 +14,6 @@ from ep2sindy.refinement.kernels import (
 )
 from ep2sindy.refinement.problem import (
     Iteration,
-    LawMap,
     RefinementFit,
     RefinementProblem,
     ignore,
@@ -67,9 +66,7 @@ class MultipleShooting:
     A step must lower the sum of squared residuals plus a price times the gaps; if it does not, it
     is undone and the next one is damped (Levenberg-Marquardt), in units of what each scaling
     does to the trajectories. So no iteration leaves the finite numbers.
-    Each point has its own steps and leaves once it has converged. Points that share a law
-    move together: the point with the shortest allowed step sets the step of all. They have
-    converged when every point has, and failed when any point has.
+    Each point has its own steps and leaves once it has converged.
     tolerance: convergence requires the relative change of every scaling, and the gaps, to be
     below it.
     Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_7; Abarbanel et al. 2009,
@@ -87,15 +84,14 @@ class MultipleShooting:
     max_iter: int = 50
 
     def fit(self, problem: RefinementProblem) -> RefinementFit:
-        n_points, law = len(problem.data), problem.law
+        n_points = len(problem.data)
         start = RefinementFit(
-            scaling=np.ones((n_points, problem.n_free)) if law is None else law.scaling(law.start),
+            scaling=np.ones((n_points, problem.n_free)),
             nodes=problem.data,
             weights=np.ones((n_points, problem.data.shape[-1])),
             finished=np.zeros(n_points, dtype=np.bool_),
             finite=np.ones(n_points, dtype=np.bool_),
             step=self.step,
-            theta=None if law is None else law.start,
         )
         walk, points = _Walk(problem, start), np.arange(n_points)
         for memory in self.memories(walk.window):
@@ -140,13 +136,12 @@ class _Walk:
     def __init__(self, problem: RefinementProblem, start: RefinementFit) -> None:
         points = np.arange(len(start.nodes))
         self.problem, self.step, self.window = problem, start.step, problem.data.shape[2]
-        self.scaling, self.nodes, self.theta = start.scaling.copy(), start.nodes.copy(), start.theta
+        self.scaling, self.nodes = start.scaling.copy(), start.nodes.copy()
         self.weights, self.finished = start.weights, start.finished.copy()
         self.memory = np.ones_like(points) if start.memory is None else start.memory.copy()
         self.damping, self.price = np.zeros((2, len(points)))
         self.maps = step_maps(problem, start.step, self.scaling, self.nodes, points)
-        sound = np.isfinite(self.maps).all(axis=(1, 2, 3, 4))
-        self.finite = start.finite & problem.agree(sound, np.all)
+        self.finite = start.finite & np.isfinite(self.maps).all(axis=(1, 2, 3, 4))
 
     def result(self) -> RefinementFit:
         """The fit as it stands; with its maps, unless the scalings were held at last."""
@@ -158,14 +153,13 @@ class _Walk:
             finished=self.finished,
             finite=self.finite,
             step=self.step,
-            theta=self.theta,
             memory=self.memory,
             maps=self.maps if is_whole else None,
         )
 
     def remember(self, memory: int, points: np.ndarray) -> None:
         """A stage with this memory, by way of others at points where it leaves gaps."""
-        before, theta = [each.copy() for each in self._by_point()], self.theta
+        before = [each.copy() for each in self._by_point()]
         self.stage(memory, points, tolerance=ROUGH, max_iter=10)
         self.note_memory(memory, points)
         reached = self.memory[points]
@@ -175,7 +169,6 @@ class _Walk:
             if self.finite[torn].any() and memory > CLOSEST * middle > CLOSEST * last:
                 for own, former in zip(self._by_point(), before, strict=True):
                     own[torn] = former[torn]
-                self.theta = theta
                 self.remember(middle, torn)
                 arrived = torn[self.memory[torn] == middle]
                 if arrived.size:
@@ -188,7 +181,7 @@ class _Walk:
         """Note this memory at the points that it leaves without gaps."""
         ends = self.pull(self._maps_of(points), points, memory)
         closed = (gap_sizes(ends, self.nodes[points])[1] < ROUGH) & self.finite[points]
-        self.memory[points[self.problem.agree(closed, np.all)]] = memory
+        self.memory[points[closed]] = memory
 
     def stage(self, memory: int, points: np.ndarray, *, tolerance: float, max_iter: int) -> None:
         """Iterate with one memory; points leave once they have converged or are stuck."""
@@ -206,7 +199,6 @@ class _Walk:
         for _ in range(JOINING_STEPS):
             _, defect = gap_sizes(self._maps_of(points), self.nodes[points])
             is_open = self.finite[points] & ~self.finished[points] & (defect > JOINED)
-            is_open = self.problem.agree(is_open, np.any)
             if not is_open.any():
                 break
             if self.maps.shape[-1] == width:  # derivatives by the scalings are not needed any more
@@ -223,9 +215,9 @@ class _Walk:
         problem, damping = self.problem, self.damping[active]
         maps = self.pull(self._maps_of(active), active, memory)
         scaling, nodes = self.scaling[active], self.nodes[active]
-        unknowns, change, moved = self._newton_step(maps, active, None if hold else damping)
+        change, moved = self._newton_step(maps, active, None if hold else damping)
         share = step_share(moved, problem.ranges[active]) / (1.0 + damping)
-        share = problem.agree(np.nan_to_num(share), np.min)
+        share = np.nan_to_num(share)
         change = share[:, None] * change
         self.scaling[active] += change
         self.nodes[active] += share[:, None, None, None] * moved
@@ -233,9 +225,9 @@ class _Walk:
         ahead = self.pull(raw, active, memory)
         size, defect = gap_sizes(maps, nodes)
         size_ahead, defect_ahead = gap_sizes(ahead, self.nodes[active])
-        better = self._is_better(active, nodes, moved, size, size_ahead)
-        if hold:
-            better = problem.agree(size_ahead < size, np.all)
+        better = (
+            size_ahead < size if hold else self._is_better(active, nodes, moved, size, size_ahead)
+        )
         self.scaling[active[~better]], self.nodes[active[~better]] = (
             scaling[~better],
             nodes[~better],
@@ -243,11 +235,9 @@ class _Walk:
         size = np.maximum(np.abs(self.scaling[active]), 1e-3)
         relative = np.abs(change / size).max(axis=1, initial=0.0)
         defect = np.where(better, defect_ahead, defect)
-        done = better & (share == 1.0) & (relative < tolerance) & (defect < tolerance)
-        self.finished[active] = problem.agree(done, np.all)
+        small = (relative < tolerance) & (defect < tolerance)
+        self.finished[active] = better & (share == 1.0) & small
         self._tell(memory, active, relative, defect)
-        if self.theta is not None and better.all():
-            self.theta = self.theta + share[0] * unknowns
         if better.all() and len(active) == len(self.maps):
             self.maps = raw
         else:
@@ -256,26 +246,24 @@ class _Walk:
 
     def _newton_step(
         self, maps: np.ndarray, active: np.ndarray, damping: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Change of the unknowns, of the scalings (points, free) and of the nodes.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Change of the scalings (points, free) and of the nodes.
 
-        The unknowns are theta if the points share a law, otherwise the scalings. damping: by point;
-        None holds the unknowns and moves the nodes alone.
+        damping: by point; None holds the scalings and moves the nodes alone.
         NaN at points whose tangents overflow.
         """
-        problem, law, n_start = self.problem, self.problem.law, self.problem.n_start
+        problem, n_start = self.problem, self.problem.n_start
         nodes, data = self.nodes[active], problem.data[active]
         condensed = condense(maps, nodes, data, self.weights[active], n_start)
         if damping is None:
-            unknowns = np.zeros_like(self.scaling[active] if self.theta is None else self.theta)
+            change = np.zeros_like(self.scaling[active])
         else:
-            unknowns = least_change(condensed[..., n_start:, n_start:], law, damping)
-        change = unknowns if law is None else law.scaling(unknowns)
+            change = least_change(condensed[..., n_start:, n_start:], damping)
         if problem.free_start:
             first = starts(condensed, change, n_start)
         else:
             first = data[:, :, 0] - nodes[:, :, 0]
-        return unknowns, change, propagate(maps, nodes, first, change)
+        return change, propagate(maps, nodes, first, change)
 
     def _is_better(
         self,
@@ -298,13 +286,11 @@ class _Walk:
             )
             cost = np.where(size > 0.0, 2.0 * (aim - loss) / np.maximum(size, JOINED), 0.0)
             price = np.maximum(self.price[active], np.where(np.isfinite(cost), cost, 0.0))
-            self.price[active] = price = problem.agree(price, np.max)
-            merit = problem.agree(loss + price * size, np.sum)
-            merit_ahead = problem.agree(loss_ahead + price * size_ahead, np.sum)
+            self.price[active] = price
             slack = SLACK * loss + ROUNDING * np.sqrt(loss * data[0].size)
-            gains = problem.agree(loss_ahead - loss - slack, np.sum) <= 0.0
-            fine = problem.agree(size_ahead - FINE * np.sqrt(loss), np.max) <= 0.0
-            better: np.ndarray = merit_ahead <= merit + problem.agree(slack, np.sum)
+            gains = loss_ahead - loss - slack <= 0.0
+            fine = size_ahead - FINE * np.sqrt(loss) <= 0.0
+            better: np.ndarray = loss_ahead + price * size_ahead <= loss + price * size + slack
         return better | (gains & fine)
 
     def _maps_of(self, points: np.ndarray) -> np.ndarray:
@@ -357,35 +343,16 @@ def step_maps(
     return step.maps(ode, nodes[points], by_scaling=by_scaling)
 
 
-def least_change(
-    by_window: np.ndarray, law: LawMap | None = None, damping: np.ndarray | None = None
-) -> np.ndarray:
-    """Change of the unknowns that minimises the condensed residuals of all windows, or NaN.
+def least_change(by_window: np.ndarray, damping: np.ndarray | None = None) -> np.ndarray:
+    """Change of the scalings that minimises the condensed residuals of all windows, or NaN.
 
-    by_window: triangles, (points, windows, size, size), by scaling. Without a law the
-    unknowns are the scalings, (points, free), and each point is solved separately. With a law they
-    are theta, common to all points: H = sum_p spread_p^T R_p^T R_p spread_p, by QR of each R_p,
-    then of all.
+    by_window: triangles, (points, windows, size, size). Returns (points, free), of each point
+    separately: the minimisers of |A x + b| for its rows [A | b], of least norm if the rows do not
+    determine a direction.
+    damping: by point; adds the squares of sqrt(damping) * x, in units of the columns' lengths.
     """
     size = by_window.shape[-1]
     rows = by_window[..., :-1, :].reshape(len(by_window), -1, size)
-    if law is None:
-        return least_squares(rows, damping)
-    if not (np.abs(rows) < OVERFLOWING).all():
-        return np.full(law.n_theta, np.nan)
-    small = np.asarray(np.linalg.qr(rows, mode="r"))
-    rows = law.rows(small[:, None]).reshape(1, -1, law.n_theta + 1)
-    return least_squares(rows, None if damping is None else damping[:1])[0]
-
-
-def least_squares(rows: np.ndarray, damping: np.ndarray | None = None) -> np.ndarray:
-    """Minimisers of |A x + b|, (problems, unknowns), for rows [A | b], or NaN.
-
-    damping: by problem; adds the squares of sqrt(damping) * x, in units of the columns' lengths.
-
-    The solution has the least norm if the rows do not determine a direction.
-    """
-    size = rows.shape[-1]
     lost: np.ndarray = ~(np.abs(rows) < OVERFLOWING).all(axis=(1, 2))
     rows = np.where(lost[:, None, None], 0.0, rows)
     if damping is not None and damping.any():

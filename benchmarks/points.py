@@ -1,0 +1,226 @@
+"""Operating points: one support for all, and a law run freely where no fit has been.
+
+    python -m benchmarks.points family 100   # realizations for each noise level
+    python -m benchmarks.points grid
+
+`family`: a family of known systems, with records of about one pulse. Percentage of realizations in
+which the supports of all equations are right: of one search over all points, of one regression
+with shared coefficients, and of every point alone; then the errors of the coefficients.
+`grid`: the package's own discharge at 290 to 370 V and 4 to 5.5 mg/s, five by five, 6 ms each,
+densities averaged over the channel. Every point is left out in turn of quadratic laws, for the
+models of conf/exp/predict.yaml and some beside them; then the law of the study's choice at points
+drawn between.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+import ep2sindy as ep
+from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
+from ep2sindy.model.comparison import Verdict
+from ep2sindy.model.free_run import FreeRun
+from ep2sindy.operating.given_models import (
+    REFINED,
+    FittingSettings,
+    GivenModel,
+    PointResult,
+    fit_models,
+    fits_of,
+)
+from ep2sindy.operating.law import constrain_law, make_basis
+from ep2sindy.operating.left_out import LawTrial, run_left_out
+from ep2sindy.operating.records import OperatingRecord, read_points
+from ep2sindy.runtime.parallel import Loky, Workers
+
+NOISES = (0.0, 0.05, 0.1)
+ERRORS = ("error_alone", "error_law")
+# Half-width: a tenth of a record, since the automatic one can leave fewer windows than terms in a
+# record this short. Five candidates of each size: the rows are weighted under the whole library,
+# where a wrong support can lead its size by a hair; the criterion weighs them again under the
+# candidate.
+METHOD = ep.Regression(
+    ep.WeightedWeak(ep.Weak(test_functions=ep.Bumps(half_width_s=1.5), split=ep.RandomSplit(0.0))),
+    ep.BestSubset(n_best=5),
+    selection=ep.EBIC(),
+    depth=5,
+)
+
+
+def run_family(
+    method: ep.Regression,
+    *,
+    noises: Sequence[float],
+    n_realizations: int,
+    workers: Workers,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """Search every realization at all points together, and at every point alone.
+
+    One row for each noise and number. together, pooled and one column per point: 1 where the
+    supports of all equations are right. error_alone, error_law: RMS relative error of the
+    coefficients at all points, of each point's fit and by the true law, where together is right.
+    """
+    tasks = [(noise, number) for noise in noises for number in range(n_realizations)]
+    rows = dict(workers.run(partial(outcome, method, seed=seed), tasks))
+    return pd.DataFrame([rows[k] for k in range(len(tasks))])
+
+
+def outcome(method: ep.Regression, task: tuple[float, int], *, seed: int = 0) -> dict[str, float]:
+    """One realization: one row of `run_family`."""
+    noise, number = task
+    points = realization(noise, number, seed=seed)
+    runs = [run for own in points.values() for run in own]
+    found = ep.discover(runs, LIBRARY, method, law=LAW)
+    pooled = ep.discover([replace(run, parameters={}) for run in runs], LIBRARY, method)
+    row = {"noise": noise, "number": number, "together": _right(found), "pooled": _right(pooled)}
+    row |= {p: _right(ep.discover(own, LIBRARY, method)) for p, own in points.items()}
+    return row | (_errors(found) if row["together"] else dict.fromkeys(ERRORS, np.nan))
+
+
+def _right(found: ep.Discovery) -> float:
+    return float(
+        all(set(found.chosen[state].terms) == set(terms) for state, terms in TRUTH.items())
+    )
+
+
+def _errors(found: ep.Discovery) -> dict[str, float]:
+    errors: dict[str, list[float]] = {name: [] for name in ERRORS}
+    for point, own in zip(PARAMETERS.values(), found.points.values(), strict=True):
+        truth = system_at(point).model.coef
+        for name, model in zip(ERRORS, (own.model, found.law.at(**point)), strict=True):
+            errors[name] += (model.coef[truth != 0.0] / truth[truth != 0.0] - 1.0).tolist()
+    return {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in errors.items()}
+
+
+def family(n_realizations: int) -> None:
+    rows = run_family(METHOD, noises=NOISES, n_realizations=n_realizations, workers=Loky())
+    print(f"right supports, % of {n_realizations} realizations")
+    print(100.0 * rows.groupby("noise")[["together", "pooled", *PARAMETERS]].mean())
+    print("median relative error of the coefficients where the support of all points is right")
+    print(rows.groupby("noise")[list(ERRORS)].median())
+
+
+CONFIG = Path(__file__).parents[1] / "conf" / "exp" / "predict.yaml"
+MODELS: dict[str, Any] = yaml.safe_load(CONFIG.read_text("utf-8"))["models"]
+CHOICE = "leaving"
+MODELS["leaving, inflow free"] = {**MODELS[CHOICE], "known": {}}
+MODELS["leaving, all free"] = {"terms": MODELS[CHOICE]["terms"]}
+IONIZED = ["n_i^2*n_n", "n_i*n_n^2"]  # in the law of docs/living.md
+MODELS["law of one point"] = {
+    "terms": {"n_i": ["n_i", "n_i^2", *IONIZED], "n_n": ["1", "n_n", *IONIZED]},
+    "known": MODELS[CHOICE]["known"],
+    "relations": [f"n_i: {term} == -1 * n_n: {term}" for term in IONIZED],
+}
+STATES, NAMES = ["n_i", "n_n"], ["V_D_V", "mdot_mg_s"]
+CUBIC = ep.polynomial(STATES, degree=3)
+QUADRATIC = ep.polynomial(NAMES, degree=2)
+VOLTAGES, FLOWS = (290.0, 310.0, 330.0, 350.0, 370.0), (4.0, 4.375, 4.75, 5.125, 5.5)
+N_BETWEEN = 20
+DEFAULT_SPEED = ep.thruster.OPERATING_POINTS[3].neutral_speed
+# Those of the study: 20 windows of two periods.
+HOW = FittingSettings(CUBIC, ep.Differential(split=ep.RandomSplit(0.0)), 20, 2.0)
+
+
+def recorded(point: tuple[float, float]) -> ep.Trajectory:
+    voltage, flow = point
+    field = ep.thruster.simulate(
+        ep.thruster.Thruster(),
+        ep.thruster.OperatingPoint(voltage, flow, neutral_speed=DEFAULT_SPEED),
+        cache=True, duration_s=6e-3, progress=False,
+    )  # fmt: skip
+    run = ep.zone_average(field, ep.Zone(z="channel"), states=STATES)
+    return replace(run, parameters=dict(zip(NAMES, point, strict=True)))
+
+
+def all_recorded(points: Sequence[tuple[float, float]], workers: Workers) -> list[ep.Trajectory]:
+    found = dict(workers.run(recorded, points))
+    return [found[k] for k in range(len(points))]
+
+
+def line(name: str, runs: Sequence[FreeRun]) -> str:
+    f = np.array([abs(run.f_error) for run in runs])
+    f[np.isnan(f)] = np.inf
+    amplitude = [max(abs(v - 1.0) for v in run.amplitude_ratio.values()) for run in runs]
+    waveform = [max(run.waveform_error.values()) for run in runs]
+    lives = sum(run.verdict is Verdict.LIVES for run in runs)
+    return (
+        f"{name:<22} {lives} of {len(runs)} live; f {np.median(f):.2%}, 9 in 10 "
+        f"{np.quantile(f, 0.9, method='higher'):.2%}, at most {f.max():.2%}; amplitude "
+        f"{np.nanmedian(amplitude):.1%}; waveform {np.nanmedian(waveform):.3f}"
+    )
+
+
+def interpolate(records: Sequence[OperatingRecord]) -> None:
+    """The measured frequencies and amplitudes themselves, by as many functions as a law has."""
+    basis = make_basis(QUADRATIC, read_points([r.parameters for r in records], NAMES), n_spare=1)
+    own = np.array([(r.cycle.frequency_Hz, *r.cycle.std) for r in records])
+    off = np.abs(basis.predict_left_out(own) / own - 1.0)
+    f, amplitude = off[:, 0], off[:, 1:].max(axis=1)
+    print(
+        f"the records' own: f {np.median(f):.2%}, 9 in 10 "
+        f"{np.quantile(f, 0.9, method='higher'):.2%}; amplitude {np.median(amplitude):.1%}"
+    )
+
+
+def left_out(
+    name: str, given: GivenModel, results: Sequence[PointResult], records: Sequence[OperatingRecord]
+) -> None:
+    """Every point by the laws of the others, of fits to rows and of refinements."""
+    for end in ("", REFINED):
+        fits = fits_of(name + end, given, results)
+        trial = LawTrial(name + end, fits, QUADRATIC, np.zeros(0))
+        runs = [each.run for each in run_left_out(trial, records)]
+        print(f"{line(name + end, runs)}; {fits.n_free} free")
+
+
+def grid() -> None:
+    workers = Loky()
+    runs = all_recorded(list(product(VOLTAGES, FLOWS)), workers)
+    records = [OperatingRecord(run) for run in runs]
+    interpolate(records)
+    given = {
+        name: GivenModel(
+            constrain_law(
+                CUBIC, model["terms"], model.get("relations", ()), model.get("known", {}),
+                parameters=NAMES,
+            )
+        )
+        for name, model in MODELS.items()
+    }  # fmt: skip
+    found = fit_models(runs, given, HOW, workers=workers, rng=np.random.default_rng(0))
+    results = [found[k] for k in range(len(runs))]
+    for name, model in given.items():
+        left_out(name, model, results, records)
+    rng = np.random.default_rng(1)
+    drawn = rng.uniform((VOLTAGES[0], FLOWS[0]), (VOLTAGES[-1], FLOWS[-1]), (N_BETWEEN, 2))
+    between = all_recorded([(round(v, 1), round(m, 2)) for v, m in drawn], workers)
+    for end in ("", REFINED):
+        law = fits_of(CHOICE + end, given[CHOICE], results).law(QUADRATIC)
+        free = [ep.free_run(law.at(**run.parameters), run) for run in between]
+        print(line(f"between, {CHOICE}{end}", free))
+
+
+def main() -> None:
+    start = time.perf_counter()
+    what = sys.argv[1] if len(sys.argv) > 1 else "family"
+    if what == "grid":
+        grid()
+    else:
+        family(int(sys.argv[2]) if len(sys.argv) > 2 else 100)
+    print(f"{time.perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()
