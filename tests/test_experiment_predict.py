@@ -44,41 +44,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_run_leaves_a_law_tables_figures_and_a_summary(folder: Path) -> None:
     summary = summary_of(folder)
     law = summary["law"]
-<<<<<<< HEAD
-    assert law["fit"] in ("conserving", "conserving_refined")
-=======
     assert law["fit"] == min(law["errors"], key=lambda fit: law["errors"][fit])
     assert set(law["errors"]) == {"conserving", "conserving_refined"}
->>>>>>> c3eba70da36ac0725d8b36d03c4be35243f9be58
     assert law["cycle"] == "all"
     assert law["terms"]["n_i"] == ["n_i", "n_n", "n_i*n_n", "n_i^2*n_n"]
     assert law["exact"][0] == "n_i: n_n == -1 * n_n: n_n"
     assert law["exact"][3] == "n_n: 1 == 4.58e+22 * mdot_mg_s"
     assert law["functions"] == ["1", "V_D_V", "mdot_mg_s"]
-<<<<<<< HEAD
-    assert set(law["errors"]) == {"conserving", "conserving_refined"}
-=======
     assert law["n_numbers"] == 15
->>>>>>> c3eba70da36ac0725d8b36d03c4be35243f9be58
     quiet = [p for p in summary["points"] if p["status"] != "oscillating"]
     assert [(p["V_D_V"], p["mdot_mg_s"]) for p in quiet] == [(150.0, 2.0)]
     assert law["oscillating_or_not"]["points"] == 5
     tables = {path.stem: pd.read_csv(path) for path in (folder / "tables").glob("*.csv")}
     assert len(tables["laws"]) == 27
-<<<<<<< HEAD
-    assert len(tables["left_out"]) == len(tables["map"]) == 4
-    assert tables["trials"].query("chosen")["fit"].tolist() == [law["fit"]]
-    assert law["errors"][law["fit"]] == pytest.approx(tables["trials"]["error"].min(), rel=1e-6)
-    figures = {p.stem for p in (folder / "figures").glob("*.png")}
-    assert figures == {"left_out", "laws", "map"}
-    assert law["left_out"]["n_lives"] == (tables["left_out"]["verdict"] == "lives").sum()
-=======
     assert len(tables["left_out"]) == 4
     assert len(tables["map"]) == 4
     assert {p.stem for p in (folder / "figures").glob("*.png")} >= {"left_out", "laws"}
     assert law["left_out"]["n_lives"] == (tables["left_out"]["verdict"] == "lives").sum()
     assert law["left_out"]["window_error"] == pytest.approx(law["errors"][law["fit"]])
->>>>>>> c3eba70da36ac0725d8b36d03c4be35243f9be58
     page = (folder / "report.html").read_text()
     assert "9 coefficients of 3 functions each, 15 numbers, from 4 records" in page
 
@@ -140,41 +123,24 @@ def own_records(folder: Path, *values: float) -> list[str]:
 
 def test_points_that_are_quiet_have_no_law(tmp_path: Path) -> None:
     damped = own_records(tmp_path, -0.6, -0.9, -1.2)
-<<<<<<< HEAD
-    with pytest.raises(ValueError, match="a law needs records of 6 periods or more: none has"):
-=======
     with pytest.raises(ValueError, match=r"none of the 3 operating points oscillates \(steady\)"):
->>>>>>> c3eba70da36ac0725d8b36d03c4be35243f9be58
         programs.computed(composed(*damped))
 
 
-def test_own_records_make_a_law_of_the_fit_that_is_chosen_and_its_line(tmp_path: Path) -> None:
+def test_own_records_make_a_law_of_the_model_that_is_chosen_and_its_line(tmp_path: Path) -> None:
     held = "+models.held={terms: {n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}, known: {n_n: {n_i: {1: 1}}}}"
     found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2), held))
     assert found.log.count("<- chosen") == 1
-<<<<<<< HEAD
-    table = found.outcome.tables()["trials"].set_index("fit")
-    assert table["numbers"].to_dict() == {
-        "own": 8, "own_refined": 8, "held": 6, "held_refined": 6
-    }  # fmt: skip
-    # Rows have the bias of smoothing; windows of the refined models are followed to its errors.
-    assert table.loc[found.summary["law"]["fit"], "error"] < 1e-3
-=======
     assert re.search(r"held( \(refined\))?  <- chosen", found.log)
     table = found.outcome.tables()["trials"]
     assert table["fit"].tolist() == ["own", "own_refined", "held", "held_refined"]
     assert table["numbers"].tolist() == [8, 8, 6, 6]
->>>>>>> c3eba70da36ac0725d8b36d03c4be35243f9be58
     law = OperatingLaw.load(found.folder / "law.json")
     np.testing.assert_allclose(law.at(a=1.0).terms("n_i")["n_i"], 1.0, atol=1e-3)
     assert set(found.outcome.figures()) == {"laws", "left_out", "map"}
     found.check_figures(*found.outcome.figures())
     log = " ".join(found.log.split())
-<<<<<<< HEAD
-    assert "Found: a law over a" in log
-=======
     assert "Found: a law over a, by held" in log
->>>>>>> c3eba70da36ac0725d8b36d03c4be35243f9be58
     assert "left out one at a time, 3 of 3 points live" in log
     assert "f (mHz)" in log
     said_by_the_empty(found.outcome)
@@ -182,10 +148,7 @@ def test_own_records_make_a_law_of_the_fit_that_is_chosen_and_its_line(tmp_path:
 
 def said_by_the_empty(outcome: Outcome) -> None:
     """A map on which nothing oscillates is no figure; the page says so instead."""
-<<<<<<< HEAD
-=======
     assert outcome.law is not None
->>>>>>> c3eba70da36ac0725d8b36d03c4be35243f9be58
     still = [replace(point, fate=Fate.RESTS, frequency_Hz=np.nan) for point in outcome.law.map]
     quiet = replace(outcome, law=replace(outcome.law, map=still))
     assert set(quiet.figures()) == {"laws", "left_out"}
@@ -195,7 +158,13 @@ def said_by_the_empty(outcome: Outcome) -> None:
     assert said[1] == "Nowhere on the map does the law's model oscillate."
 
 
-<<<<<<< HEAD
+def test_without_a_model_the_terms_are_searched_for(tmp_path: Path) -> None:
+    records = own_records(tmp_path, 0.6, 0.9, 1.2)
+    found = programs.computed(composed(*records, "models=null", "degree=3", "map_points=1"))
+    assert {each.name.split("_")[0] for each in found.outcome.law.trials} >= {"found"}
+    assert found.summary["law"]["terms"] == {"n_i": ["n_i", "n_n", "n_i^3"], "n_n": ["n_i"]}
+
+
 def test_of_two_cycles_the_law_is_that_of_the_one_with_most_records(tmp_path: Path) -> None:
     values = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
     settings = own_records(tmp_path, *values)
@@ -211,16 +180,6 @@ def test_of_two_cycles_the_law_is_that_of_the_one_with_most_records(tmp_path: Pa
     assert points.to_dict() == {a: "weak" if a in values[2:4] else "strong" for a in values}
     law = OperatingLaw.load(found.folder / "law.json")
     assert law.points[:, 0].tolist() == [0.5, 0.6, 0.9, 1.0, 1.1]
-
-
-def test_without_a_model_the_terms_are_found_among_all_that_were_tried(tmp_path: Path) -> None:
-    settings = ["models=null", "degree=3", "map_points=1"]
-    records = own_records(tmp_path, 0.6, 0.9, 1.2)
-    found = programs.computed(composed(*[r for r in records if "models" not in r], *settings))
-    table = found.outcome.tables()["trials"]
-    assert table["chosen"].sum() == 1
-    assert len(table) > 2
-    assert found.summary["law"]["terms"]["n_i"] == ["n_i", "n_n", "n_i^3"]
 
 
 def known_records(folder: Path, system: str) -> list[str]:

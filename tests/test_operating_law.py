@@ -14,12 +14,12 @@ from ep2sindy.operating.left_out import (
     LawTrial,
     LeftOutRun,
     error_statistics,
-    fewest_of_least,
     run_left_out,
     window_errors,
 )
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
 from ep2sindy.operating.records import OperatingRecord, branches_of
+from ep2sindy.regression.pooled import fewest_of_least
 from ep2sindy.regression.rows import RegressionRows
 from tests.models import plain_rows
 
