@@ -195,7 +195,7 @@ def known_records(folder: Path, system: str) -> list[str]:
     return [
         "data=recognised", "data.path=null", f"points.files='{folder}/{pattern}.csv'",
         f"trajectory.states=[{','.join(law)}]", "trajectory.zone=null",
-        f"models={{own: {{terms: {{{terms}}}}}}}", "thesis=null", f"output={folder}/outputs",
+        "~models", f"+models.own.terms={{{terms}}}", f"output={folder}/outputs",
         "parallel=serial", "keep=false",
     ]  # fmt: skip
 
@@ -226,10 +226,3 @@ def test_the_law_of_known_records_is_headlined(
             for term, value in true.terms(state).items()
         ]
     assert np.sqrt(np.square(missed).mean()) < 0.01
-=======
-def test_without_a_model_the_terms_are_searched_for(tmp_path: Path) -> None:
-    records = own_records(tmp_path, 0.6, 0.9, 1.2)
-    found = programs.computed(composed(*records, "models=null", "degree=3", "map_points=1"))
-    assert {each.name.split("_")[0] for each in found.outcome.law.trials} >= {"found"}
-    assert found.summary["law"]["terms"] == {"n_i": ["n_i", "n_n", "n_i^3"], "n_n": ["n_i"]}
->>>>>>> c3eba70da36ac0725d8b36d03c4be35243f9be58
