@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from omegaconf import DictConfig
 
+from benchmarks import known_laws
 from ep2sindy.app.runner import run_config
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import Fate, map_points
@@ -159,7 +160,7 @@ def said_by_the_empty(outcome: Outcome) -> None:
 
 def test_without_a_model_the_terms_are_searched_for(tmp_path: Path) -> None:
     records = own_records(tmp_path, 0.6, 0.9, 1.2)
-    found = programs.computed(composed(*records, "models=null", "+degree=3", "map_points=1"))
+    found = programs.computed(composed(*records, "models=null", "degree=3", "map_points=1"))
     assert [trial.name for trial in found.outcome.law.trials] == [
         "found_1", "found_1_refined", "found_2", "found_2_refined",
     ]  # fmt: skip
@@ -167,3 +168,66 @@ def test_without_a_model_the_terms_are_searched_for(tmp_path: Path) -> None:
     assert {state: set(own) for state, own in terms.items()} == {
         "n_i": {"n_i", "n_n", "n_i^3"}, "n_n": {"n_i"},
     }  # fmt: skip
+
+
+def test_of_two_cycles_the_law_is_that_of_the_one_with_most_records(tmp_path: Path) -> None:
+    values = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
+    settings = own_records(tmp_path, *values)
+    for a in values[2:4]:  # as if smaller cycles coexisted
+        table = pd.read_csv(tmp_path / f"{a}.csv", index_col="time")
+        (0.1 * table).to_csv(tmp_path / f"{a}.csv")
+    found = programs.computed(composed(*settings))
+    assert found.summary["law"]["cycle"] == "strong"
+    (said,) = [each for each in found.warnings if "two cycles coexist" in each]
+    assert "the law is that of the 5 points on the strong one" in said
+    assert said.endswith("on the other are a=0.7, a=0.8")
+    points = found.outcome.tables()["points"].set_index("a")["branch"]
+    assert points.to_dict() == {a: "weak" if a in values[2:4] else "strong" for a in values}
+    law = OperatingLaw.load(found.folder / "law.json")
+    assert law.points[:, 0].tolist() == [0.5, 0.6, 0.9, 1.0, 1.1]
+
+
+def known_records(folder: Path, system: str) -> list[str]:
+    """The records of a known law in CSV files, and how a study reads them."""
+    for run in known_laws.records(system, noise=0.05, seed=0):
+        name = "_".join(f"{key}{value:.6g}" for key, value in run.parameters.items())
+        run.to_dataframe().to_csv(folder / f"{name}.csv", index_label="time (s)")
+    law = known_laws.LAWS[system]
+    pattern = "_".join(f"{key}{{{key}}}" for key in known_laws.POINTS[system][0])
+    terms = ", ".join(
+        f"{state}: [{', '.join(repr(term) for term in own)}]" for state, own in law.items()
+    )
+    return [
+        "data=recognised", "data.path=null", f"points.files='{folder}/{pattern}.csv'",
+        f"trajectory.states=[{','.join(law)}]", "trajectory.zone=null",
+        "~models", f"+models.own.terms={{{terms}}}", f"output={folder}/outputs",
+        "parallel=serial", "keep=false",
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("system", known_laws.LAWS)
+@pytest.mark.parametrize("experiment", ["parametric", "predict"])
+def test_the_law_of_known_records_is_headlined(
+    experiment: str, system: str, tmp_path: Path
+) -> None:
+    settings = known_records(tmp_path, system)
+    if experiment == "predict":
+        settings.append("map_points=2")
+    found = programs.computed(programs.composed(f"+exp={experiment}", *settings))
+    summary = found.summary["law"]
+    # Rows have the bias of smoothing: the refined coefficients are right.
+    assert summary["fit"] == "own_refined"
+    law = OperatingLaw.load(found.folder / "law.json")
+    left_out = law.left_out[law.left_out < 1.0]  # of refinements that converged
+    assert len(left_out) >= 11
+    assert left_out.max() < 0.01
+    missed = []
+    for at in known_laws.POINTS[system]:
+        true, own = (each.at(extrapolate=True, **at) for each in (known_laws.truth(system), law))
+        missed += [
+            own.terms(state)[term] / value - 1.0
+            for state in true.states
+            for term, value in true.terms(state).items()
+        ]
+    assert np.sqrt(np.square(missed).mean()) < 0.01

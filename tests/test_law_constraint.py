@@ -1,15 +1,16 @@
 """Laws under relations: exact in every fit, weighted and pooled, at points fitted and not."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.operating.fit import SETTINGS, OperatingFit, leave_one_out, operating_fit
-from ep2sindy.operating.law import Known, constrain_law
-from tests.test_operating_law import GRID, LIBRARY, SHORT, STATES, STRUCTURE
+from ep2sindy.model.comparison import Verdict
+from ep2sindy.operating.law import Known, LawConstraint, constrain_law, law_of_constraint
+from ep2sindy.operating.left_out import LawTrial, run_left_out
+from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
+from tests.test_operating_law import GRID, LIBRARY, LINEAR, SHORT, STATES, STRUCTURE
 
 # What leaves x enters y, and the growth of x is known; its square is beyond a law of degree one.
 RELATIONS = ["x: y == -1 * y: x"]
@@ -33,25 +34,37 @@ def records() -> tuple[ep.operating.OperatingRecord, ...]:
         states = model_at(**point).simulate(np.append(0.0, 40.0 + t), [1.0, 0.0]).states[1:]
         # A little noise: relations hold where the data do not obey them by themselves.
         states = states + 1e-3 * rng.normal(size=states.shape)
-        found.append(ep.operating.OperatingRecord.of(point, ep.Trajectory(t, states, STATES)))
+        run = ep.Trajectory(t, states, STATES, parameters=point)
+        found.append(ep.operating.OperatingRecord(run))
     return tuple(found)
 
 
-@cache
-def fit() -> OperatingFit:
-    return operating_fit(
-        records(), LIBRARY, STRUCTURE, relations=RELATIONS, known=KNOWN,
-        settings=SHORT,
-    )  # fmt: skip
+def held(relations: list[str] = RELATIONS, known: Known = KNOWN) -> LawConstraint:
+    return constrain_law(LIBRARY, STRUCTURE, relations, known, parameters=["a", "b"])
+
+
+def by_rows(relations: LawConstraint) -> PointFits:
+    weak, points = ep.Weak(split=ep.RandomSplit(0.0)), np.array([list(p.values()) for p in GRID])
+    rows = [
+        weak.assemble([record.run], LIBRARY, rng=np.random.default_rng(k))
+        for k, record in enumerate(records())
+    ]
+    return fit_rows(["a", "b"], points, rows, relations, provenance={})
 
 
 @cache
-def pooled() -> ep.operating.OperatingLaw:
-    return fit().refine_law(fit().functions(1))[0]
+def fits() -> dict[str, PointFits]:
+    """By rows, and refined."""
+    rows, runs = by_rows(held()), [[record.run] for record in records()]
+    return {"rows": rows, "trajectories": fit_trajectories(rows, runs, SHORT)}
 
 
-def laws() -> list[ep.operating.OperatingLaw]:
-    return [fit().fit_law(fit().functions(1)), pooled()]
+@cache
+def law(how: str) -> ep.operating.OperatingLaw:
+    return fits()[how].law(LINEAR)
+
+
+BOTH = pytest.mark.parametrize("how", ["rows", "trajectories"])
 
 
 def check_exact(model: ep.SparseModel, a: float) -> None:
@@ -59,70 +72,65 @@ def check_exact(model: ep.SparseModel, a: float) -> None:
     assert model.terms("x")["x"] == pytest.approx(0.7 + 0.2 * a**2, rel=1e-15)
 
 
-def test_relations_and_known_values_are_exact_in_every_fit() -> None:
-    for record, each in zip(records(), fit().fits, strict=True):
-        check_exact(each.model, record.parameters["a"])
-    assert fit().n_free == 2
-    assert fit().coefficients.shape == (9, 2)
-    assert fit().information.shape == (9, 2, 2)
-
-
-def test_relations_and_known_values_are_exact_in_laws_at_every_point() -> None:
-    for law in laws():
-        for point in [*GRID, BETWEEN, {"a": 3.0, "b": -1.0}]:
-            check_exact(law.model_at(point, extrapolate=True), point["a"])
-    _, refinement = fit().refine_law(fit().functions(1))
-    for record, model in zip(records(), refinement.models, strict=True):
+@BOTH
+def test_relations_and_known_values_are_exact_in_every_fit_and_law(how: str) -> None:
+    fit = fits()[how]
+    for record, model in zip(records(), fit.models, strict=True):
         check_exact(model, record.parameters["a"])
+    assert fit.n_free == 2
+    assert fit.coefficients.shape == (9, 2)
+    assert fit.information.shape == (9, 2, 2)
+    for point in [*GRID, BETWEEN, {"a": 3.0, "b": -1.0}]:
+        check_exact(law(how).at(extrapolate=True, **point), point["a"])
 
 
-def test_the_law_under_relations_is_the_true_one() -> None:
-    for law in laws():
-        assert law.coefficients == (("x", "x"), ("x", "y"), ("x", "x^3"), ("y", "x"))
-        assert list(law.functions.names) == ["1", "a", "b", "a^2"]
-        truth = [[0.7, 0, 0, 0.2], [-1, -0.2, -0.1, 0], [-0.4, 0, 0.1, 0], [1, 0.2, 0.1, 0]]
-        # Noise of a thousandth, on 9 records of some hundred samples in windows.
-        np.testing.assert_allclose(law.coef, truth, atol=2e-3)
-        np.testing.assert_array_equal(law.coef[0], truth[0])
-        np.testing.assert_array_equal(law.coef[1], -law.coef[3])
+@BOTH
+def test_the_law_under_relations_is_the_true_one(how: str) -> None:
+    own = law(how)
+    assert own.coefficients == (("x", "x"), ("x", "y"), ("x", "x^3"), ("y", "x"))
+    assert list(own.functions.names) == ["1", "a", "b", "a^2"]
+    truth = [[0.7, 0, 0, 0.2], [-1, -0.2, -0.1, 0], [-0.4, 0, 0.1, 0], [1, 0.2, 0.1, 0]]
+    # Noise of a thousandth, on 9 records of some hundred samples in windows.
+    np.testing.assert_allclose(own.coef, truth, atol=2e-3)
+    np.testing.assert_array_equal(own.coef[0], truth[0])
+    np.testing.assert_array_equal(own.coef[1], -own.coef[3])
+    assert own.left_out.max() < 5e-3
 
 
 def test_a_known_number_has_no_interval_and_a_shared_one_has_the_same_twice() -> None:
-    bounds = pooled().intervals()
+    bounds = law("rows").intervals()
     assert bounds["x", "x"] == {"1": (0.7, 0.7), "a": (0, 0), "b": (0, 0), "a^2": (0.2, 0.2)}
     low, high = bounds["x", "y"]["a"]
     assert low < high
     assert bounds["y", "x"]["a"] == pytest.approx((-high, -low))
-    model = pooled().model_at(BETWEEN)
+    model = law("rows").at(**BETWEEN)
     low, high = model.intervals("x")["x"]
     assert low == high == model.terms("x")["x"]
 
 
-def test_points_left_out_live_by_laws_under_relations() -> None:
-    functions = fit().functions(1)
-    for found in (leave_one_out(fit(), functions), leave_one_out(fit(), functions, start=pooled())):
-        assert [each.run.verdict for each in found] == [ep.Verdict.LIVES] * 9
+@BOTH
+def test_points_left_out_live_by_laws_under_relations(how: str) -> None:
+    found = run_left_out(LawTrial(how, fits()[how], LINEAR, np.zeros(9)), records())
+    assert [each.run.verdict for each in found] == [Verdict.LIVES] * 9
 
 
 def test_a_file_and_the_text_hold_the_relations() -> None:
-    again = ep.operating.OperatingLaw.from_json(pooled().to_json())
-    np.testing.assert_array_equal(again.coef, pooled().coef)
+    again = ep.operating.OperatingLaw.from_json(law("trajectories").to_json())
+    np.testing.assert_array_equal(again.coef, law("trajectories").coef)
     assert again.provenance["exact"] == "; ".join(EXACT)
-    lines = pooled().text().splitlines()
+    lines = law("trajectories").text().splitlines()
     assert lines[0] == "x: x = 0.7 + 0.2 a^2"
-    assert tuple(lines[4:]) == tuple(f"exact: {text}" for text in EXACT)
-    check_exact(again.model_at(BETWEEN), BETWEEN["a"])
+    assert tuple(lines[4:-1]) == tuple(f"exact: {text}" for text in EXACT)
+    assert lines[-1].startswith("points left out one at a time: the rates err by")
+    check_exact(again.at(**BETWEEN), BETWEEN["a"])
 
 
 def test_without_known_values_relations_are_the_same_everywhere() -> None:
-    alone = operating_fit(
-        records(), LIBRARY, STRUCTURE, relations=[*RELATIONS, "x: x^3 == -0.3"],
-        settings=SHORT,
-    )  # fmt: skip
+    alone = by_rows(held([*RELATIONS, "x: x^3 == -0.3"], {}))
     assert alone.n_free == 2
-    law = alone.fit_law(alone.functions(1))
-    assert law.coefficients[2] == ("x", "x^3")
-    assert law.coef[2].tolist() == [-0.3, 0.0, 0.0]
+    own = alone.law(LINEAR)
+    assert own.coefficients[2] == ("x", "x^3")
+    assert own.coef[2].tolist() == [-0.3, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(
@@ -139,20 +147,14 @@ def test_relations_that_cannot_hold_are_refused(
     relations: list[str], known: Known, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        operating_fit(records(), LIBRARY, STRUCTURE, relations=relations, known=known)
+        held(relations, known).at(np.array([list(point.values()) for point in GRID]))
 
 
-def test_constraints_of_the_points_of_a_law_must_be_alike() -> None:
-    held = constrain_law(LIBRARY, STRUCTURE, RELATIONS, KNOWN, parameters=["a", "b"])
-    own = held.at(np.array([[0.5, 0.0], [1.0, 0.0], [1.5, 0.0]]))
+def test_a_constraint_of_one_point_holds_at_all_of_them() -> None:
+    one = ep.constraint(LIBRARY, STRUCTURE, ["x: x^3 == -0.3", *RELATIONS])
+    relations = law_of_constraint(one, ["a", "b"])
+    for each in relations.at(np.array([[0.5, 0.0], [1.0, 2.0]])):
+        np.testing.assert_array_equal(each.C, one.C)
+        np.testing.assert_array_equal(each.d, one.d)
+    own = held().at(np.array([[0.5, 0.0], [1.0, 0.0], [1.5, 0.0]]))
     assert [each.d[0] for each in own] == pytest.approx([0.75, 0.9, 1.15])
-    models = [model_at(a, 0.0) for a in (0.5, 1.0, 1.5)]
-    runs = [[record.run] for record in records()[::3]]
-    basis = np.ones((3, 1))
-    other = [*own[:2], ep.constraint(LIBRARY, STRUCTURE)]
-    for wrong, message in ((own[:2], "one entry per model.* 2 came for 3"), (other, "not alike")):
-        with pytest.raises(ValueError, match=message):
-            ep.refinement.refine_law(models, runs, basis, constraints=wrong, seed=0)
-    settings = replace(SETTINGS, constraint=own[0])
-    with pytest.raises(ValueError, match="beside a common one"):
-        ep.refinement.refine_law(models, runs, basis, settings, constraints=own, seed=0)

@@ -1,23 +1,27 @@
 """Laws of the operating point: known families, points left out, files, and what is refused."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.operating.fit import SETTINGS, LeaveOneOut, OperatingFit, leave_one_out, operating_fit
-from ep2sindy.operating.law import OperatingLaw, in_hull, make_basis
-from ep2sindy.operating.records import (
-    OperatingRecord,
-    branches_of,
-    check_records,
-    interpolation_errors,
+from ep2sindy.model.comparison import Verdict
+from ep2sindy.operating.law import OperatingLaw, constrain_law, in_hull, make_basis
+from ep2sindy.operating.left_out import (
+    LawTrial,
+    LeftOutRun,
+    error_statistics,
+    run_left_out,
+    window_errors,
 )
-from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
+from ep2sindy.operating.records import OperatingRecord, branches_of
+from ep2sindy.regression.pooled import fewest_of_least
+from ep2sindy.regression.rows import RegressionRows
+from tests.models import plain_rows
 
 STATES = ("x", "y")
 LIBRARY = ep.polynomial(STATES, degree=3)
@@ -25,8 +29,9 @@ STRUCTURE = {"x": ["x", "y", "x^3"], "y": ["x"]}
 # Lienard's van der Pol at two parameters, every coefficient linear in them.
 LAW = {"x": {"x": (0.8, 0.3, 0.0), "y": (-1.0, 0.0, -0.2), "x^3": (-0.4, 0.0, 0.1)},
        "y": {"x": (1.0, 0.2, 0.1)}}  # fmt: skip
-SHORT = replace(SETTINGS, n_windows=3, periods=1.0)
+SHORT = ep.RefinementSettings(n_windows=3, periods=1.0, n_reweights=0)
 GRID = [{"a": a, "b": b} for a in (0.5, 1.0, 1.5) for b in (0.0, 0.5, 1.0)]
+LINEAR = ep.polynomial(["a", "b"], degree=1)
 
 
 def model_at(a: float, b: float) -> ep.SparseModel:
@@ -39,7 +44,7 @@ def recorded(a: float, b: float, end: float = 60.0) -> OperatingRecord:
     t = np.arange(0.0, end, 0.1)
     run = model_at(a, b).simulate(np.append(0.0, 40.0 + t), [1.0, 0.0])
     states = run.states[1:]
-    return OperatingRecord.of({"a": a, "b": b}, ep.Trajectory(t, states, STATES))
+    return OperatingRecord(ep.Trajectory(t, states, STATES, parameters={"a": a, "b": b}))
 
 
 @cache
@@ -47,14 +52,41 @@ def records() -> tuple[OperatingRecord, ...]:
     return tuple(recorded(**point) for point in GRID)
 
 
+def exact_rows(run: ep.Trajectory, a: float, b: float) -> list[RegressionRows]:
+    """Rows of the samples with the true derivatives."""
+    slopes = model_at(a, b).predict(run.states)
+    return [plain_rows(LIBRARY.evaluate(run.states), slopes, LIBRARY, STATES)]
+
+
+def by_rows(
+    runs: Sequence[ep.Trajectory],
+    structure: Mapping[str, Sequence[str]] = STRUCTURE,
+    relations: Sequence[str] = (),
+    **known: Mapping[str, Mapping[str, float]],
+) -> PointFits:
+    parameters = list(runs[0].parameters)
+    points = [{"a": 1.0, "b": 0.0} | dict(run.parameters) for run in runs]
+    problems = [
+        [replace(part, trajectories=(run,)) for part in exact_rows(run, **at)]
+        for run, at in zip(runs, points, strict=True)
+    ]
+    held = constrain_law(LIBRARY, structure, relations, known, parameters=parameters)
+    values = np.array([list(run.parameters.values()) for run in runs])
+    return fit_rows(parameters, values, problems, held, provenance={})
+
+
 @cache
-def fit() -> OperatingFit:
-    return operating_fit(records(), LIBRARY, STRUCTURE, settings=SHORT)
+def fit() -> PointFits:
+    """Refined at every point, from coefficients that are far off."""
+    runs = [record.run for record in records()]
+    rows = by_rows(runs)
+    start = replace(rows, models=[replace(m, coef=1.1 * m.coef) for m in rows.models])
+    return fit_trajectories(start, [[run] for run in runs], SHORT)
 
 
 @cache
 def law() -> OperatingLaw:
-    return fit().refine_law(fit().functions(1))[0]
+    return fit().law(LINEAR)
 
 
 def truth() -> np.ndarray:
@@ -65,8 +97,10 @@ def test_the_law_of_a_known_family_is_found() -> None:
     assert law().coefficients == (("x", "x"), ("x", "y"), ("x", "x^3"), ("y", "x"))
     # rk4 at 0.1 of a time unit near one, on a stiff corner of the relaxation oscillation.
     np.testing.assert_allclose(law().coef, truth(), atol=1e-4)
-    weighted = fit().fit_law(fit().functions(1))
-    np.testing.assert_allclose(weighted.coef, truth(), atol=1e-4)
+    assert law().left_out.max() < 1e-3
+    exact = by_rows([record.run for record in records()]).law(LINEAR)
+    np.testing.assert_allclose(exact.coef, truth(), atol=1e-10)
+    assert exact.left_out.max() < 1e-10
 
 
 @pytest.mark.parametrize(
@@ -83,16 +117,17 @@ def test_the_law_of_a_known_family_is_found() -> None:
         ({"points": np.ones((0, 2))}, "a column for each"),
         ({"points": np.full((4, 2), np.inf)}, "points must be finite"),
         ({"covariance": np.eye(4)}, r"that of 12 numbers: shape \(4, 4\)"),
+        ({"left_out": np.zeros(4)}, r"an error for each of 9 points: shape \(4,\)"),
     ],
 )
 def test_a_law_holds_numbers_that_fit_each_other(change: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        replace(law(), **change)
+        replace(law(), **({"left_out": None} | change))
 
 
 def test_a_model_between_the_points_is_the_true_one() -> None:
     at = {"a": 0.8, "b": 0.3}
-    model = law().model_at(at)
+    model = law().at(**at)
     np.testing.assert_allclose(model.coef, model_at(**at).coef, atol=1e-4)
     assert model.provenance["point"] == "a=0.8, b=0.3"
     low, high = model.intervals("x")["x"]
@@ -102,8 +137,8 @@ def test_a_model_between_the_points_is_the_true_one() -> None:
 def test_a_model_outside_the_points_must_be_asked_for() -> None:
     at = {"a": 2.0, "b": 0.5}
     with pytest.raises(ValueError, match=r"outside the points.* a 0.5 to 1.5, b 0 to 1"):
-        law().model_at(at)
-    model = law().model_at(at, extrapolate=True)
+        law().at(**at)
+    model = law().at(extrapolate=True, **at)
     np.testing.assert_allclose(model.coef, model_at(**at).coef, atol=1e-3)
     assert not law().is_inside(at)
     assert law().is_inside(GRID[0])
@@ -112,7 +147,7 @@ def test_a_model_outside_the_points_must_be_asked_for() -> None:
 @pytest.mark.parametrize("at", [{"a": 1.0}, {"a": 1.0, "c": 0.0}, {"a": 1.0, "b": np.nan}])
 def test_a_model_needs_every_parameter(at: Mapping[str, float]) -> None:
     with pytest.raises(ValueError, match="an operating point must"):
-        law().model_at(at)
+        law().at(**at)
 
 
 def test_a_hull_may_be_flat_or_a_triangle() -> None:
@@ -133,108 +168,177 @@ def test_every_number_survives_a_file() -> None:
         OperatingLaw.from_json("{}")
 
 
-def test_a_law_that_an_earlier_version_saved_is_read() -> None:
-    """The file is that of the predict study at toy size, before laws of all kinds became one."""
-    path = Path(__file__).parent / "data" / "operating_law.json"
-    saved = OperatingLaw.load(path)
-    assert saved.to_json() == path.read_text("utf-8")
-    assert (saved.parameters, saved.states) == (("V_D_V", "mdot_mg_s"), ("n_i", "n_n"))
-    model = saved.model_at({"V_D_V": 300.0, "mdot_mg_s": 5.0})
-    numbers = saved.numbers["n_n"]["1"]
-    expected = numbers["1"] + 300.0 * numbers["V_D_V"] + 5.0 * numbers["mdot_mg_s"]
-    assert model.terms("n_n")["1"] == pytest.approx(expected, rel=1e-12)
-    assert model.covariance is not None
-
-
 def test_intervals_follow_the_covariance() -> None:
     bounds = law().intervals()["x", "x"]
     assert list(bounds) == ["1", "a", "b"]
-    assert law().covariance is not None
     reach = 0.5 * (bounds["1"][1] - bounds["1"][0])
     assert reach == pytest.approx(1.959964 * np.sqrt(law().covariance[0, 0]))
     with pytest.raises(ValueError, match="this law has none"):
         replace(law(), covariance=None).intervals()
 
 
+def test_intervals_by_the_jackknife_hold_the_truth() -> None:
+    """Noise that differs tenfold between the points, and coefficients that leave the law a bit."""
+    p, held = np.linspace(1.0, 3.0, 12), []
+    lib = ep.named_terms(["u", "v"], ["u", "v"])
+    relations = constrain_law(lib, {"y": ["u", "v"]}, parameters=["p"])
+    line, true = ep.polynomial(["p"], degree=1), np.array([[2.0, -3.0], [0.5, 1.0]])
+    ramp = ep.Trajectory(np.arange(3.0), np.arange(3.0)[:, None], ["y"])
+    for seed in range(60):
+        rng, problems = np.random.default_rng(seed), []
+        for value in p:
+            theta = rng.normal(size=(40, 2))
+            own = true @ [1.0, value] + 0.03 * rng.normal(size=2)
+            noise = 0.05 * 10.0 ** rng.uniform() * rng.normal(size=40)
+            rows = plain_rows(theta, (theta @ own + noise)[:, None], lib)
+            problems.append([replace(rows, trajectories=(ramp,))])
+        found = fit_rows(["p"], p[:, None], problems, relations, provenance={}).law(line)
+        ends = found.intervals()
+        held += [
+            low <= value <= high
+            for pair, row in zip(found.coefficients, true, strict=True)
+            for (low, high), value in zip(ends[pair].values(), row, strict=True)
+        ]
+    assert 0.88 <= np.mean(held) <= 0.99
+
+
+@cache
+def trial() -> LawTrial:
+    return LawTrial("free", fit(), LINEAR, np.zeros(9))
+
+
+def test_errors_at_points_left_out_are_those_of_the_laws_of_the_others() -> None:
+    for k, error in enumerate(law().left_out):
+        other = fit().law_without(k, LINEAR)
+        assert len(other.points) == 8
+        index = [LIBRARY.index(t) for _, t in law().coefficients]
+        column = [STATES.index(s) for s, _ in law().coefficients]
+        own = fit().models[k].coef[index, column]
+        off = other.at(extrapolate=True, **GRID[k]).coef[index, column] - own
+        weight = fit().information[k]
+        assert error == pytest.approx(np.sqrt(off @ weight @ off / (own @ weight @ own)), rel=1e-4)
+
+
 def test_points_left_out_live_by_the_law_of_the_others() -> None:
-    functions = fit().functions(1)
-    for found in (leave_one_out(fit(), functions), leave_one_out(fit(), functions, start=law())):
-        assert len(found) == 9
-        assert [each.run.verdict for each in found] == [ep.Verdict.LIVES] * 9
-        # A frequency read off the five periods of half a record.
-        assert max(abs(each.run.f_error) for each in found) < 5e-3
-        # Of three by three the corners are outside of what the others enclose.
-        assert [each.inside for each in found].count(True) == 5
-        assert max(each.error for each in found) < 0.5
+    found = run_left_out(trial(), records())
+    assert [each.run.verdict for each in found] == [Verdict.LIVES] * 9
+    # A frequency read off the periods of a record.
+    assert max(abs(each.run.f_error) for each in found) < 5e-3
+    # Of three by three the corners are outside of what the others enclose.
+    assert [each.inside for each in found].count(True) == 5
+    assert all(each.attracts for each in found)
+    numbers = error_statistics(found)
+    assert (numbers["n"], numbers["n_lives"], numbers["diverging"]) == (9, 9, 0)
+    assert numbers["f_90"] < 5e-3
 
 
-def test_a_run_that_diverges_counts_as_ten_bounds() -> None:
-    found = leave_one_out(fit(), fit().functions(1))[0]
-    gone = replace(found.run, verdict=ep.Verdict.DIVERGES, f_error=float("nan"))
-    assert LeaveOneOut(found.record, gone, inside=True).error == 10.0
+def test_a_point_without_a_frequency_has_an_infinite_error_of_it() -> None:
+    found = run_left_out(trial(), records())
+    gone = replace(found[0].run, verdict=Verdict.DIVERGES, f_error=float("nan"))
+    numbers = error_statistics([LeftOutRun(records()[0], gone, inside=True), *found[1:]])
+    assert numbers["n_lives"] == 8
+    assert numbers["f_90"] == np.inf
+    assert numbers["f_median"] < 5e-3
 
 
-def test_a_smooth_family_interpolates_its_own_frequency() -> None:
-    quadratic = ep.polynomial(["a", "b"], degree=2)
-    f, amplitude = interpolation_errors(records(), make_basis(quadratic, fit().points))
-    assert f.shape == amplitude.shape == (9,)
-    assert np.median(f) < 0.01
+def test_windows_tell_the_true_model_from_a_biased_one_and_one_that_blows_up() -> None:
+    (point,), record = GRID[4:5], records()[4]
+    true = model_at(**point)
+    biased, wild = (replace(true, coef=share * true.coef) for share in (1.02, -30.0))
+    right, off, gone = window_errors([true, biased, wild], record.run)
+    assert right < 1e-4
+    assert 100.0 * right < off < 1.0
+    assert gone == pytest.approx(1.0, abs=1e-3)
+    longer = window_errors([true, biased], record.run, periods=3.0)
+    assert longer[1] > 2.0 * off  # a wrong frequency shows in the phase
+
+
+def test_relations_that_hold_save_numbers_and_others_cost_errors() -> None:
+    line = [replace(recorded(a, 0.0).run, parameters={"a": a}) for a in (0.5, 0.75, 1, 1.25, 1.5)]
+    known = {"x": {"x": {"1": 0.8, "a": 0.3}}}
+    fits = {
+        "more": by_rows(line, {**STRUCTURE, "y": ["x", "y"]}),
+        "free": by_rows(line),
+        "held": by_rows(line, STRUCTURE, ["x: y == -1"], **known),
+        "wrong": by_rows(line, STRUCTURE, ["x: y == -1 * y: x"]),
+        "fewer": by_rows(line, {**STRUCTURE, "x": ["x", "y"]}),
+    }
+    straight, found = ep.polynomial(["a"], degree=1), []
+    for name, fits_of in fits.items():
+        models = [
+            fits_of.law_without(k, straight).at(extrapolate=True, **run.parameters)
+            for k, run in enumerate(line)
+        ]
+        errors = [window_errors([model], run)[0] for model, run in zip(models, line, strict=True)]
+        found.append(LawTrial(name, fits_of, straight, np.array(errors)))
+    assert [each.n_numbers for each in found] == [10, 8, 4, 6, 6]
+    errors = {each.name: each.errors.mean() for each in found}
+    assert max(errors["free"], errors["held"]) < 1e-2 * min(errors["wrong"], errors["fewer"])
+
+
+def test_of_errors_that_cannot_be_told_apart_the_fewest_numbers_are_chosen() -> None:
+    rng = np.random.default_rng(0)
+    least = 1.0 + 0.1 * rng.normal(size=9)
+    same, worse = least + 0.05 * (-1.0) ** np.arange(9) + 0.003, least + 0.3
+    assert fewest_of_least([(least, 12), (same, 6), (worse, 3)]) == 1
+    assert fewest_of_least([(least, 6), (least, 6)]) == 0
+    assert fewest_of_least([(worse, 3)]) == 0
+
+
+def test_a_fit_that_failed_tells_nothing_and_counts_as_missed() -> None:
+    information = fit().information.copy()
+    information[4] = 0.0
+    broken = [replace(m, coef=7.0 * m.coef) if k == 4 else m for k, m in enumerate(fit().models)]
+    found = replace(fit(), information=information, models=broken).law(LINEAR)
+    np.testing.assert_allclose(found.coef, truth(), atol=1e-4)
+    assert found.left_out[4] == 1.0
+    assert np.delete(found.left_out, 4).max() < 1e-3
 
 
 def test_a_point_that_the_law_needs_cannot_be_left_out() -> None:
-    corner = [0, 1, 6]
+    corner = [0, 2, 6]
     three = replace(
-        fit(), records=[records()[k] for k in corner], fits=[fit().fits[k] for k in corner]
-    )
-    with pytest.raises(ValueError, match="a=0.5, b=0 cannot be left out: a law of 3 terms needs"):
-        leave_one_out(three, three.functions(1))
-
-
-def test_a_law_that_is_tested_needs_a_point_more_than_it_has_functions() -> None:
-    functions, points = fit().functions(1), np.array([list(p.values()) for p in GRID])
-    corners = points[[0, 2, 6]]
-    assert len(functions) == 3
-    make_basis(functions, corners)
-    make_basis(functions, points[[0, 2, 6, 8]], n_spare=1)
+        fit(), points=fit().points[corner], models=[fit().models[k] for k in corner],
+        information=fit().information[corner],
+    )  # fmt: skip
     with pytest.raises(
         ValueError, match="a law of 3 functions .* more points than these.*: 3 came"
     ):
-        make_basis(functions, corners, n_spare=1)
+        three.rate_errors(LINEAR)
+    with pytest.raises(ValueError, match="a law of 3 terms needs as many points: 2 came"):
+        three.law_without(0, LINEAR)
+    found = three.law(LINEAR)
+    np.testing.assert_allclose(found.coef, truth(), atol=1e-4)
+    assert found.left_out is None
+    assert found.covariance is None
 
 
-def test_parameters_must_vary_and_be_the_same_everywhere() -> None:
+def test_a_law_that_is_tested_needs_a_point_more_than_it_has_functions() -> None:
+    points = np.array([list(p.values()) for p in GRID])
+    corners = points[[0, 2, 6]]
+    make_basis(LINEAR, corners)
+    make_basis(LINEAR, points[[0, 2, 6, 8]], n_spare=1)
+    with pytest.raises(
+        ValueError, match="a law of 3 functions .* more points than these.*: 3 came"
+    ):
+        make_basis(LINEAR, corners, n_spare=1)
+
+
+def test_parameters_must_vary_and_a_record_must_have_them() -> None:
     with pytest.raises(ValueError, match="'a' is 0.5 at all 3 operating points"):
-        check_records(records()[:3])
-    other = replace(records()[1], parameters={"a": 1.0})
-    with pytest.raises(ValueError, match=r"every operating point must have \['a', 'b'\]"):
-        check_records([records()[0], other])
-    with pytest.raises(ValueError, match="none came"):
-        check_records([])
+        make_basis(LINEAR, fit().points[:3])
+    with pytest.raises(ValueError, match=r"needs its operating point: .* parameters=\{'V_D_V'"):
+        OperatingRecord(replace(records()[0].run, parameters={}))
 
 
 def test_a_record_must_hold_six_periods() -> None:
-    run = records()[0].run
-    period = round(1.0 / (records()[0].cycle.frequency_Hz * run.dt_s))
+    run = records()[3].run
+    period = round(1.0 / (records()[3].cycle.frequency_Hz * run.dt_s))
     with pytest.raises(ValueError, match=r"a=1, b=0: its record holds 4\.\d periods of the 6"):
-        OperatingRecord.of({"a": 1.0, "b": 0.0}, run.window(0, round(4.5 * period)))
+        _ = OperatingRecord(run.window(0, round(4.5 * period))).cycle
     still = replace(run, states=1.0 + 1e-3 * np.random.default_rng(0).normal(size=run.states.shape))
     with pytest.raises(ValueError, match="its record has no period"):
-        OperatingRecord.of({"a": 1.0, "b": 0.0}, still)
-
-
-def test_a_fit_needs_terms_of_every_state_and_no_constraint() -> None:
-    with pytest.raises(ValueError, match=r"terms for each of \['x', 'y'\]"):
-        operating_fit(records(), LIBRARY, {"x": ["x"]})
-    pooled = replace(SETTINGS, constraint=ep.constraint(LIBRARY, STRUCTURE))
-    with pytest.raises(ValueError, match="laws of the operating point take no constraint"):
-        operating_fit(records(), LIBRARY, STRUCTURE, settings=pooled)
-
-
-def test_a_start_that_is_given_leaves_the_method_as_it_was_set() -> None:
-    poor = replace(law(), coef=1.2 * law().coef)
-    for method, status in ((None, "converged"), (MultipleShooting(max_iter=1), "max_iter")):
-        own = replace(fit(), settings=replace(fit().settings, method=method))
-        assert own.refine_law(own.functions(1), start=poor)[1].status == status
+        _ = OperatingRecord(still).cycle
 
 
 def test_a_free_run_starts_where_the_states_move_least() -> None:
@@ -246,11 +350,10 @@ def test_a_free_run_starts_where_the_states_move_least() -> None:
 
 def amplitudes(factors: Mapping[int, float]) -> list[OperatingRecord]:
     """The same records about a mean of ten, some larger or smaller than the family's."""
-    found = []
-    for k, record in enumerate(records()):
-        run = replace(record.run, states=10.0 + factors.get(k, 1.0) * record.run.states)
-        found.append(OperatingRecord.of(record.parameters, run))
-    return found
+    return [
+        OperatingRecord(replace(record.run, states=10.0 + factors.get(k, 1.0) * record.run.states))
+        for k, record in enumerate(records())
+    ]
 
 
 def test_records_of_a_second_cycle_are_told_apart() -> None:

@@ -104,9 +104,9 @@ def law(names: list[str], points: list[list[float]]) -> ep.operating.OperatingLa
     )
 
 
-def point(*values: float) -> ep.operating.OperatingRecord:
+def point(*values: float) -> ep.Trajectory:
     at = dict(zip(("w", "b", "c"), values, strict=False))
-    return ep.operating.OperatingRecord(replace(record(values[0], n=2000), parameters=at))
+    return replace(record(values[0], n=2000), parameters=at)
 
 
 def test_a_law_of_one_parameter_is_drawn_as_a_line_of_its_frequency() -> None:
@@ -114,8 +114,8 @@ def test_a_law_of_one_parameter_is_drawn_as_a_line_of_its_frequency() -> None:
     figure = ep.plot(law(["w"], [[3.0], [3.5]]), records, n_points=3, labels={"w": "w (rad/s)"})
     assert labels(figure)[0].startswith("frequency (")
     assert figure.axes[0].get_xlabel() == "w (rad/s)"
-    line, dots = figure.axes[0].lines[:2]
-    assert line.get_ydata()[[0, -1]] == pytest.approx(dots.get_ydata(), rel=1e-3)
+    line, dots = figure.axes[0].lines[0], figure.axes[0].collections[0].get_offsets()
+    assert line.get_ydata()[[0, -1]] == pytest.approx(np.asarray(dots)[:, 1], rel=1e-3)
 
 
 def test_a_law_of_two_parameters_is_drawn_as_a_map_and_of_three_not_at_all() -> None:

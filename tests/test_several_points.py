@@ -13,7 +13,7 @@ from benchmarks import known_laws
 from benchmarks.breathing_family import LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.selection.criteria import Selection, log_supports
-from tests.models import model_of, plain_rows
+from tests.models import plain_rows
 
 METHOD = ep.Regression(
     ep.WeightedWeak(ep.Weak(test_functions=ep.Bumps(half_width_s=1.5), split=ep.RandomSplit(0.0))),
@@ -61,7 +61,10 @@ def rows_of(
 
 
 def searched(
-    rows: Mapping[float, RegressionRows], *, selection: Selection = METHOD.selection, **asked: object
+    rows: Mapping[float, RegressionRows],
+    *,
+    selection: Selection = METHOD.selection,
+    **asked: object,
 ) -> ep.Discovery:
     """What is found from rows at points p; `points` of it has the labels "p=1" and so on."""
     ramp, values = np.arange(3.0), np.ones((3, 6))
@@ -282,9 +285,9 @@ def test_a_law_is_least_squares_over_the_rows_of_points_that_weigh_alike() -> No
     parts = [(r.theta[:, :2], r.target[:, 0]) for r in rows.values()]
 
     def pooled(kept: Sequence[int]) -> np.ndarray:
-        weights = [1.0 / np.linalg.norm(parts[k][0] * size) for k in kept]
-        design = [w * np.kron(parts[k][0], [[1.0, p[k]]]) for w, k in zip(weights, kept, strict=True)]
-        target = [w * parts[k][1] for w, k in zip(weights, kept, strict=True)]
+        weight = {k: 1.0 / np.linalg.norm(parts[k][0] * size) for k in kept}
+        design = [weight[k] * np.kron(parts[k][0], [[1.0, p[k]]]) for k in kept]
+        target = [weight[k] * parts[k][1] for k in kept]
         return np.linalg.lstsq(np.concatenate(design), np.concatenate(target))[0].reshape(2, 2)
 
     every = range(len(p))
@@ -410,7 +413,8 @@ def test_relations_and_known_coefficients_are_exact_at_points_and_in_laws(
         exclude={"n_i": ["n_n"]},
     )  # fmt: skip
     at = {"V_D": 310.0, "mdot_mgs": 4.4}
-    places = [(own.model, PARAMETERS[p]) for own, p in zip(found.points.values(), PARAMETERS)]
+    models = [own.model for own in found.points.values()]
+    places = list(zip(models, PARAMETERS.values(), strict=True))
     for model, point in [*places, (found.law.at(**at), at)]:
         n_i, n_n = model.terms("n_i"), model.terms("n_n")
         assert (set(n_i), set(n_n)) == ({"n_i", "n_i*n_n"}, {"1", "n_i*n_n"})
@@ -444,9 +448,7 @@ def predators(noise: float = 0.0) -> tuple[ep.Trajectory, ...]:
 
 
 def test_roles_hold_at_every_point_and_in_the_law() -> None:
-    roles = ep.Roles(
-        exchange=[("x", "y")], outflow=["y"], inflow={"x": ["x"]}, nonnegative=True
-    )
+    roles = ep.Roles(exchange=[("x", "y")], outflow=["y"], inflow={"x": ["x"]}, nonnegative=True)
     method = ep.Regression(selection=ep.FreeRunScore())
     found = ep.discover(predators(), method=method, roles=roles, law=1)
     for model in [*(own.model for own in found.points.values()), found.law.at(a=0.65)]:
@@ -460,7 +462,9 @@ def test_points_without_a_law_are_searched_alone_as_by_themselves() -> None:
     assert found.law is None
     assert list(found.points) == [f"a={a}" for a in (0.5, 0.6, 0.7, 0.8, 0.9)]
     for run, own in zip(runs, found.points.values(), strict=True):
-        assert own.model.coef == pytest.approx(ep.discover(run, method=method).model.coef, rel=1e-12)
+        assert own.model.coef == pytest.approx(
+            ep.discover(run, method=method).model.coef, rel=1e-12
+        )
     assert found.model == found.points["a=0.7"].model  # the most central point's
     head = repr(found).splitlines()[0]
     assert head.startswith("Discovery of 2 equations at 5 operating points, each alone")
@@ -488,9 +492,17 @@ UNLIKE = "runs of several operating points need the same parameters"
         ({"parameters": {}}, {"law": 1}, UNLIKE),
         ({"parameters": {"b": 1.0}}, {}, UNLIKE),
         ({"parameters": {"a": 1.0, "b": 1.0}}, {}, UNLIKE),
-        ({"units": {"x": "m^-3"}}, {"law": 1}, "'x' is in 1 in trajectory 0 and in m.-3 in trajectory 2"),
+        (
+            {"units": {"x": "m^-3"}},
+            {"law": 1},
+            "'x' is in 1 in trajectory 0 and in m.-3 in trajectory 2",
+        ),
         ({}, {"law": 4}, "a law of 5 terms needs as many points: 3 came"),
-        ({"parameters": {"a": 0.6}}, {"law": "auto"}, r"a law of 2 functions of \['a'\] needs more points"),
+        (
+            {"parameters": {"a": 0.6}},
+            {"law": "auto"},
+            r"a law of 2 functions of \['a'\] needs more points",
+        ),
         ({}, {"law": ep.named_terms(["b"], ["1", "b"])}, r"must be of \['a'\]: \['b'\] came"),
         ({}, {"law": []}, "must name degrees or functions"),
         ({}, {"law": 1, "hidden": ["z"]}, r"samples of every state: .*z.* came as hidden"),
