@@ -107,7 +107,7 @@ def _errors(found: ep.Discovery) -> dict[str, float]:
 def family(n_realizations: int) -> None:
     rows = run_family(METHOD, noises=NOISES, n_realizations=n_realizations, workers=Loky())
     print(f"right supports, % of {n_realizations} realizations")
-    print(100.0 * rows.groupby("noise")[["together", "pooled", *PARAMETERS]].mean())
+    print((100.0 * rows.groupby("noise")[["together", "pooled", *PARAMETERS]].mean()).to_string())
     print("median relative error of the coefficients where the support of all points is right")
     print(rows.groupby("noise")[list(ERRORS)].median())
 

@@ -11,7 +11,7 @@ from ep2sindy.app.runner import run_config
 from tests.programs import composed
 from tests.test_pages import TOYS
 
-TWICE = "points=[{V_D_V: 300, mdot_mg_s: 5},{V_D_V: 300.0, mdot_mg_s: 5}]"
+TWICE = "points=[{V_D_V: 300, mdot_mg_s: 5},{V_D_V: 300, mdot_mg_s: 5, data: {n_cells: 40}}]"
 ALIKE = "points=[{V_D_V: 1, mdot_mg_s: 5},{V_D_V: 2, mdot_mg_s: 5}]"
 LINE = "{V_D_V: 300, mdot_mg_s: [4, 5, 6, 7]}"
 FEW = "{V_D_V: 300, mdot_mg_s: [4, 5]}, {V_D_V: 310, mdot_mg_s: 4}"
@@ -50,14 +50,14 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
         ("parametric", ["models.free.quantities.L_m.power=3"], "the power 1 or -1"),
         ("parametric", ["models.free.quantities.L_m.coefficient='n_i: 1'"], "'1' is not in"),
         ("parametric", ["windows.n_windows=0"], "windows.n_windows must be a whole number, one or"),
-        ("parametric", ["law=0"], "law must be a whole number, one or more: 0 came"),
+        ("parametric", ["law=0"], "law must be a degree of one or more, names of functions"),
         ("parametric", ["thesis.free=[{V_D_V: 200}]"], "thesis must give ['V_D_V', 'mdot_mg_s']"),
         ("pointwise", ["bootstraps.n=0"], "a pointwise study needs bootstraps for its spread"),
         ("pointwise", ["outline.inner_radius=0.06"], "inner_radius must be below outer_radius"),
         ("pointwise", ["terms=[n_i-n_n]"], "a term is variables joined by *"),
         ("pointwise", ["terms=[n_i*B]"], "unknown variables ['B']; this field has"),
         ("pointwise", ["bootstraps.block=100000"], "no point could be fitted: a block must hold"),
-        ("predict", ["models.conserving.terms.n_i=[n_i,u_iz]"], "runs freely, on its states ['n_i"),
+        ("predict", ["models.conserving.terms.n_i=[n_i,u_iz]"], "conserving cannot hold: relation"),
         ("predict", ["models.conserving.terms.n_n=[]"], "must list the terms of every state"),
         (
             "predict",

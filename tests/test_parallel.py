@@ -118,6 +118,7 @@ def test_a_piece_has_one_thread(workers: Workers) -> None:
     assert set(dict(workers.run(n_threads, range(2))).values()) == {1}
 
 
+@pytest.mark.slow
 def test_a_study_of_points_finds_the_same_numbers_on_dask(address: str, tmp_path: Path) -> None:
     """Its fits, laws of the points left out, and the map of its law."""
     for a in (0.6, 0.9, 1.2):

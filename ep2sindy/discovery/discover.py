@@ -13,12 +13,12 @@ from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import IdentifiedEquations, as_in, judge_noise
 from ep2sindy.discovery.method import DiscoveryMethod, TrajectorySearch
-from ep2sindy.discovery.result import Discovery
+from ep2sindy.discovery.result import Discovery, join_points
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.library.roles import Roles
 from ep2sindy.operating.law import NOTHING, Known, LawFunctions
-from ep2sindy.operating.records import group_by_point, most_central, read_points
+from ep2sindy.operating.records import group_by_point, most_central, values_of
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
@@ -99,32 +99,50 @@ def discover(
         )
     if not together and len(points) == 1:
         return _discover_point((task, rng), method=method, progress=watch)
-    if not trajectories[0].parameters:
-        raise ValueError(
-            "a law or a shared support needs runs of several operating points, which carry their "
-            "parameters: Trajectory(..., parameters={'V_D_V': 300.0}), or ep.read_runs("
-            "'runs/V{V_D_V}.csv'); runs without parameters came"
-        )
-    # This loads torch, only for several operating points.
-    from ep2sindy.discovery.several_points import PointsTask, join_points
-
-    values = read_points(
-        [own[0].parameters for own in points.values()], list(trajectories[0].parameters)
-    )
-    tasks = [replace(task, runs=own) for own in points.values()]
     if not together:
-        pieces = list(zip(tasks, rng.spawn(len(tasks)), strict=True))
-        stage = watch.stage(len(pieces), "point", "discovery")
-        found = collect(workers or Serial(), partial(_discover_point, method=method), pieces, stage)
-        return join_points(dict(zip(points, found, strict=True)), values)
+        return _discover_each(task, points, method, rng, workers or Serial(), watch)
+    return _discover_together(task, points, method, law, known, rng, watch)
+
+
+def _discover_each(
+    task: Task,
+    points: Mapping[str, Sequence[Trajectory]],
+    method: DiscoveryMethod,
+    rng: np.random.Generator,
+    workers: Workers,
+    progress: Progress,
+) -> Discovery:
+    """Every point searched alone."""
+    tasks = [replace(task, runs=runs) for runs in points.values()]
+    pieces = list(zip(tasks, rng.spawn(len(tasks)), strict=True))
+    stage = progress.stage(len(pieces), "point", "discovery")
+    found = collect(workers, partial(_discover_point, method=method), pieces, stage)
+    return join_points(dict(zip(points, found, strict=True)), values_of(points))
+
+
+def _discover_together(
+    task: Task,
+    points: Mapping[str, Sequence[Trajectory]],
+    method: DiscoveryMethod,
+    law: LawFunctions | Sequence[LawFunctions] | None,
+    known: Known,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> Discovery:
+    """One support for all points, and the law of its coefficients if one is asked for."""
+    # This loads torch, only for a law or a support of several operating points.
+    from ep2sindy.discovery.several_points import PointsTask
+
     structure = None
-    if roles is not None:
-        structure = _discover_point((tasks[most_central(values)], rng), method=method).constraint
+    if task.roles is not None:
+        middle = list(points.values())[most_central(values_of(points))]
+        one = replace(task, runs=middle)
+        structure = _discover_point((one, rng), method=method).constraint
         assert structure is not None
         terms = {s: [t for state, t in structure.coefficients if state == s] for s in task.states}
         task = replace(task, roles=None, terms=terms)
     several = PointsTask(task, points, known, method, structure)
-    return several.discover(law, rng=rng, progress=watch)
+    return several.discover(law, rng=rng, progress=progress)
 
 
 def _discover_point(

@@ -25,6 +25,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.storage import read_as, read_stored
 from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.records import most_central
 from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.front import Candidate, Cloud, LeftOver, ParetoFront
 from ep2sindy.runtime.files import read_json, write_text
@@ -240,6 +241,16 @@ class Discovery:
             for own in others
             for state in first.scores
         )
+
+
+def join_points(
+    points: Mapping[str, Discovery],
+    values: Float[np.ndarray, "points parameters"],
+    law: OperatingLaw | None = None,
+) -> Discovery:
+    """The discoveries of all points as one, which shows that of the most central point."""
+    central = list(points.values())[most_central(values)]
+    return replace(central, points=points, law=law)
 
 
 # Fields of a Discovery that are stored beside the model, and the kind of each or of its values.

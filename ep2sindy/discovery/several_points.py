@@ -12,7 +12,7 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import as_in
 from ep2sindy.discovery.method import DiscoveryMethod, Regression, TrajectorySearch
-from ep2sindy.discovery.result import Discovery
+from ep2sindy.discovery.result import Discovery, join_points
 from ep2sindy.discovery.shared_support import SharedFront, check_shared, search_shared
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation
@@ -25,7 +25,7 @@ from ep2sindy.operating.law import (
     law_of_constraint,
 )
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
-from ep2sindy.operating.records import most_central, read_points
+from ep2sindy.operating.records import values_of
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.regression.ambiguity import ambiguities
 from ep2sindy.regression.pooled import fewest_of_least
@@ -79,7 +79,7 @@ class PointsTask:
 
     @property
     def values(self) -> Float[np.ndarray, "points parameters"]:
-        return read_points([runs[0].parameters for runs in self.points.values()], self.parameters)
+        return values_of(self.points)
 
     def discover(
         self,
@@ -184,16 +184,6 @@ class PointsTask:
             start = replace(rows, models=models)
         runs = list(self.points.values())
         return fit_trajectories(start, runs, WINDOWS, seed=rng, progress=progress)
-
-
-def join_points(
-    points: Mapping[str, Discovery],
-    values: Float[np.ndarray, "points parameters"],
-    law: OperatingLaw | None = None,
-) -> Discovery:
-    """The discoveries of all points as one, which shows that of the most central point."""
-    central = list(points.values())[most_central(values)]
-    return replace(central, points=points, law=law)
 
 
 def choose_law(fits: PointFits, law: LawFunctions | Sequence[LawFunctions]) -> OperatingLaw:

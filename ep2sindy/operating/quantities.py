@@ -173,6 +173,7 @@ def fit_control_law(
     """
     _check(values, parameters, library, max_terms)
     theta = library.evaluate(parameters)
+    max_terms = max_terms or max(1, len(values) // POINTS_PER_TERM)
     support, coef, left_out = _search(values, theta, max_terms)
     fitted = theta[:, support] @ coef
     searched = np.empty_like(values)
@@ -207,14 +208,14 @@ def _check(
 
 
 def _search(
-    values: np.ndarray, theta: np.ndarray, max_terms: int | None
+    values: np.ndarray, theta: np.ndarray, max_terms: int
 ) -> tuple[list[int], np.ndarray, np.ndarray]:
     """Columns of a law, their coefficients, and values at points left out.
 
     Of all supports up to a size, one of fewest terms whose error cannot be told from the least.
     """
     n_points, n_terms = theta.shape
-    largest = max(1, min(n_terms, n_points - 2, max_terms or n_points // POINTS_PER_TERM))
+    largest = max(1, min(n_terms, n_points - 2, max_terms))
     floor = ROUNDING * np.sqrt(np.square(values).mean())
     found: list[tuple[list[int], np.ndarray]] = []
     for size in range(1, largest + 1):

@@ -160,6 +160,18 @@ def read_points(
     return np.array([[float(point[name]) for name in names] for point in points])
 
 
+def values_of(points: Mapping[str, Sequence[Trajectory]]) -> Float[np.ndarray, "points parameters"]:
+    """Parameters of all points. Raises ValueError for runs without parameters."""
+    first = [runs[0].parameters for runs in points.values()]
+    if not first[0]:
+        raise ValueError(
+            "a law or a shared support needs runs of several operating points, which carry their "
+            "parameters: Trajectory(..., parameters={'V_D_V': 300.0}), or ep.read_runs("
+            "'runs/V{V_D_V}.csv'); runs without parameters came"
+        )
+    return read_points(first, list(first[0]))
+
+
 def most_central(points: Float[np.ndarray, "points parameters"]) -> int:
     """Index of the point that is nearest to the mean of all."""
     off = (points - points.mean(axis=0)) / zero_to_one(np.ptp(points, axis=0))

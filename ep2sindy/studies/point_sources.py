@@ -11,7 +11,6 @@ from typing import Annotated, Any
 from ep2sindy.data.quantities import STEP_DOUBT
 from ep2sindy.data.run_files import FilePattern
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
-from ep2sindy.operating.given_models import PointResult
 from ep2sindy.operating.records import Point, name_point
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, collect
@@ -29,6 +28,13 @@ Points = Annotated[
         "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}], or a pattern of files, "
         "'points.files=runs/V{V_D_V}_m{mdot_mg_s}.csv'",
         lambda value: isinstance(value, list | str) and bool(value),
+    ),
+]
+Functions = Annotated[
+    int | Sequence[str] | None,
+    Check(
+        "a degree of one or more, names of functions like ['1',V_D_V], or null for a choice",
+        lambda value: isinstance(value, list | None) or (type(value) is int and value > 0),
     ),
 ]
 
@@ -201,11 +207,11 @@ def open_points(
     return points
 
 
-def nothing_moves(points: Sequence[OpenedPoint] | Sequence[PointResult]) -> str:
+def nothing_moves(statuses: Sequence[str]) -> str:
     """Why there is nothing to fit where no point oscillates, and what to try."""
-    statuses = ", ".join(sorted({str(point.status) for point in points}))
     return (
-        f"none of the {len(points)} operating points oscillates ({statuses}), so there is no fit: "
+        f"none of the {len(statuses)} operating points oscillates "
+        f"({', '.join(sorted(set(statuses)))}), so there is no fit: "
         "try the part of the records behind the start-up "
         "('prepare=[{_target_:ep2sindy.prepare.crop,start_s:...}]'), another zone "
         "(trajectory.zone.z=...), or other points"

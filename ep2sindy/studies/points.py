@@ -42,6 +42,7 @@ from ep2sindy.signals.trace import MIN_PERIODS, prepare_signal
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.law_tables import FoundLaw, find_law
 from ep2sindy.studies.point_sources import (
+    Functions,
     GivenPoints,
     OpenedPoint,
     Points,
@@ -109,7 +110,7 @@ class Study:
     points: Points
     models: Mapping[str, ModelSettings] | None
     windows: RefiningWindows | None
-    law: Count | Sequence[str] | None
+    law: Functions
     labels: Mapping[str, str]
     map_points: CountOrNone = None
     degree: CountOrNone = None
@@ -193,7 +194,7 @@ class Study:
                 except ValueError as error:
                     run.warn(str(error))
         if not any(result.fits for result in results):
-            raise ValueError(nothing_moves(results))
+            raise ValueError(nothing_moves([result.status for result in results]))
         if not known:
             raise ValueError(
                 f"a law needs records of {MIN_PERIODS:g} periods or more: none has them"
@@ -234,12 +235,13 @@ class Study:
     ) -> dict[str, ModelSettings]:
         """Models of the terms that a search of all points finds; points left out choose of them.
 
-        They are all combinations of the best supports of some sizes. Of a signal, the first
-        equation is known, and the rows of the second are those of smoothed samples.
+        They are all combinations of the best supports of some sizes, or of a state whose front ends
+        before these, as that of x' = y does, of the best support. Of a signal, the first equation
+        is known, and the rows of the second are those of smoothed samples.
         """
         runs = [point.run for point in opened if point.run is not None]
         if not runs:
-            raise ValueError(nothing_moves(opened))
+            raise ValueError(nothing_moves([point.status for point in opened]))
         sizes, n_best = (SIGNAL_SIZES, 2) if signal else (SIZES, 1)
         known = signal.terms if signal else {}
         library = polynomial(runs[0].state_names, degree=self.degree or (3 if signal else 2))
@@ -253,7 +255,7 @@ class Study:
         supports = {
             state: [known[state]]
             if state in known
-            else [c.terms for c in front.candidates if c.n_terms in sizes]
+            else [c.terms for c in front.candidates if c.n_terms in sizes] or [front.best.terms]
             for state, front in found.fronts.items()
         }
         if prod(map(len, supports.values())) > MOST_FOUND:
