@@ -211,9 +211,8 @@ def known_records(folder: Path, system: str) -> list[str]:
 def test_the_law_of_known_records_is_headlined(
     experiment: str, system: str, tmp_path: Path
 ) -> None:
-    settings = known_records(tmp_path, system)
-    if experiment == "predict":
-        settings.append("map_points=2")
+    own = {"parametric": "thesis=null", "predict": "map_points=2"}[experiment]
+    settings = [*known_records(tmp_path, system), own]
     found = programs.computed(programs.composed(f"+exp={experiment}", *settings))
     summary = found.summary["law"]
     # Rows have the bias of smoothing: the refined coefficients are right.

@@ -32,6 +32,7 @@ LAW = {"x": {"x": (0.8, 0.3, 0.0), "y": (-1.0, 0.0, -0.2), "x^3": (-0.4, 0.0, 0.
 SHORT = ep.RefinementSettings(n_windows=3, periods=1.0, n_reweights=0)
 GRID = [{"a": a, "b": b} for a in (0.5, 1.0, 1.5) for b in (0.0, 0.5, 1.0)]
 LINEAR = ep.polynomial(["a", "b"], degree=1)
+LINE = (0.5, 0.75, 1.0, 1.25, 1.5)
 
 
 def model_at(a: float, b: float) -> ep.SparseModel:
@@ -254,7 +255,7 @@ def test_windows_tell_the_true_model_from_a_biased_one_and_one_that_blows_up() -
 
 
 def test_relations_that_hold_save_numbers_and_others_cost_errors() -> None:
-    line = [replace(recorded(a, 0.0).run, parameters={"a": a}) for a in (0.5, 0.75, 1, 1.25, 1.5)]
+    line = [replace(recorded(a, 0.0).run, parameters={"a": a}) for a in LINE]
     known = {"x": {"x": {"1": 0.8, "a": 0.3}}}
     fits = {
         "more": by_rows(line, {**STRUCTURE, "y": ["x", "y"]}),

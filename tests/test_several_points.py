@@ -235,7 +235,9 @@ def test_points_may_be_sampled_differently_and_have_several_runs() -> None:
         ep.lotka_volterra(b=0.5).trajectory(),
     )
     parts = [slow.window(0, 600), fast, slow.window(600, 1000)]  # runs of a point need not follow
-    runs = [replace(run, parameters={"b": b}) for run, b in zip(parts, (0.5, 1, 0.5), strict=True)]
+    runs = [
+        replace(run, parameters={"b": b}) for run, b in zip(parts, (0.5, 1.0, 0.5), strict=True)
+    ]
     library = ep.polynomial(["x", "y"], degree=3)
     method = ep.Regression(ep.WeightedWeak(), ep.BestSubset(), selection=ep.EBIC())
     found = ep.discover(runs, library, method, shared=True)

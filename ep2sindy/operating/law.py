@@ -73,7 +73,7 @@ class OperatingLaw:
     covariance: Float[np.ndarray, "_ _"] | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
-    left_out: Float[np.ndarray, " points"] | None = None
+    left_out: Float[np.ndarray, " _"] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "coef", read_only(self.coef))
