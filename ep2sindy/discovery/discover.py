@@ -89,7 +89,6 @@ def discover(
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")
     terms, exclude = ({} if given is None else given for given in (terms, exclude))
     task = Task(trajectories, library, relations_of(relations), terms, roles, hidden, exclude)
-    points = group_by_point(task.runs, [v for v in library.variables if v not in hidden])
     rng, watch = np.random.default_rng(seed), as_progress(progress)
     together = shared or law is not None
     if known and not together:
@@ -97,8 +96,9 @@ def discover(
             "known coefficients are functions of the parameters of several operating points: give "
             "law=1 or shared=True as well, or relations=['x: y == 1'] for runs of one point"
         )
-    if not together and len(points) == 1:
+    if not together and all(run.parameters == task.runs[0].parameters for run in task.runs):
         return _discover_point((task, rng), method=method, progress=watch)
+    points = group_by_point(task.runs, [v for v in library.variables if v not in hidden])
     if not together:
         return _discover_each(task, points, method, rng, workers or Serial(), watch)
     return _discover_together(task, points, method, law, known, rng, watch)
