@@ -83,7 +83,7 @@ def between_gaps(t: Float[np.ndarray, " samples"]) -> list[tuple[int, int]]:
     return list(pairwise([0, *cuts.tolist(), len(t)]))
 
 
-def mean_step(*times: Float[np.ndarray, " samples"]) -> float:
+def mean_step(*times: Float[np.ndarray, " _"]) -> float:
     """Mean step of the times of one record or several, in their unit, gaps left out."""
     spans = [(t[b - 1] - t[a], b - 1 - a) for t in times for a, b in between_gaps(t)]
     duration, n_steps = np.sum(spans, axis=0)
