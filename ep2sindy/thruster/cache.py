@@ -94,7 +94,7 @@ def read(path: Path) -> xr.Dataset:
 def write(field: xr.Dataset, path: Path) -> None:
     """Write a file with checksums, completely or not at all.
 
-    It is not compressed: that would save a third of the space, for twenty times the time.
+    It is not compressed: that would save a third of the space, for twice the time.
     """
     checked = {str(variable): {"fletcher32": True} for variable in field.data_vars}
     write_netcdf(field, path, encoding=checked)
