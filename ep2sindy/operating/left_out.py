@@ -19,12 +19,10 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import smooth_batch
 from ep2sindy.refinement.steps import FusedRungeKutta
 from ep2sindy.refinement.windows import cut_windows, dominant_window
+from ep2sindy.selection.free_run import PULL
 
 # Windows of every record that is left out, and steps of the integration in each of its samples.
 N_WINDOWS, N_SUBSTEPS = 20, 4
-
-# Largest Floquet multiplier of a cycle that attracts.
-PULL = 0.95
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, product
 
@@ -219,20 +219,11 @@ def fit_trajectories(
     fits = refine(
         start.models, runs, settings, constraints=constraints, seed=seed, progress=progress
     )
-    return of_refinements(start.parameters, start.points, start.relations, fits)
-
-
-def of_refinements(
-    parameters: Sequence[str],
-    points: Float[np.ndarray, "points parameters"],
-    relations: LawConstraint,
-    fits: Sequence[Refinement],
-) -> PointFits:
-    """Refinements of all points; one that failed tells nothing of the coefficients."""
-    information = [information_of(fit, relations.common) for fit in fits]
-    models = [fit.model for fit in fits]
-    return PointFits(
-        tuple(parameters), points, relations, models, np.array(information), "trajectories"
+    return replace(
+        start,
+        models=[fit.model for fit in fits],
+        information=np.array([information_of(fit, start.relations.common) for fit in fits]),
+        how="trajectories",
     )
 
 

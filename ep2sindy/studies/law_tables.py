@@ -24,7 +24,7 @@ from ep2sindy.operating.left_out import (
 )
 from ep2sindy.operating.map import Fate, MapPoint, law_map, map_points
 from ep2sindy.operating.point_fits import PointFits
-from ep2sindy.operating.records import OperatingRecord, Point
+from ep2sindy.operating.records import OperatingRecord, Point, most_central, read_points
 from ep2sindy.regression.pooled import fewest_of_least
 from ep2sindy.report.document import (
     Block,
@@ -263,9 +263,8 @@ class FoundLaw:
     @property
     def middle(self) -> OperatingRecord:
         """The record whose parameters are nearest to the mean of all."""
-        values = pd.DataFrame([dict(record.parameters) for record in self.records])
-        off = (values - values.mean()) / (values.max() - values.min()).replace(0.0, 1.0)
-        return self.records[int(np.square(off).sum(axis=1).to_numpy().argmin())]
+        points = read_points([record.parameters for record in self.records], self.parameters)
+        return self.records[most_central(points)]
 
     def in_short(self, statuses: Mapping[str, bool], drawn: Mapping[str, Any]) -> Result:
         """The law at the middle point, how it does at points left out, and what others do."""
