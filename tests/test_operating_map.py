@@ -47,6 +47,15 @@ def test_a_cycle_begins_where_the_fixed_point_turns_unstable() -> None:
     assert np.isnan(found[0].frequency_Hz)
 
 
+def test_a_law_of_some_parameters_is_mapped_at_points_of_more() -> None:
+    near = at_one()
+    more = replace(near, run=replace(near.run, parameters={"b": 7.0, "a": 1.0}))
+    (alone,) = law_map(hopf(), [near], [{"a": 1.2}])
+    (found,) = law_map(hopf(), [more], [{"b": 7.0, "a": 1.2}])
+    assert found.frequency_Hz == alone.frequency_Hz
+    assert found.parameters == {"b": 7.0, "a": 1.2}
+
+
 def test_a_start_where_a_state_passes_through_zero_ends_no_run() -> None:
     near = at_one()
     states = near.run.states.copy()

@@ -23,6 +23,7 @@ from ep2sindy.operating.law import (
     OperatingLaw,
     constrain_law,
     law_of_constraint,
+    read_law,
 )
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
 from ep2sindy.operating.records import values_of
@@ -177,11 +178,7 @@ class PointsTask:
         start = rows
         if law is not None:
             at = [dict(zip(self.parameters, each, strict=True)) for each in rows.points.tolist()]
-            models = [
-                law.at(extrapolate=True, **{name: point[name] for name in law.parameters})
-                for point in at
-            ]
-            start = replace(rows, models=models)
+            start = replace(rows, models=[read_law(law, point) for point in at])
         runs = list(self.points.values())
         return fit_trajectories(start, runs, WINDOWS, seed=rng, progress=progress)
 

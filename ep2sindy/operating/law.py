@@ -159,9 +159,13 @@ class OperatingLaw:
         provenance = {**self.provenance, "point": where}
         return SparseModel(self.library, self.states, coef, self.units, provenance, covariance)
 
-    def is_inside(self, parameters: Mapping[str, float]) -> bool:
+    def own(self, point: Mapping[str, float]) -> dict[str, float]:
+        """The parameters of a point on which the law depends."""
+        return {name: point[name] for name in self.parameters}
+
+    def is_inside(self, point: Mapping[str, float]) -> bool:
         """True if a point lies in the convex hull of the fitted points."""
-        return in_hull(self.points, read_points([parameters], self.parameters)[0])
+        return in_hull(self.points, read_points([self.own(point)], self.parameters)[0])
 
     def intervals(self, *, level: float = 0.95) -> dict[tuple[str, str], dict[str, Any]]:
         """(state, term) -> function -> lower and upper bound of its factor, for Gaussian errors.
@@ -256,6 +260,11 @@ class OperatingLaw:
     @staticmethod
     def load(path: str | Path) -> OperatingLaw:
         return read_stored(Path(path), OperatingLaw.from_json)
+
+
+def read_law(law: OperatingLaw, point: Mapping[str, float]) -> SparseModel:
+    """The law's model at a point, extrapolated if need be; the point may have more parameters."""
+    return law.at(extrapolate=True, **law.own(point))
 
 
 def in_hull(

@@ -13,6 +13,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun, cycle_of, free_run
 from ep2sindy.model.model import SparseModel
+from ep2sindy.operating.law import read_law
 from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.operating.records import OperatingRecord
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
@@ -93,9 +94,8 @@ def run_left_out(trial: LawTrial, records: Sequence[OperatingRecord]) -> list[Le
     runs = []
     for k, record in enumerate(records):
         law = trial.fits.law_without(k, trial.functions)
-        point = {name: record.parameters[name] for name in law.parameters}
-        run = free_run(law.at(extrapolate=True, **point), record.from_slowest)
-        runs.append(LeftOutRun(record, run, law.is_inside(point)))
+        run = free_run(read_law(law, record.parameters), record.from_slowest)
+        runs.append(LeftOutRun(record, run, law.is_inside(record.parameters)))
     return runs
 
 

@@ -15,7 +15,7 @@ from ep2sindy.model.fixed_point import rest_point
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import CycleStability, limit_cycle
-from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.law import OperatingLaw, read_law
 from ep2sindy.operating.records import OperatingRecord, Point, read_points
 from ep2sindy.signals.spectrum import SIMULATED, relative_amplitude
 
@@ -90,7 +90,7 @@ def law_map(
     law: OperatingLaw, records: Sequence[OperatingRecord], points: Sequence[Point]
 ) -> list[MapPoint]:
     """The law's models at given operating points, each started from the nearest record."""
-    values = read_points([record.parameters for record in records], law.parameters)
+    values = read_points([law.own(r.parameters) for r in records], law.parameters)
     scale = zero_to_one(np.ptp(values, axis=0))
     found = []
     for point in points:
@@ -101,7 +101,7 @@ def law_map(
 
 
 def _map_point(law: OperatingLaw, record: OperatingRecord, point: Point) -> MapPoint:
-    model = law.at(extrapolate=True, **point)
+    model = read_law(law, point)
     period_s = 1.0 / record.cycle.frequency_Hz
     start = record.run.states[record.slowest]
     mean, frequency_Hz, amplitude, second = record.cycle.mean, np.nan, np.nan, np.nan

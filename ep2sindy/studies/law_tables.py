@@ -14,7 +14,7 @@ from jaxtyping import Float
 from ep2sindy.figures.operating import cycle_figure, frequency_scale, laws_figure, left_out_figure
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.given_models import REFINED
-from ep2sindy.operating.law import LawFunctions, OperatingLaw
+from ep2sindy.operating.law import LawFunctions, OperatingLaw, read_law
 from ep2sindy.operating.left_out import (
     LawTrial,
     LeftOutRun,
@@ -108,8 +108,7 @@ class FoundLaw:
         return list(self.records[0].parameters)
 
     def model_at(self, point: Point) -> SparseModel:
-        own = {name: point[name] for name in self.law.parameters}
-        return self.law.at(extrapolate=True, **own)
+        return read_law(self.law, point)
 
     @cached_property
     def statistics(self) -> dict[str, float | int]:
@@ -160,14 +159,9 @@ class FoundLaw:
 
     def agreement(self, statuses: Mapping[str, bool]) -> tuple[int, int]:
         """At how many points the law says rightly whether they oscillate: all, and quiet ones."""
-        right = [
-            (point.fate is Fate.OSCILLATES) == oscillates
-            for point, oscillates in zip(self.at_points, statuses.values(), strict=True)
-        ]
-        quiet = [
-            r for r, oscillates in zip(right, statuses.values(), strict=True) if not oscillates
-        ]
-        return sum(right), sum(quiet)
+        says = np.array([point.fate is Fate.OSCILLATES for point in self.at_points])
+        does = np.array(list(statuses.values()))
+        return int((says == does).sum()), int((~says & ~does).sum())
 
     def tables(self) -> dict[str, pd.DataFrame]:
         return {
@@ -379,11 +373,8 @@ def _leave_out(
 ) -> Float[np.ndarray, " trials"]:
     """Errors of the laws of all fits at one point, each of the other points."""
     number, record = numbered
-    models = []
-    for trial in trials:
-        law = trial.fits.law_without(number, trial.functions)
-        point = {name: record.parameters[name] for name in law.parameters}
-        models.append(law.at(extrapolate=True, **point))
+    laws = [trial.fits.law_without(number, trial.functions) for trial in trials]
+    models = [read_law(law, record.parameters) for law in laws]
     return window_errors(models, record.run, periods=periods)
 
 
