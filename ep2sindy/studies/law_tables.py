@@ -252,7 +252,7 @@ class FoundLaw:
         model = self.model_at(middle.parameters)
         equations: list[Block] = [display_equation(model, state) for state in model.states]
         blocks = [*exact, Text(text), *equations, Table(pd.DataFrame(shown), note=INTERVALS)]
-        return Section(f"Law of {self.choice.name}", [*blocks, Picture("laws")])
+        return Section(f"Law of {spoken(self.choice.name)}", [*blocks, Picture("laws")])
 
     @property
     def middle(self) -> OperatingRecord:
