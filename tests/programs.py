@@ -20,10 +20,10 @@ from omegaconf import DictConfig
 import ep2sindy as ep
 from ep2sindy.app.arguments import mend
 from ep2sindy.app.main import main
-from ep2sindy.app.runner import about, start_run, study_class
-from ep2sindy.app.schema import study_of
+from ep2sindy.app.runner import purpose_of, start_run, study_class
+from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.report.document import Result
-from ep2sindy.report.page import page_html
+from ep2sindy.report.report import Report
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "exp").glob("*.yaml"))
@@ -57,37 +57,37 @@ def composed_of(groups: tuple[str, ...]) -> DictConfig:
 class Computed:
     """What a study finds and says: all but figures, which take most of a toy run's time."""
 
-    outcome: Any
+    report: Report
     log: str
     page: str
-    folder: Path
-    warnings: Sequence[str]
+
+    @property
+    def folder(self) -> Path:
+        return self.report.folder.path
 
     @property
     def summary(self) -> dict[str, Any]:
-        return self.outcome.summary()
+        return summary_of(self.folder)
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        return self.report.warnings
 
     def check_figures(self, *names: str) -> None:
         """Each of these can be drawn; that it can be printed, the full run of a study shows."""
-        figures = self.outcome.figures()
         for name in names:
-            assert figures[name].draw().axes, name
+            assert self.report.figures[name].draw().axes, name
 
 
 def computed(config: DictConfig) -> Computed:
-    with start_run(config) as run:
-        study = study_of(study_class(config.study), config)
-        outcome = study.compute(run)
-        sections = outcome.sections()
-        result = outcome.in_short()
-        run.screen.show(sections)
-        page = page_html(config.experiment, sections, {}, about(run, study), result=result)
-        run.screen.conclude(result, run.folder.path)
-        for end in run.ends:
-            end()
-        log = (run.folder.path / "run.log").read_text()
-    check_end(log, page, result, run.folder.path)
-    return Computed(outcome, log, page, run.folder.path, run.warnings)
+    with start_run(config) as report:
+        kind = study_class(config.study)
+        study_of(kind, config).run(report)
+        report.finish(purpose=purpose_of(kind), keys=keys_of(kind), formats=())
+    log, page = ((report.folder.path / name).read_text() for name in ("run.log", "report.html"))
+    assert report.result is not None
+    check_end(log, page, report.result, report.folder.path)
+    return Computed(report, log, page)
 
 
 def summary_of(folder: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from importlib import import_module
@@ -18,20 +18,18 @@ import ep2sindy.studies
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
-from ep2sindy.report.about import ASIDE, About, by_place, settings_used
+from ep2sindy.report.about import ASIDE
 from ep2sindy.report.folder import FORMATS, RunFolder
-from ep2sindy.report.page import page_html
-from ep2sindy.report.picture import draw
-from ep2sindy.report.run import Run
-from ep2sindy.report.screen import PAGE, Screen
+from ep2sindy.report.report import Report
+from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
-from ep2sindy.runtime.progress import Bars, count_pieces
-from ep2sindy.studies.study import Experiment, Outcome
+from ep2sindy.runtime.progress import Bars
+from ep2sindy.studies.study import Experiment
 from ep2sindy.trust.user_code import load_user_module
 
 
 def run_config(config: DictConfig) -> Path:
-    """Build the study that a config names, compute it, and write its outcome; its run folder."""
+    """Build the study that a config names, and run it; returns its run folder."""
     check_common(config)
     formats = formats_of(config)
     with Bars().stage(3, "step", "loading") as advance:
@@ -42,10 +40,15 @@ def run_config(config: DictConfig) -> Path:
         study: Experiment = study_of(kind, config)  # an invalid setting leaves no run folder
         advance(1)
     warm()
-    with start_run(config) as run:
-        outcome = study.compute(run)
-        write(run, outcome, study, formats)
-    return run.folder.path
+    with start_run(config) as report:
+        study.run(report)
+        report.finish(purpose=purpose_of(kind), keys=keys_of(kind) - {*ASIDE}, formats=formats)
+    return report.folder.path
+
+
+def purpose_of(kind: type) -> str:
+    """The first paragraph of a study's docstring, in one line."""
+    return " ".join((kind.__doc__ or "").split("\n\n")[0].split())
 
 
 def study_class(name: object) -> type:
@@ -114,7 +117,7 @@ def formats_of(config: DictConfig) -> list[str]:
 
 
 @contextmanager
-def start_run(config: DictConfig) -> Iterator[Run]:
+def start_run(config: DictConfig) -> Iterator[Report]:
     """A new run folder that already holds its config and provenance."""
     folder = RunFolder.create(Path(config.output), config.experiment, now=datetime.now())
     folder.write_text("config.yaml", OmegaConf.to_yaml(config, resolve=True))
@@ -123,59 +126,10 @@ def start_run(config: DictConfig) -> Iterator[Run]:
     board = Board(folder.path / "tensorboard")
     settings: Any = OmegaConf.to_container(config, resolve=True)
     try:
-        yield Run(config.experiment, config.seed, folder, screen, board, settings, provenance)
+        yield Report(config.experiment, config.seed, folder, screen, board, settings, provenance)
     except BaseException as error:
         screen.log(f"ended early: {type(error).__name__}: {error}\n{format_exc()}")
         raise
     finally:
         board.close()
         screen.close()
-
-
-def write(run: Run, outcome: Outcome, study: Experiment, formats: Sequence[str] = ("png",)) -> None:
-    """Write an outcome into the run folder; models and tables first, as views may fail."""
-    folder, models = run.folder, outcome.models()
-    for name, model in models.items():
-        folder.write_model(name, model)
-    for name, table in outcome.tables().items():
-        folder.write_table(name, table)
-    sections, headline = outcome.sections(), dict(outcome.headline())
-    result, verbose = outcome.in_short(), bool(run.settings.get("verbose"))
-    run.screen.show(sections, on_terminal=verbose)
-    figures = {}
-    for name, captioned in count_pieces(run.watch, outcome.figures().items(), "figure"):
-        figure = captioned.draw()
-        png = folder.write_figure(name, figure, formats)
-        run.board.image(name, png)
-        figures[name] = draw(figure, png, captioned.caption)
-    run.board.equations({name: model.text() for name, model in models.items()})
-    run.board.settings(hparams_of(run.settings, keys_of(type(study))), headline)
-    page = page_html(run.title, sections, figures, about(run, study), result=result)
-    folder.write_text(PAGE, page)
-    named = {"experiment": run.title, "seed": run.seed}
-    named |= {"warnings": run.warnings} if run.warnings else {}
-    folder.write_json("summary.json", named | outcome.summary() | {"headline": headline})
-    for end in run.ends:
-        end()
-    run.screen.conclude(result, folder.path)
-
-
-def about(run: Run, study: Experiment) -> About:
-    """Information on a run for its page, besides the results."""
-    purpose = (type(study).__doc__ or "").split("\n\n")[0].replace("\n", " ")
-    return About(
-        purpose=" ".join(purpose.split()),
-        asked=settings_used(run.settings, keys_of(type(study))),
-        said=run.said,
-        warnings=run.warnings,
-        provenance=run.provenance,
-        config=(run.folder.path / "config.yaml").read_text("utf-8"),
-    )
-
-
-def hparams_of(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
-    """Settings that distinguish runs: each by its dotted place, groups by their name."""
-    found: dict[str, Any] = {"seed": settings["seed"]}
-    for key in sorted({*keys} & {*settings} - {*ASIDE}):
-        found |= by_place(key, settings[key])
-    return found

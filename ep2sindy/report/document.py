@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -95,7 +95,7 @@ class Section:
     """Blocks under a heading; a level 3 section is a part of the one before it."""
 
     title: str
-    blocks: Sequence[Block]
+    blocks: list[Block]
     level: int = 2
 
 
@@ -136,7 +136,3 @@ def cell_text(value: object) -> str:
 def places(value: float, n: int) -> str:
     """A number to `n` decimal places, NaN as a dash."""
     return "-" if value != value else f"{value:.{n}f}"
-
-
-def pictures(names: Iterable[str]) -> list[Picture]:
-    return [Picture(name) for name in names]

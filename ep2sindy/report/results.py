@@ -44,16 +44,15 @@ LABELS = {
 
 
 class View(Flag):
-    """Places where a metric appears: tables/*.csv, screen and page, summary.json, headline.
+    """Places where a metric appears.
 
-    FILES: tables and summary. SHOWN: also on screen and page. ALL: also in the headline.
+    FILES: tables/*.csv and summary.json. SCREEN: screen and page. HEADLINE: the numbers by which
+    runs are compared.
     """
 
-    CSV = auto()
+    FILES = auto()
     SCREEN = auto()
-    JSON = auto()
     HEADLINE = auto()
-    FILES = CSV | JSON
     SHOWN = FILES | SCREEN
     ALL = SHOWN | HEADLINE
 
@@ -68,10 +67,10 @@ class Metric(Generic[Record]):
     """One value of a record, in SI unless its key says otherwise.
 
     key: its name in files and headlines. value: function that takes it from a record; a mapping
-    gives one value for each state (or other part). heading: of its column on the screen, with `{}`
-    for the state; the key by default. format: of its cell, such as `{:.3f}` (a dash for a missing
-    number), or a function of the value; three digits by default. column: name of the CSV columns of
-    a mapping, with `{}` for the state; `<key>_{}` by default.
+    gives one value for each state (or other part), in CSV files in columns `<key>_<state>`.
+    heading: of its column on the screen, with `{}` for the state; the key by default. format: of
+    its cell, such as `{:.3f}` (a dash for a missing number), or a function of the value; three
+    digits by default.
     """
 
     key: str
@@ -79,7 +78,6 @@ class Metric(Generic[Record]):
     view: View = View.FILES
     heading: str = ""
     format: str | Callable[[Any], object] = ""
-    column: str = ""
 
     def cell(self, value: Any) -> object:
         """A value formatted for reading."""
@@ -93,8 +91,7 @@ class Metric(Generic[Record]):
         """The value by CSV column: one column, or one for each state."""
         if not isinstance(value, Mapping):
             return {self.key: value}
-        name = self.column or f"{self.key}_{{}}"
-        return {name.format(part): each for part, each in value.items()}
+        return {f"{self.key}_{part}": each for part, each in value.items()}
 
     def cells(self, value: Any) -> dict[str, object]:
         """The formatted value by heading: one cell, or one for each state."""
@@ -111,14 +108,8 @@ class Metric(Generic[Record]):
         part: takes this record from the outer one. key: the new name, with `{}` for the old one.
         view: places to appear in, limited to the present ones.
         """
-        made: Any = replace(self, key=key.format(self.key))  # Any: the record's type changes
-        column = key.format(self.column) if self.column else ""
-        return replace(
-            made,
-            column=column,
-            view=self.view & view,
-            value=lambda outer: self.value(part(outer)),
-        )
+        made: Any = replace(self, key=key.format(self.key), view=self.view & view)
+        return replace(made, value=lambda outer: self.value(part(outer)))  # of another record
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +127,7 @@ class ResultTable(Generic[Record]):
         rows: list[dict[str, Any]] = []
         for name, record in self._named():
             first = {heading: name} if heading else {}
-            values = [(m, m.value(record)) for m in self._in(View.CSV)]
+            values = [(m, m.value(record)) for m in self._in(View.FILES)]
             if by_state:
                 for state in _states(values):
                     of_state = {m.key: _of_state(value, state) for m, value in values}
@@ -144,7 +135,7 @@ class ResultTable(Generic[Record]):
             else:
                 columns = [metric.columns(value) for metric, value in values]
                 rows.append(reduce(or_, columns, first))
-        known = None if rows else [*filter(None, [heading]), *(m.key for m in self._in(View.CSV))]
+        known = None if rows else [*filter(None, [heading]), *(m.key for m in self._in(View.FILES))]
         return pd.DataFrame(rows, columns=known)
 
     def screen(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
@@ -170,9 +161,11 @@ class ResultTable(Generic[Record]):
         columns = {name: [of[h] for h in headings] for name, of in cells.items()}
         return pd.DataFrame({heading: headings, **columns})
 
-    def json(self) -> dict[str, dict[str, Any]]:
-        """Metrics by record name and key; values by state stay mappings."""
-        return {name: facts(record, self.metrics) for name, record in self._named()}
+    def json(self) -> dict[str, dict[str, Any]] | list[dict[str, Any]]:
+        """Metrics by key, of every record by its name or in turn; values by state stay mappings."""
+        if isinstance(self.records, Mapping):
+            return {name: facts(record, self.metrics) for name, record in self._named()}
+        return [facts(record, self.metrics) for record in self.records]
 
     def headline(self) -> dict[str, float]:
         """Headline values by `name/key`, or `name/state/key` if they are by state."""
@@ -201,7 +194,7 @@ class ResultTable(Generic[Record]):
 
 def facts(record: Record, metrics: Metrics[Record]) -> dict[str, Any]:
     """Metrics of one record for `summary.json`, by key."""
-    found = {m.key: m.value(record) for m in metrics if View.JSON in m.view}
+    found = {m.key: m.value(record) for m in metrics if View.FILES in m.view}
     return {key: dict(v) if isinstance(v, Mapping) else v for key, v in found.items()}
 
 

@@ -15,9 +15,8 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.figures.identified import frontier_figure
-from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Captioned, Picture, Result, Section, Table, Text
-from ep2sindy.report.run import Run
+from ep2sindy.report.document import Result, Text
+from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.studies.benchmark import Variant, build_variants, merits
 from ep2sindy.studies.study import Deferred, Names, Positives
@@ -44,11 +43,35 @@ class Study:
     definitions: Mapping[str, Deferred]
     parallel: Workers
 
-    def compute(self, run: Run) -> Outcome:
+    def run(self, report: Report) -> None:
         variants = build_variants(self.variants, self.definitions)
-        with run.progress(len(self.rates_Hz) * len(self.durations_s), "trajectory") as progress:
-            points = self.points(variants, seed=run.seed, progress=progress)
-        return Outcome(self.system, points)
+        with report.progress(len(self.rates_Hz) * len(self.durations_s), "trajectory") as progress:
+            points = self.points(variants, seed=report.seed, progress=progress)
+        by_variant = points.groupby("variant", sort=False)
+        too_few = points[points["reason"] != ""].groupby("variant", sort=False).size()
+        counts = ", ".join(f"{variant} {n}" for variant, n in too_few.items())
+        report.section(
+            "Points",
+            f"{self.system.name}: one noise-free trajectory per sampling rate and duration, all "
+            f"from the same initial state. Points with too few samples to run: {counts or 'none'}; "
+            "tables/points.csv says why.",
+        )
+        report.figure("frontier", partial(frontier_figure, points), FIGURE)
+        report.table("points", points, shown=False)
+        report.section(TITLE)
+        report.table("lowest_rates", lowest_rates(points))
+        percent = 100.0 * by_variant["identified"].mean()
+        report.headline |= {f"{n}/identified_percent": float(v) for n, v in percent.items()}
+        shares = "; ".join(f"{name} {share:.0f} %" for name, share in percent.items())
+        report.found(
+            Result(
+                f"Found: {percent.idxmax()} identifies {self.system.name} at the largest share of "
+                f"sampling rates and durations, {percent.max():.0f} %",
+                [Text(f"identified: {shares}")],
+                load='pandas.read_csv("{}/tables/points.csv")',
+                picture="frontier",
+            )
+        )
 
     def points(
         self,
@@ -130,52 +153,3 @@ def lowest_rates(points: pd.DataFrame) -> pd.DataFrame:
             row[f"{duration_s:g} s"] = falling.loc[unbroken, "rate_Hz"].min()
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Result of the frontier. points: the table that `Study.points` returns."""
-
-    system: System
-    points: pd.DataFrame
-
-    def models(self) -> dict[str, SparseModel]:
-        return {}
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        return {"points": self.points, "lowest_rates": lowest_rates(self.points)}
-
-    def figures(self) -> dict[str, Captioned]:
-        return {"frontier": Captioned(partial(frontier_figure, self.points), FIGURE)}
-
-    def in_short(self) -> Result:
-        shares = self.points.groupby("variant", sort=False)["identified"].mean()
-        counts = "; ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items())
-        return Result(
-            f"Found: {shares.idxmax()} identifies {self.system.name} at the largest share of "
-            f"sampling rates and durations, {100 * shares.max():.0f} %",
-            [Text(f"identified: {counts}")],
-            load='pandas.read_csv("{}/tables/points.csv")',
-            picture="frontier",
-        )
-
-    def sections(self) -> list[Section]:
-        too_few = self.points[self.points["reason"] != ""].groupby("variant", sort=False).size()
-        counts = ", ".join(f"{variant} {n}" for variant, n in too_few.items())
-        text = (
-            f"{self.system.name}: one noise-free trajectory per sampling rate and duration, all "
-            f"from the same initial state. Points with too few samples to run: {counts or 'none'}; "
-            "tables/points.csv says why."
-        )
-        return [
-            Section("Points", [Text(text), Picture("frontier")]),
-            Section(TITLE, [Table(lowest_rates(self.points))]),
-        ]
-
-    def summary(self) -> dict[str, Any]:
-        kept = self.points[["variant", "rate_Hz", "duration_s", "identified"]]
-        return {"points": kept.to_dict("records")}
-
-    def headline(self) -> dict[str, float]:
-        percent = 100.0 * self.points.groupby("variant", sort=False)["identified"].mean()
-        return {f"{name}/identified_percent": float(value) for name, value in percent.items()}

@@ -12,7 +12,7 @@ from ep2sindy.data.quantities import STEP_DOUBT
 from ep2sindy.data.run_files import FilePattern
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
 from ep2sindy.operating.records import Point, name_point
-from ep2sindy.report.run import Run
+from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.spectrum import Oscillation
 from ep2sindy.studies.source import DivergedError, Source, amiss, is_simulation, quiet
@@ -59,10 +59,10 @@ class GivenPoints:
     def sources(self, source: Source) -> list[PointSource]:
         return point_sources(source, self.places, self.points)
 
-    def tell(self, run: Run) -> None:
+    def tell(self, report: Report) -> None:
         """Report the files that are no points."""
         if self.left_out:
-            run.say(f"left out, for their names hold no number there: {', '.join(self.left_out)}")
+            report.say(f"left out, for their names hold no number there: {', '.join(self.left_out)}")
 
 
 def given_points(
@@ -190,20 +190,20 @@ def point_sources(
 
 
 def open_points(
-    sources: Sequence[PointSource], inputs: Sequence[str], *, workers: Workers, run: Run
+    sources: Sequence[PointSource], inputs: Sequence[str], *, workers: Workers, report: Report
 ) -> list[OpenedPoint]:
     """Open or simulate all points, and report their data and warnings."""
-    stage = run.progress(len(sources), "point opened")
+    stage = report.progress(len(sources), "point opened")
     points = collect(workers, partial(PointSource.open, inputs=inputs), sources, stage)
     used = {point.label: point.used for point in points if point.used}
     if len(alike := {*used.values()}) == 1:  # all points are averaged alike
-        run.say(f"data: {alike.pop()}")
+        report.say(f"data: {alike.pop()}")
     else:
         for label, words in used.items():
-            run.say(f"data: {label}: {words}")
+            report.say(f"data: {label}: {words}")
     for point in points:
         for note in point.notes:
-            run.warn(f"{point.label}: {note}")
+            report.warn(f"{point.label}: {note}")
     return points
 
 

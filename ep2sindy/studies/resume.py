@@ -12,7 +12,7 @@ from typing import Any
 
 from ep2sindy.data.run_files import FilePattern
 from ep2sindy.data.steps import files_of
-from ep2sindy.report.run import Run
+from ep2sindy.report.report import Report
 from ep2sindy.runtime.files import fingerprint
 from ep2sindy.runtime.parallel import ONE_BY_ONE, KeptWorkers, Workers
 from ep2sindy.runtime.user_cache import cache_folder
@@ -78,7 +78,7 @@ def _files_named(settings: object) -> Iterator[str]:
 
 @contextmanager
 def resumed(
-    keep: bool, run: Run, workers: Workers = ONE_BY_ONE, *, aside: Collection[str] = ()
+    keep: bool, report: Report, workers: Workers = ONE_BY_ONE, *, aside: Collection[str] = ()
 ) -> Iterator[KeptWorkers]:
     """Workers that go on with the pieces that a broken run had finished, kept in the user's cache.
 
@@ -88,16 +88,16 @@ def resumed(
     folder = None
     if keep:
         try:
-            folder = cache_folder("pieces", pieces_key(run.settings, aside=aside))
+            folder = cache_folder("pieces", pieces_key(report.settings, aside=aside))
         except OSError as error:
-            run.say(f"finished pieces are not kept: {error}")
+            report.say(f"finished pieces are not kept: {error}")
     if folder is not None and folder.exists():
-        run.say("going on with the pieces that a broken run had finished")
+        report.say("going on with the pieces that a broken run had finished")
     try:
         yield KeptWorkers(workers, folder)
     except KeyboardInterrupt:
         if folder is not None:
-            run.say("finished pieces are kept: the same command goes on with them")
+            report.say("finished pieces are kept: the same command goes on with them")
         raise
     if folder is not None:
-        run.when_written(partial(rmtree, folder, ignore_errors=True))
+        report.when_written(partial(rmtree, folder, ignore_errors=True))

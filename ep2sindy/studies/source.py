@@ -20,7 +20,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone, describe_zone
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.scores import r2
-from ep2sindy.report.run import Run
+from ep2sindy.report.report import Report
 from ep2sindy.runtime.screen import in_line
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.study import Deferred
@@ -111,17 +111,18 @@ class Source:
         variables = dict.fromkeys(v for library in libraries for v in library.variables)
         return list(dict.fromkeys(v.partition("@")[0] for v in variables if v not in known))
 
-    def opened(self, libraries: Iterable[Library], run: Run) -> tuple[xr.Dataset, Trajectory]:
+    def opened(self, libraries: Iterable[Library], report: Report) -> tuple[xr.Dataset, Trajectory]:
         """The single record, and its trajectory as `sampled` makes it."""
-        with run.progress(None, "", "data"):
+        with report.progress(None, "", "data"):
             field = self.field()
-        return field, self.sampled(field, libraries, run)
+        return field, self.sampled(field, libraries, report)
 
-    def sampled(self, field: xr.Dataset, libraries: Iterable[Library], run: Run) -> Trajectory:
-        """The trajectory that the libraries need; also reports the data on screen and page."""
-        say_simulation(run, field.attrs)  # first, as it may explain later errors
-        data = self.trajectory.trajectory(field, inputs=self.inputs(libraries), label=run.title)
-        say_data(run, data, field, self.trajectory.place(field))
+    def sampled(self, field: xr.Dataset, libraries: Iterable[Library], report: Report) -> Trajectory:
+        """The trajectory that the libraries need, which is reported on screen, page and summary."""
+        say_simulation(report, field.attrs)  # first, as it may explain later errors
+        data = self.trajectory.trajectory(field, inputs=self.inputs(libraries), label=report.title)
+        say_data(report, data, field, self.trajectory.place(field))
+        report.summary.setdefault("data", data_summary(data))
         return data
 
 
@@ -130,7 +131,7 @@ def zone_of(source: Source) -> Zone | None:
     return source.trajectory.zone if isinstance(source.trajectory, ZoneAverage) else None
 
 
-def zones_of(source: Source, field: xr.Dataset, run: Run) -> Zones:
+def zones_of(source: Source, field: xr.Dataset, report: Report) -> Zones:
     """The zones that the trajectory is averaged over; none if it is that of a point.
 
     Balances that cannot be made, as of a zone that reaches into the plume, are reported.
@@ -138,10 +139,10 @@ def zones_of(source: Source, field: xr.Dataset, run: Run) -> Zones:
     sampling = source.trajectory
     if not isinstance(sampling, ZoneAverage):
         return Zones()
-    return Zones(_balances(sampling, field, run), sampling.sizes(field))
+    return Zones(_balances(sampling, field, report), sampling.sizes(field))
 
 
-def _balances(sampling: ZoneAverage, field: xr.Dataset, run: Run) -> dict[str, xr.Dataset]:
+def _balances(sampling: ZoneAverage, field: xr.Dataset, report: Report) -> dict[str, xr.Dataset]:
     if not {"n_i", "n_n"} <= set(field.data_vars):
         return {}
     zones = sampling.parts(field)
@@ -151,11 +152,11 @@ def _balances(sampling: ZoneAverage, field: xr.Dataset, run: Run) -> dict[str, x
         axisymmetric = sampling.axisymmetric
         return {n: zone_balance(field, z, axisymmetric=axisymmetric) for n, z in zones.items()}
     except ValueError as error:
-        run.say(f"the model has no balance of its zone beside it: {error}")
+        report.say(f"the model has no balance of its zone beside it: {error}")
         return {}
 
 
-def say_field(run: Run, field: xr.Dataset) -> None:
+def say_field(report: Report, field: xr.Dataset) -> None:
     """Report which data are used, for a study of every grid point."""
     t, clock = grid_points(field, "time"), clock_of(field)
     words = [
@@ -164,17 +165,17 @@ def say_field(run: Run, field: xr.Dataset) -> None:
         f"{len(t)} samples of {clock.duration_text(usual_step(t), digits=4)} "
         f"from {clock.duration_text(t[0], digits=4)}",
     ]
-    run.say(in_line(f"data: {'; '.join(word for word in words if word)}"))
-    say_doubts(run, field)
+    report.say(in_line(f"data: {'; '.join(word for word in words if word)}"))
+    say_doubts(report, field)
 
 
-def say_doubts(run: Run, field: xr.Dataset) -> None:
+def say_doubts(report: Report, field: xr.Dataset) -> None:
     """Warn of a step that contradicts the file's own times."""
     if STEP_DOUBT in field.attrs:
-        run.warn(field.attrs[STEP_DOUBT])
+        report.warn(field.attrs[STEP_DOUBT])
 
 
-def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
+def say_data(report: Report, data: Trajectory, field: xr.Dataset, place: str) -> None:
     """Report the data: file, zone, samples, units, missing values and warnings."""
     units = ", ".join(f"{name} in {unit}" for name, unit in data.units.items())
     where = [field.attrs.get("file", ""), place]
@@ -189,12 +190,12 @@ def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
         units,
         f"dominant frequency {frequencies}",
     ]
-    run.say(in_line(f"data: {'; '.join(words)}"))
-    say_doubts(run, field)
+    report.say(in_line(f"data: {'; '.join(words)}"))
+    say_doubts(report, field)
     if data.n_samples < field.sizes["time"]:
-        run.warn(describe_gaps(data.t, field.sizes["time"]))
+        report.warn(describe_gaps(data.t, field.sizes["time"]))
     elif text := describe_breaks(data.t):
-        run.warn(text)
+        report.warn(text)
 
 
 def data_summary(data: Trajectory) -> dict[str, Any]:
@@ -308,19 +309,19 @@ def doubts(attributes: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def say_simulation(run: Run, attributes: Mapping[str, Any]) -> None:
+def say_simulation(report: Report, attributes: Mapping[str, Any]) -> None:
     """Report a simulation in one line, with its warnings, on screen, page and in the summary."""
     if not is_simulation(attributes):
         return
     known = [name for name in BALANCES if name in attributes]
     balances = ", ".join(f"{BALANCES[name]} {attributes[name]:.4f}" for name in known)
-    run.say(
+    report.say(
         f"simulation: {status_text(attributes)}, from {attributes.get('initial', 'its start')}; "
         f"I_d {attributes['I_d_mean']:.2f} A, std {attributes['I_d_std']:.2f} A; "
         f"out/in {balances or 'unknown'}"
     )
     for text in amiss(attributes):
-        run.warn(text)
+        report.warn(text)
 
 
 def status_text(attributes: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""The protocol of studies: an experiment with its settings, and its outcome.
+"""The protocol of studies: an experiment with its settings, which fills a report.
 
 The module also holds annotated types for numbers in a config. `n_realizations: Count` in a study
 states the requirement once, for the reader and for the check.
@@ -11,37 +11,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Annotated, Any, Protocol, runtime_checkable
 
-import pandas as pd
-
-from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Captioned, Result, Section
-from ep2sindy.report.run import Run
-
-
-@runtime_checkable
-class Outcome(Protocol):
-    """Everything that a study returns. The runner writes models and tables first, then the views.
-
-    figures: by name, drawn when they are written. in_short: what was found in five lines or so, the
-    end of the screen and the beginning of the page. sections: all else, for the page and run.log.
-    summary: the findings, for `summary.json`; experiment and seed are added to it. headline: the
-    few numbers by which runs are compared, in TensorBoard and by `compare`. Their names do not
-    depend on the findings.
-    """
-
-    def models(self) -> Mapping[str, SparseModel]: ...
-
-    def tables(self) -> Mapping[str, pd.DataFrame]: ...
-
-    def figures(self) -> Mapping[str, Captioned]: ...
-
-    def in_short(self) -> Result: ...
-
-    def sections(self) -> Sequence[Section]: ...
-
-    def summary(self) -> dict[str, Any]: ...
-
-    def headline(self) -> Mapping[str, float]: ...
+from ep2sindy.report.report import Report
 
 
 @runtime_checkable
@@ -49,11 +19,11 @@ class Experiment(Protocol):
     """A frozen dataclass whose fields are the keys of its config.
 
     A field of type AnyMethod or Source is made of several groups of the config: formulation,
-    search, ...; data, prepare, trajectory. Everything but the data is built before `compute` is
+    search, ...; data, prepare, trajectory. Everything but the data is built before `run` is
     called, so that a misspelt key costs no simulation.
     """
 
-    def compute(self, run: Run) -> Outcome: ...
+    def run(self, report: Report) -> None: ...
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""Views shared by several studies: figures and tables of runs, equations and tables of models."""
+"""Views of runs that several studies share: figures, samples, and the model that was found."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -12,15 +12,12 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
-from ep2sindy.library.equations import equation_text
 from ep2sindy.library.relations import Constraint
-from ep2sindy.library.units import SECONDS, Clock, unit_product
 from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.display import grouped
 from ep2sindy.model.free_run import FreeRun
-from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Block, Captioned, Equation, Result, Section, Table, Text
-from ep2sindy.report.results import Metric, Metrics, View
+from ep2sindy.report.document import Block, Result, Text
+from ep2sindy.report.models import equations
+from ep2sindy.report.report import Report
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.studies.study import PositiveOrAll
 
@@ -28,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
-NO_ENDS = (np.nan, np.nan)  # of an interval that is not known
 FROM_DERIVATIVES = (
     "These are the equations that fits of the derivatives select; the models that live, which are "
     "selected by free runs, stand above."
@@ -61,173 +57,57 @@ class PlotRange:
         return self.f_max_Hz or 0.5 / data.dt_s
 
 
-def rollout_tables(data: Trajectory, models: Mapping[str, FreeRun]) -> dict[str, pd.DataFrame]:
+def add_samples(report: Report, data: Trajectory, runs: Mapping[str, FreeRun]) -> None:
     """Model and data, sample by sample, so that the figures can be redrawn."""
-    found = {}
-    for name, integrated in models.items():
-        rollout, states = integrated.rollout, integrated.model.states
+    for name, run in runs.items():
+        rollout, states = run.rollout, run.model.states
         samples = data.columns(states)[: len(rollout.t)]
         columns: dict[str, Any] = {"t_s": rollout.t}
         for k, state in enumerate(states):
             columns |= {f"{state}_data": samples[:, k], f"{state}_model": rollout.states[:, k]}
-        found[f"rollout_{name.replace(' ', '_')}"] = pd.DataFrame(columns)
-    return found
+        report.samples(f"rollout_{name.replace(' ', '_')}", pd.DataFrame(columns))
 
 
-def run_figures(
+def add_figures(
+    report: Report,
     names: Sequence[str],
     data: Trajectory,
-    models: Mapping[str, FreeRun],
+    runs: Mapping[str, FreeRun],
     shown: PlotRange,
     *,
     smoother: Smoother | None = None,
     since: str = series.SINCE_START,
-) -> dict[str, Captioned]:
-    """The named figures of CAPTIONS; phase portraits need two states or more.
+) -> None:
+    """Add the named figures of CAPTIONS; phase portraits need two states or more.
 
     smoother: gives the data's derivative; without one there are no derivative figures.
     since: the origin of the time axis of runs, in words.
     """
     span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
-    rollouts = {name: integrated.rollout for name, integrated in models.items()}
-    verdicts = {name: integrated.verdict for name, integrated in models.items()}
+    rollouts = {name: run.rollout for name, run in runs.items()}
+    how = {"verdicts": {name: run.verdict for name, run in runs.items()}}
     drawn: dict[str, Callable[[], Figure]] = {
         "data": partial(series.data_figure, data, duration_s=span, f_max_Hz=f_max_Hz),
         "trajectories": partial(
-            series.trajectory_figure, data, rollouts, duration_s=span, verdicts=verdicts,
-            since=since,
+            series.trajectory_figure, data, rollouts, duration_s=span, since=since, **how
         ),
-        "spectra": partial(
-            series.spectrum_figure, data, rollouts, f_max_Hz=f_max_Hz, verdicts=verdicts
-        ),
-    }  # fmt: skip
+        "spectra": partial(series.spectrum_figure, data, rollouts, f_max_Hz=f_max_Hz, **how),
+    }
     if smoother is not None:
-        sides = {name: integrated.model for name, integrated in models.items()}
+        models = {name: run.model for name, run in runs.items()}
         drawn["derivatives"] = partial(
-            series.derivative_figure, data, sides, smoother=smoother, duration_s=span
+            series.derivative_figure, data, models, smoother=smoother, duration_s=span
         )
     if len(data.state_names) > 1:
-        drawn["phase"] = partial(
-            series.phase_figure, data, rollouts, duration_s=span, verdicts=verdicts
-        )
-    return {name: Captioned(drawn[name], CAPTIONS[name]) for name in names if name in drawn}
-
-
-def trajectories(
-    data: Trajectory,
-    models: Mapping[str, FreeRun],
-    shown: PlotRange,
-    caption: str,
-    *,
-    since: str = series.SINCE_START,
-) -> Captioned:
-    """Trajectories of other models, or from other initial states."""
-    (figure,) = run_figures(["trajectories"], data, models, shown, since=since).values()
-    return replace(figure, caption=caption)
+        drawn["phase"] = partial(series.phase_figure, data, rollouts, duration_s=span, **how)
+    for name in names:
+        if name in drawn:
+            report.figure(name, drawn[name], CAPTIONS[name])
 
 
 def terms_text(terms: Mapping[str, Sequence[str]]) -> str:
     """`x: x, x*y; y: y`: the terms of every equation or role."""
     return "; ".join(f"{part}: {', '.join(names)}" for part, names in terms.items())
-
-
-def intervals(model: SparseModel) -> dict[str, dict[str, tuple[float, float]]] | None:
-    """95 % intervals by state and term; None if they are not known."""
-    if model.covariance is None:
-        return None
-    return {state: model.intervals(state) for state in model.states}
-
-
-MODEL: Metrics[SparseModel] = [
-    Metric("text", lambda model: model.text(), View.JSON),
-    Metric(
-        "text",
-        lambda model: {state: equation_text(state, model.terms(state)) for state in model.states},
-        View.CSV,
-    ),
-    Metric(
-        "equations", lambda model: {state: model.terms(state) for state in model.states}, View.JSON
-    ),
-]
-
-
-def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataFrame:
-    """One row per model, state and term, in SI, with 95 % intervals if they are known.
-
-    heading: heading of the column with the models' names.
-    """
-    rows = [
-        (name, state, term, value, *(intervals(model) or {}).get(state, {}).get(term, NO_ENDS))
-        for name, model in models.items()
-        for state in model.states
-        for term, value in model.terms(state).items()
-    ]
-    return pd.DataFrame(rows, columns=[heading, "state", "term", "coef", "lower", "upper"])
-
-
-def display_equation(
-    model: SparseModel,
-    state: str,
-    clock: Clock = SECONDS,
-    *,
-    held: Constraint | None = None,
-    lead: str = "",
-    on_screen: bool = True,
-) -> Equation:
-    """One equation of a model with its unit, per time unit of the clock; held: see `grouped`."""
-    terms = grouped(model, held, clock)[state]
-    unit = clock.rate_unit(model.units[state])
-    return Equation(state, terms, lead=lead, unit=unit, on_screen=on_screen)
-
-
-def interval_table(
-    model: SparseModel,
-    states: Sequence[str] | None = None,
-    clock: Clock = SECONDS,
-    *,
-    page_only: bool = False,
-    words: str = "95 %",
-    note: str = "",
-) -> list[Block]:
-    """Coefficients of some or all equations with 95 % intervals; empty if these are not known.
-
-    words: what the intervals are called. note: what they mean.
-    """
-    if model.covariance is None:
-        return []
-    units = {term.name: term.unit(model.units) for term in model.library.terms}
-    rows = []
-    for state in model.states if states is None else states:
-        for term, ends in model.intervals(state).items():
-            numbers = [model.terms(state)[term], *ends]
-            unit = unit_product([(model.units[state], 1), (units[term], -1)])
-            row = [f"{state}'", term.replace("*", " ")]
-            shown = [f"{clock.seconds * number:.4g}" for number in numbers]
-            row += shown if ends[0] < ends[1] else [shown[0], "exact", ""]  # known, or a relation
-            rows.append([*row, clock.rate_unit(unit)])
-    columns = ["equation", "term", "coefficient", f"{words} from", "to", "unit"]
-    table = pd.DataFrame(rows, columns=columns)
-    return [Table(table, note=note, page_only=page_only)] if rows else []
-
-
-def equation_sections(
-    models: Mapping[str, SparseModel], clock: Clock = SECONDS, *, page_only: bool = False
-) -> list[Section]:
-    """One section per model with its equations, and intervals if they are known.
-
-    page_only: whether the intervals are left off the screen.
-    """
-    return [
-        Section(
-            name,
-            [
-                *(display_equation(model, state, clock) for state in model.states),
-                *interval_table(model, clock=clock, page_only=page_only),
-            ],
-            level=3,
-        )
-        for name, model in models.items()
-    ]
 
 
 def best_run(runs: Mapping[str, FreeRun]) -> str:
@@ -269,7 +149,7 @@ def found_model(
     return Result(
         f"{found}: a model that {_fate(run, seen=seen, misfit=misfit)}",
         [
-            *(display_equation(model, state, clock, held=held) for state in model.states),
+            *equations(model, clock, held=held),
             Text(f"run freely from one sample over {where}: {run_words(run)}"),
             *([Text(misfit, warning=True)] if misfit else []),
             *more,
@@ -315,17 +195,3 @@ def run_words(run: FreeRun) -> str:
     if not found and np.isfinite(run.nrmse):
         found.append(f"{run.nrmse:.2g} standard deviations off")
     return "; ".join(found) or run.text
-
-
-def with_error(value: float, reach: float) -> str:
-    """`0.03640 ±2e-05`: the value to the digit of its error, with at least three digits.
-
-    An error that is not known (NaN) is left out.
-    """
-    digits = 3
-    if np.isfinite(reach) and reach > 0.0 and value != 0.0:
-        # Digits of the error as it is printed: 9.6e-05 reads 1e-04.
-        places = np.floor(np.log10([abs(value), float(f"{reach:.1g}")]))
-        digits = int(np.clip(places[0] - places[1] + 1, 3, 8))
-    text = f"{value:#.{digits}g}".removesuffix(".")
-    return text if np.isnan(reach) else f"{text} ±{reach:.1g}"
