@@ -117,7 +117,9 @@ class Source:
             field = self.field()
         return field, self.sampled(field, libraries, report)
 
-    def sampled(self, field: xr.Dataset, libraries: Iterable[Library], report: Report) -> Trajectory:
+    def sampled(
+        self, field: xr.Dataset, libraries: Iterable[Library], report: Report
+    ) -> Trajectory:
         """The trajectory that the libraries need, which is reported on screen, page and summary."""
         say_simulation(report, field.attrs)  # first, as it may explain later errors
         data = self.trajectory.trajectory(field, inputs=self.inputs(libraries), label=report.title)
