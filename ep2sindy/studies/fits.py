@@ -70,9 +70,9 @@ INTERVALS = (
     "terms are the whole law; what the terms lack, they do not count."
 )
 NOTE = (
-    "Amplitude: standard deviation against the data's. Start fitted: frequency error and nrmse from "
-    "a start fitted to the first one and a half periods, since a single sample may lie off every "
-    "orbit of the model. R2: of the derivative, on a fit's own rows, which windows average."
+    "Amplitude: standard deviation against the data's. In files, started: from a start fitted to the "
+    "first one and a half periods, since a single sample may lie off every orbit of the model; r2: "
+    "of the derivative, on the rows of the fit, which windows average."
 )
 CAPTION = (
     "Refinement with windows of several lengths: loss on the fitted part, where each window has a "
@@ -91,7 +91,7 @@ class Fit:
     form: of the regression, one of those that the config names; None means the formulation;
     "balance" fits every process to the rate that a simulation records. relations: whether those of
     a structure hold. refine: whether trajectories are followed then. n_points, n_windows: of random
-    windows, for a form that has them; every combination is a fit of its own.
+    windows, for a form that has them; every combination is a fit of its own, `n_points_70`.
     """
 
     form: str | None = None
@@ -125,8 +125,9 @@ def expand(
         own = form.test_functions
         for n_windows, n_points in product(fit.n_windows or [own.n_windows], fit.n_points):
             boxes = replace(own, n_points=n_points, n_windows=n_windows)
-            several = f"_{n_windows}" if len(fit.n_windows) > 1 else ""
-            found[f"{name}{several}_{n_points}"] = fit, replace(form, test_functions=boxes)
+            varying = {"n_windows": n_windows} if len(fit.n_windows) > 1 else {}
+            words = (f"{key}_{value}" for key, value in (varying | {"n_points": n_points}).items())
+            found["_".join(words)] = fit, replace(form, test_functions=boxes)
     return found
 
 
