@@ -19,10 +19,10 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.terms import variables_of
-from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import dominant_window
 from ep2sindy.regression.constrained import constrained_fit
@@ -99,7 +99,7 @@ def terms_of(
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class EvaluatedFit:
     """A fit and its performance on the held-out part.
 
     from_sample: the run started at the first sample. from_fit: the run started at an initial state
@@ -109,8 +109,8 @@ class Evaluation:
     """
 
     model: SparseModel
-    from_sample: FreeRun
-    from_fit: FreeRun
+    from_sample: Evaluation
+    from_fit: Evaluation
     cpu_s: float
     status: str | None = None
     loss: float = float("nan")
@@ -143,7 +143,7 @@ def fit_and_evaluate(
     formulation: Formulation,
     *,
     rng: np.random.Generator,
-) -> Evaluation:
+) -> EvaluatedFit:
     """Fit by least squares under the constraint, in one form of the regression.
 
     There is no covariance: smoothed rows and overlapping windows are not independent, and intervals
@@ -158,12 +158,12 @@ def fit_and_evaluate(
     )
     cpu_s = process_time() - begun
     model = replace(model, covariance=None)
-    return Evaluation(model, *runs_of(model, held), cpu_s)
+    return EvaluatedFit(model, *runs_of(model, held), cpu_s)
 
 
-def runs_of(model: SparseModel, held: Trajectory) -> tuple[FreeRun, FreeRun]:
+def runs_of(model: SparseModel, held: Trajectory) -> tuple[Evaluation, Evaluation]:
     """Free runs over the held-out part, from its first sample and from a fitted start."""
-    return free_run(model, held), free_run(model, held, initial=_fitted_start(model, held))
+    return evaluate(model, held), evaluate(model, held, initial=_fitted_start(model, held))
 
 
 def _fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_states"]:
@@ -197,7 +197,7 @@ class Outcome:
 
     data: Trajectory
     seen: bool
-    runs: Mapping[str, FreeRun]
+    runs: Mapping[str, Evaluation]
     labels: Mapping[str, str]
     kind: str
     fits: pd.DataFrame
@@ -257,7 +257,7 @@ class Outcome:
 def held_out_outcome(
     train: Trajectory,
     held: Trajectory,
-    judged: Mapping[str, Evaluation],
+    judged: Mapping[str, EvaluatedFit],
     labels: Mapping[str, str],
     relations: Sequence[str],
     shown: PlotRange,
@@ -293,7 +293,7 @@ def held_out_outcome(
 
 
 def held_out_figures(
-    held: Trajectory, labelled: Mapping[str, Evaluation], shown: PlotRange
+    held: Trajectory, labelled: Mapping[str, EvaluatedFit], shown: PlotRange
 ) -> dict[str, Captioned]:
     """Runs from the first sample and from a fitted start, phase portraits and spectra."""
     sample = {name: each.from_sample for name, each in labelled.items()}
@@ -306,7 +306,7 @@ def held_out_figures(
 
 
 # Metrics of a free run. CSV has values by state; JSON and headlines have the first state's.
-RUN: Metrics[FreeRun] = [
+RUN: Metrics[Evaluation] = [
     Metric("f", frequency_words, View.SCREEN),
     Metric("f_Hz", lambda run: run.frequency_Hz, View.CSV),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.JSON),
@@ -320,9 +320,9 @@ RUN: Metrics[FreeRun] = [
     Metric("amplitude", lambda run: run.amplitude_ratio, View.SCREEN, "amplitude {}"),
     Metric("waveform_error", lambda run: run.waveform_error[run.model.states[0]], View.JSON),
     Metric("periods", lambda run: run.periods, View.JSON),
-    Metric("verdict", lambda run: run.text, View.JSON | View.SCREEN),
+    Metric("status", lambda run: run.text, View.JSON | View.SCREEN),
 ]  # fmt: skip
-METHOD: Metrics[Evaluation] = [
+METHOD: Metrics[EvaluatedFit] = [
     *(metric.of(lambda judged: judged.model) for metric in MODEL),
     *(metric.of(lambda judged: judged.from_sample) for metric in RUN),
     *(metric.of(lambda judged: judged.from_fit, "{}_started", View.CSV) for metric in RUN),
@@ -335,7 +335,7 @@ METHOD: Metrics[Evaluation] = [
 ]
 
 
-def _started_text(run: FreeRun) -> str:
+def _started_text(run: Evaluation) -> str:
     """Frequency error and nrmse; the verdict of a run without a frequency."""
     has_none = np.isnan(run.f_error)
     return run.text if has_none else f"{100 * run.f_error:+.1f} %, {run.nrmse:.2f}"

@@ -18,10 +18,10 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.windows import loss_against_window_figure
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import polynomial
 from ep2sindy.library.relations import Constraint, constraint
-from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.rows import Formulation
@@ -34,7 +34,7 @@ from ep2sindy.studies.fits import (
     COMPARED,
     METHOD,
     RUN,
-    Evaluation,
+    EvaluatedFit,
     Outcome,
     Relations,
     Terms,
@@ -135,7 +135,7 @@ class Study:
         }
         draws = {
             name: [
-                free_run(again[name](seed=each).model, held)
+                evaluate(again[name](seed=each).model, held)
                 for each in count_pieces(run.watch, stream.spawn(self.n_draws), "draw", name)
             ]
             for name, stream in zip(starts, draws_rng.spawn(3), strict=True)
@@ -178,9 +178,9 @@ class Study:
         self,
         train: Trajectory,
         held: Trajectory,
-        judged: Mapping[str, Evaluation],
-        by_window: Mapping[str, Mapping[int, Evaluation]],
-        draws: Mapping[str, Sequence[FreeRun]],
+        judged: Mapping[str, EvaluatedFit],
+        by_window: Mapping[str, Mapping[int, EvaluatedFit]],
+        draws: Mapping[str, Sequence[Evaluation]],
     ) -> Outcome:
         period_s = 1.0 / dominant_frequency(train.t, train.states[:, 0])
         windows = window_table(by_window, dt_s=train.dt_s, period_s=period_s)
@@ -203,16 +203,16 @@ class Study:
 
 def refine_and_judge(
     refinement: Callable[..., Refinement], held: Trajectory, *, seed: np.random.Generator
-) -> Evaluation:
+) -> EvaluatedFit:
     begun = process_time()
     found = refinement(seed=seed)
     cpu_s = process_time() - begun
     runs = runs_of(found.model, held)
-    return Evaluation(found.model, *runs, cpu_s, found.status, found.loss)
+    return EvaluatedFit(found.model, *runs, cpu_s, found.status, found.loss)
 
 
 def window_table(
-    by_window: Mapping[str, Mapping[int, Evaluation]], *, dt_s: float, period_s: float
+    by_window: Mapping[str, Mapping[int, EvaluatedFit]], *, dt_s: float, period_s: float
 ) -> pd.DataFrame:
     """One row per method and window length; columns in _started are for a fitted initial state."""
     rows = []
@@ -261,7 +261,7 @@ def watcher(
 # How far the result of a refinement depends on the windows that were drawn.
 
 
-def _of_worst(run: FreeRun) -> dict[str, float]:
+def _of_worst(run: Evaluation) -> dict[str, float]:
     """Numbers of one free run; amplitude and waveform error are those of the worst state."""
     ratios = np.array(list(run.amplitude_ratio.values()))
     return {
@@ -272,21 +272,21 @@ def _of_worst(run: FreeRun) -> dict[str, float]:
     }
 
 
-def draws_table(draws: Mapping[str, Sequence[FreeRun]]) -> pd.DataFrame:
+def draws_table(draws: Mapping[str, Sequence[Evaluation]]) -> pd.DataFrame:
     """One row per method and draw of windows: the model's run over the held-out part."""
     rows = [
-        {"method": name, "draw": k, "verdict": str(run.verdict), **_of_worst(run)}
+        {"method": name, "draw": k, "status": str(run.status), **_of_worst(run)}
         for name, runs in draws.items()
         for k, run in enumerate(runs)
     ]
     return pd.DataFrame(rows)
 
 
-def _n_living(runs: Sequence[FreeRun]) -> int:
-    return sum(run.verdict is Verdict.LIVES for run in runs)
+def _n_living(runs: Sequence[Evaluation]) -> int:
+    return sum(run.status is Status.SUSTAINED for run in runs)
 
 
-def _ends(runs: Sequence[FreeRun], name: str) -> list[float]:
+def _ends(runs: Sequence[Evaluation], name: str) -> list[float]:
     """Lowest and highest value of a number over the draws that have it; NaN if none has it."""
     values = np.array([_of_worst(run)[name] for run in runs])
     known = values[np.isfinite(values)]
@@ -300,7 +300,7 @@ def _range_text(ends: Sequence[float], form: str = "{:.3f} to {:.3f}", factor: f
 
 _RELATIVE = partial(_range_text, form="{:+.2f} to {:+.2f} %", factor=100.0)
 BOTH = View.JSON | View.SCREEN
-SPREAD: Metrics[Sequence[FreeRun]] = [
+SPREAD: Metrics[Sequence[Evaluation]] = [
     Metric("n_draws", len, View.JSON),
     Metric("n_living", _n_living, View.JSON),
     Metric("live", lambda runs: f"{_n_living(runs)} of {len(runs)}", View.SCREEN),
@@ -312,7 +312,7 @@ SPREAD: Metrics[Sequence[FreeRun]] = [
 ]
 
 
-def spread_section(draws: Mapping[str, Sequence[FreeRun]]) -> Section:
+def spread_section(draws: Mapping[str, Sequence[Evaluation]]) -> Section:
     """One row per method: the range of its numbers over the draws."""
     rows = ResultTable({LABELS[name]: runs for name, runs in draws.items()}, SPREAD)
     table = Table(

@@ -12,12 +12,12 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
+from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.units import SECONDS, Clock, unit_product
-from ep2sindy.model.comparison import Verdict
+from ep2sindy.model.comparison import Status
 from ep2sindy.model.display import grouped
-from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Result, Section, Table, Text
 from ep2sindy.report.results import Metric, Metrics, View
@@ -61,7 +61,7 @@ class PlotRange:
         return self.f_max_Hz or 0.5 / data.dt_s
 
 
-def rollout_tables(data: Trajectory, models: Mapping[str, FreeRun]) -> dict[str, pd.DataFrame]:
+def rollout_tables(data: Trajectory, models: Mapping[str, Evaluation]) -> dict[str, pd.DataFrame]:
     """Model and data, sample by sample, so that the figures can be redrawn."""
     found = {}
     for name, integrated in models.items():
@@ -77,7 +77,7 @@ def rollout_tables(data: Trajectory, models: Mapping[str, FreeRun]) -> dict[str,
 def run_figures(
     names: Sequence[str],
     data: Trajectory,
-    models: Mapping[str, FreeRun],
+    models: Mapping[str, Evaluation],
     shown: PlotRange,
     *,
     smoother: Smoother | None = None,
@@ -90,15 +90,15 @@ def run_figures(
     """
     span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
     rollouts = {name: integrated.rollout for name, integrated in models.items()}
-    verdicts = {name: integrated.verdict for name, integrated in models.items()}
+    statuses = {name: integrated.status for name, integrated in models.items()}
     drawn: dict[str, Callable[[], Figure]] = {
         "data": partial(series.data_figure, data, duration_s=span, f_max_Hz=f_max_Hz),
         "trajectories": partial(
-            series.trajectory_figure, data, rollouts, duration_s=span, verdicts=verdicts,
+            series.trajectory_figure, data, rollouts, duration_s=span, statuses=statuses,
             since=since,
         ),
         "spectra": partial(
-            series.spectrum_figure, data, rollouts, f_max_Hz=f_max_Hz, verdicts=verdicts
+            series.spectrum_figure, data, rollouts, f_max_Hz=f_max_Hz, statuses=statuses
         ),
     }  # fmt: skip
     if smoother is not None:
@@ -108,14 +108,14 @@ def run_figures(
         )
     if len(data.state_names) > 1:
         drawn["phase"] = partial(
-            series.phase_figure, data, rollouts, duration_s=span, verdicts=verdicts
+            series.phase_figure, data, rollouts, duration_s=span, statuses=statuses
         )
     return {name: Captioned(drawn[name], CAPTIONS[name]) for name in names if name in drawn}
 
 
 def trajectories(
     data: Trajectory,
-    models: Mapping[str, FreeRun],
+    models: Mapping[str, Evaluation],
     shown: PlotRange,
     caption: str,
     *,
@@ -230,25 +230,24 @@ def equation_sections(
     ]
 
 
-def best_run(runs: Mapping[str, FreeRun]) -> str:
-    """Name of the run of the best verdict, and of these the nearest to the data."""
-    order = list(Verdict)
+def best_run(runs: Mapping[str, Evaluation]) -> str:
+    """Name of the run of the best status, and of these the nearest to the data."""
 
-    def rank(name: str) -> tuple[int, float]:
+    def rank(name: str) -> tuple[tuple[bool, int], float]:
         nrmse = runs[name].nrmse
-        return order.index(runs[name].verdict), nrmse if np.isfinite(nrmse) else np.inf
+        return runs[name].rank, nrmse if np.isfinite(nrmse) else np.inf
 
     return min(runs, key=rank)
 
 
-def worst_run(runs: Sequence[FreeRun]) -> FreeRun:
-    """The first run of the worst verdict."""
-    return max(runs, key=lambda run: list(Verdict).index(run.verdict))
+def worst_run(runs: Sequence[Evaluation]) -> Evaluation:
+    """The first run of the worst status."""
+    return max(runs, key=lambda run: run.rank)
 
 
 def found_model(
     found: str,
-    run: FreeRun,
+    run: Evaluation,
     *,
     file: str,
     picture: str,
@@ -279,14 +278,18 @@ def found_model(
     )
 
 
-def _fate(run: FreeRun, *, seen: bool, misfit: str) -> str:
-    """`lives`, `has the wrong cycle`, `diverges after 12 us`."""
-    words = {Verdict.WRONG_CYCLE: "has the wrong cycle", Verdict.UNLIKE: "is unlike the data"}
-    words |= {} if seen or misfit else {Verdict.ALIKE: "is like the data"}
-    return words.get(run.verdict, run.words(seen=seen, misfit=misfit))
+def _fate(run: Evaluation, *, seen: bool, misfit: str) -> str:
+    """`is sustained`, `has the wrong cycle`, `diverges after 12 us`."""
+    if run.status is Status.NO_CYCLE:
+        does = "has the statistics of the data" if run.is_similar else "is unlike the data"
+        return "does not explain the data" if misfit else does
+    words = {Status.SUSTAINED: "is sustained", Status.WRONG_CYCLE: "has the wrong cycle"}
+    words |= {Status.WRONG_FREQUENCY: "has the wrong frequency"}
+    where = " where it was fitted" if seen and run.is_similar else ""
+    return f"{words.get(run.status, run.text)}{where}"
 
 
-def frequency_words(run: FreeRun, form: str = "+.1f") -> str:
+def frequency_words(run: Evaluation, form: str = "+.1f") -> str:
     """`20 kHz (+1.2 %)`: the first state's frequency and its error; a dash if it has none.
 
     form: of the error in percent.
@@ -298,7 +301,7 @@ def frequency_words(run: FreeRun, form: str = "+.1f") -> str:
     return f"{run.rollout.clock.frequency_text(frequency_Hz)}{error}"
 
 
-def run_words(run: FreeRun) -> str:
+def run_words(run: Evaluation) -> str:
     """Frequency, amplitude and waveform of a run beside the data's, as far as they are known."""
     found = []
     if (frequency := frequency_words(run, "+.2g")) != "-":

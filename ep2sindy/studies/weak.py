@@ -14,8 +14,9 @@ import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import assemble_model, reweight
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
-from ep2sindy.model.free_run import FreeRun, free_run, samples_in
+from ep2sindy.model.comparison import samples_in
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.formulations import Weak
 from ep2sindy.regression.front import Candidate, fit_support
@@ -127,7 +128,7 @@ class SettingFit:
     setting: Setting
     r2: Mapping[str, float]
     half_width: Mapping[str, int]
-    integrated: FreeRun
+    integrated: Evaluation
 
     def by_state(self, value: Callable[[str], Any]) -> dict[str, Any]:
         return {state: value(state) for state in self.integrated.model.states}
@@ -241,7 +242,7 @@ def fit_settings(
             units=run.units,
             provenance={"formulation": repr(setting.formulation), "trajectories": run.label},
         )
-        integrated = free_run(model, run, n_samples=n_samples)
+        integrated = evaluate(model, run, n_samples=n_samples)
         results[name] = SettingFit(
             setting=setting,
             r2={state: _r2_own_rows(*pair) for state, pair in found.items()},
@@ -341,7 +342,7 @@ def _metrics(data: Trajectory, f_data_Hz: float) -> Metrics[SettingFit]:
         ),
         Metric("r2", lambda f: f.r2, View.ALL, "R2", "{:.3f}"),
         *(metric.of(lambda f: f.integrated) for metric in RUN if metric.key in TOLD),
-        Metric("verdict", lambda f: f.integrated.text, View.SHOWN),
+        Metric("status", lambda f: f.integrated.text, View.SHOWN),
     ]  # fmt: skip
 
 
