@@ -205,6 +205,13 @@ def run_words(run: Evaluation) -> str:
     return "; ".join(found) or run.text
 
 
+def _rest(run: Evaluation) -> dict[str, float] | None:
+    """Where the model rests inside its cycle, by state; None if it does not."""
+    if run.rest is None:
+        return None
+    return dict(zip(run.model.states, run.rest.state.tolist(), strict=True))
+
+
 COMPARED = View.FILES | View.HEADLINE
 # How a model runs beside a record: of every model, in every study.
 EVALUATION: Metrics[Evaluation] = [
@@ -232,10 +239,3 @@ EVALUATED = (
     "standard deviations. nrmse: RMS error of the trajectory, in standard deviations; 1 is no "
     "better than a constant. Periods in phase: until it is a quarter of a period off."
 )
-
-
-def _rest(free: Evaluation) -> dict[str, float] | None:
-    """Where the model rests inside its cycle, by state; None if it does not."""
-    if free.rest is None:
-        return None
-    return dict(zip(free.run.model.states, free.rest.state.tolist(), strict=True))
