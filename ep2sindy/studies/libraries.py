@@ -52,7 +52,7 @@ from ep2sindy.studies.library_result import (
 )  # fmt: skip
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import NO_ZONES, Sampling, Source, Zones, data_summary, zones_of
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, ZeroOrMore
 from ep2sindy.studies.views import (
     FROM_DERIVATIVES,
     INTEGRATED,
@@ -147,7 +147,7 @@ class Study:
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: ShareOrNone = None
-    forecasts: Starts = 0
+    forecasts: ZeroOrMore = 0
     hidden: Sequence[str] = ()
     relations: Sequence[str] = ()
     exclude: Terms | None = None
