@@ -243,6 +243,7 @@ class Study:
         held, clock = record.held, record.held.clock
         f_Hz = dominant_frequency(held.t, held.states[:, 0])
         where = "held-out time" if self.held_out else "the record"
+        since = f"time since start of {'held-out part' if self.held_out else 'record'}"
         report.section(f"Run freely over {where}")
         report.table(
             "fits",
@@ -252,10 +253,11 @@ class Study:
             note=f"The data have {clock.frequency_text(f_Hz)}. {NOTE}",
         )
         runs = {name: each.from_sample for name, each in fits.items()}
-        add_figures(report, FIGURES, held, runs, self.figures)
+        draw = partial(add_figures, report, data=held, shown=self.figures, since=since)
+        draw(FIGURES, runs=runs)
         add_samples(report, held, runs)
         started = {name: each.from_fit for name, each in fits.items()}
-        add_figures(report, ["trajectories"], held, started, self.figures, suffix=STARTED)
+        draw(["trajectories"], runs=started, suffix=STARTED)
         relations = dict.fromkeys(t for each in self.models.values() for t in each.relations)
         report.section("Equations", *(f"relation: {text}" for text in relations))
         if any(each.model.covariance is not None for each in fits.values()):
