@@ -344,7 +344,7 @@ def test_one_call_finds_the_law_of_a_signal_and_the_state_that_nobody_measured()
     assert found.evaluation.forecast is not None
     text = repr(found)
     assert "x: the signal and 1 that nobody measured" in text
-    assert "its end, which was not fitted: follows" in text
+    assert "its end, which was not fitted: no cycle to compare; its statistics are" in text
     assert found.discovery.model == found.model
 
 
