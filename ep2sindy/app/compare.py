@@ -170,7 +170,9 @@ def compare_runs(runs: Sequence[ReadRun], figures: Sequence[str], *, beside: Pat
     ]
     versions = _differing({run.label: run.provenance["versions"] for run in runs}, "package")
     settings = _differing({run.label: run.settings for run in runs}, "setting")
-    pictures = {name: [Picture(f"{run.label}-{name}") for run in runs] for name in figures}
+    pictures: dict[str, list[Block]] = {
+        name: [Picture(f"{run.label}-{name}") for run in runs] for name in figures
+    }
     return [
         Section("Runs", [Table(pd.DataFrame(rows)), *versions]),
         Section("Settings that differ", settings or [Text("None: they are the same.")]),

@@ -125,8 +125,8 @@ class Report:
             frame, self.summary[name], seen = rows, json_rows(rows), rows
         self.samples(name, frame)
         if shown:
-            own = isinstance(shown, Table)
-            self.add(shown if own else Table(seen, title=title, note=note, bold=bold))
+            drawn = Table(seen, title=title, note=note, bold=bold)
+            self.add(shown if isinstance(shown, Table) else drawn)
 
     def samples(self, name: str, frame: pd.DataFrame) -> None:
         """Add samples, such as those that a figure draws: tables/NAME.csv alone."""

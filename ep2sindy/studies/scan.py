@@ -179,8 +179,11 @@ def scan_table(
 
     labels: of all places. A setting that is no number is a text.
     """
+    settings: list[Metric[Simulated]] = [
+        Metric(p, itemgetter(p), View.SHOWN, label, value_text) for p, label in labels.items()
+    ]
     metrics = [
-        *(Metric(p, itemgetter(p), View.SHOWN, label, value_text) for p, label in labels.items()),
+        *settings,
         *(metric.of(dict, view=View.SHOWN) for metric in (*VERDICT, *MERITS)),  # no headlines
         Metric("initial", lambda run: run.get("initial", "")),
         Metric("message", lambda run: "; ".join(reasons(run))),
