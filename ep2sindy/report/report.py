@@ -109,12 +109,13 @@ class Report:
         title: str = "",
         note: str = "",
         bold: Sequence[int] = (),
+        page_only: bool = False,
     ) -> None:
         """Add a table: tables/NAME.csv, an entry of the summary, and its place on the page.
 
         rows: records with their metrics, of which some are in the headline; or the table itself.
         heading, by_state: see `ResultTable.csv`. shown: False leaves it out of screen and page; or
-        another form of it for these. title, note, bold: of the table on the page.
+        another form of it for these. title, note, bold, page_only: of the table as it is shown.
         """
         _once("table", name, [*self.tables, *self.summary])
         if isinstance(rows, ResultTable):
@@ -125,7 +126,7 @@ class Report:
             frame, self.summary[name], seen = rows, json_rows(rows), rows
         self.samples(name, frame)
         if shown:
-            drawn = Table(seen, title=title, note=note, bold=bold)
+            drawn = Table(seen, title=title, note=note, bold=bold, page_only=page_only)
             self.add(shown if isinstance(shown, Table) else drawn)
 
     def samples(self, name: str, frame: pd.DataFrame) -> None:
