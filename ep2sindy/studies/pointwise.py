@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from itertools import product
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
@@ -56,14 +57,12 @@ OVER_ALL = (
     "over the points that have the term, in the unit named. All values by point, term and equation "
     "lie in pointwise.nc."
 )
-# Columns of tables, with their headings.
-OF_TERMS = {
-    "equation": "equation", "term": "term", "selected": "selected", "inclusion": "inclusion",
-    "coef": "median", "low": "16 %", "high": "84 %", "unit": "unit",
-}  # fmt: skip
-OF_REGIME = {
-    "equation": "equation", "term": "term", "in_support": "points that have it",
-    "coef": "median", "coef_low": "16 %", "coef_high": "84 %", "coef_units": "unit",
+# Columns that are shown of the tables of terms and of regimes, with their headings.
+HEADINGS = {
+    "equation": "equation", "term": "term",
+    "selected": "selected", "inclusion": "inclusion", "in_support": "points that have it",
+    "coef": "median", "low": "16 %", "coef_low": "16 %", "high": "84 %", "coef_high": "84 %",
+    "unit": "unit", "coef_units": "unit",
 }  # fmt: skip
 
 
@@ -194,7 +193,7 @@ def add_result(
     report.figure("quality", partial(quality_maps, result, outline=outline), CAPTIONS["quality"])
     report.section("Terms over all fitted points")
     terms = terms_table(result)
-    report.table("terms", terms, shown=Table(_readable(terms, OF_TERMS), note=OVER_ALL))
+    report.table("terms", terms, shown=Table(_readable(terms), note=OVER_ALL))
 
 
 def count_points(report: Report, result: xr.Dataset, wall_s: float) -> str:
@@ -251,7 +250,7 @@ def _add_regime(report: Report, regimes: Regimes, regime: int) -> None:
     )
     held = rows[rows["in_support"] > 0.0]
     held = held.assign(equation=held["equation"] + "'")
-    report.add(Table(_readable(held, OF_REGIME), bold=np.flatnonzero(held["acts"]).tolist()))
+    report.add(Table(_readable(held), bold=np.flatnonzero(held["acts"]).tolist()))
 
 
 def terms_table(result: xr.Dataset) -> pd.DataFrame:
@@ -261,29 +260,21 @@ def terms_table(result: xr.Dataset) -> pd.DataFrame:
     over the points. coef, low, high: median, 16 % and 84 % over the points that have the term.
     """
     fitted = (result["status"] == 0).values
-    rows: list[dict[str, Any]] = []
-    for equation in result["equation"].values:
-        for term in result["term"].values:
-            here = result.sel(equation=equation, term=term)
-            coef = here["coef"].values[fitted]
-            low, middle, high = spread(coef)
-            rows.append(
-                {
-                    "equation": f"{equation}'",
-                    "term": str(term),
-                    "selected": np.count_nonzero(coef) / max(coef.size, 1),
-                    "inclusion": float(here["inclusion"].values[fitted].mean()),
-                    "coef": middle,
-                    "low": low,
-                    "high": high,
-                    "unit": str(here["coef_units"].values),
-                }
-            )
-    return pd.DataFrame(rows)
+    rows = []
+    for equation, term in product(result["equation"].values, result["term"].values):
+        here = result.sel(equation=equation, term=term)
+        coef, inclusion = (here[name].values[fitted] for name in ("coef", "inclusion"))
+        low, middle, high = spread(coef)
+        shares = np.count_nonzero(coef) / max(coef.size, 1), float(inclusion.mean())
+        unit = str(here["coef_units"].values)
+        rows.append((f"{equation}'", str(term), *shares, middle, low, high, unit))
+    names = ["equation", "term", "selected", "inclusion", "coef", "low", "high", "unit"]
+    return pd.DataFrame(rows, columns=names)
 
 
-def _readable(rows: pd.DataFrame, headings: Mapping[str, str]) -> pd.DataFrame:
-    """Some columns under their headings, with shares in percent."""
-    shares = {name for name in ("selected", "inclusion", "in_support") if name in rows}
+def _readable(rows: pd.DataFrame) -> pd.DataFrame:
+    """The columns that are shown, under their headings, with shares in percent."""
+    shares = [name for name in ("selected", "inclusion", "in_support") if name in rows]
     percent = {name: [f"{share:.0%}" for share in rows[name]] for name in shares}
-    return rows.assign(**percent)[[*headings]].rename(columns=headings)
+    shown = [name for name in HEADINGS if name in rows]
+    return rows.assign(**percent)[shown].rename(columns=HEADINGS)

@@ -15,6 +15,7 @@ from typing import Any
 import xarray as xr
 
 from ep2sindy.figures.breathing import curves_figure, stability_figure
+from ep2sindy.report.about import setting_text
 from ep2sindy.report.document import Result, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, ResultTable, View, percent
@@ -122,14 +123,8 @@ def run_point(point: Point) -> Simulated:
 
 
 def value_text(value: Any) -> str:
-    """A value as text in tables and on axes: `250`, `BN`, `ColdStart(n_i=1e+17)`."""
-    if isinstance(value, Mapping):
-        name = str(value.get("_target_", "")).rpartition(".")[2]
-        inner = [f"{k}={value_text(v)}" for k, v in value.items() if k != "_target_"]
-        return f"{name}({', '.join(inner)})" if inner or not name else name
-    if isinstance(value, list):
-        return f"[{', '.join(map(value_text, value))}]"
-    return f"{value:g}" if isinstance(value, float) else "null" if value is None else str(value)
+    """A value as text in tables and on axes: `250`, `BN`, `ColdStart (n_i 1e+17)`, `null`."""
+    return setting_text(value) or "null"
 
 
 def add_scan(
