@@ -57,8 +57,8 @@ VERDICT: list[Metric[Simulated]] = [
     Metric("cycle", lambda run: run.get("cycle", "none"), View.SHOWN),
 ]
 MERITS = [
-    number("I_d_mean", "mean current", "{:.2f} A"),
-    number("I_d_std", "standard deviation", "{:.2f} A"),
+    number("I_d_mean", "mean discharge current", "{:.2f} A"),
+    number("I_d_std", "its standard deviation", "{:.2f} A"),
     number("f_kHz", "frequency", "{:.2f} kHz"),
     number("peak_spread", "spread of the peaks", percent(1)),
     number("multiplicity", "peaks repeat after", _cycles),

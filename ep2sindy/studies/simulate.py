@@ -57,8 +57,9 @@ PERFORMANCE: list[Metric[Simulated]] = [
     *VERDICT,
     Metric("initial", lambda run: run.get("initial"), View.SHOWN, "start"),
     *MERITS,
+    number("std_share", "standard deviation over mean current", percent(0), View.SHOWN),
     number("I_beam_mean", "mean ion beam current", "{:.2f} A"),
-    number("beam_share", "ion beam in the mean current", percent(0), View.SHOWN),
+    number("beam_share", "ion beam over discharge current", percent(0), View.SHOWN),
     number("I_wall_mean", "mean ion current to the walls", "{:.2f} A"),
     Metric("rates", lambda run: run.get("rates"), View.SHOWN, "rates of the propellant"),
     number("half_angle_deg", "mean half-angle of the plume", "{:.1f} degrees", View.SHOWN),
@@ -180,7 +181,8 @@ def performance(field: xr.Dataset) -> dict[str, Any]:
     means = {"I_beam": "I_beam_mean", "half_angle": "half_angle_deg"}
     if field.sizes["time"]:
         found |= {key: float(field[name].mean()) for name, key in means.items() if name in field}
-        found["beam_share"] = found.get("I_beam_mean", np.nan) / found["I_d_mean"]
+        shares = {"I_d_std": "std_share", "I_beam_mean": "beam_share"}
+        found |= {k: found.get(name, np.nan) / found["I_d_mean"] for name, k in shares.items()}
     return found
 
 
