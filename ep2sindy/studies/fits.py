@@ -20,10 +20,10 @@ from scipy.optimize import least_squares
 
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
 from ep2sindy.figures.windows import loss_against_window_figure
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
-from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeRun, free_run, samples_in
+from ep2sindy.model.comparison import Status, samples_in
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 from ep2sindy.refinement.windows import MIN_SAMPLES, dominant_window
@@ -70,9 +70,9 @@ INTERVALS = (
     "terms are the whole law; what the terms lack, they do not count."
 )
 NOTE = (
-    "Amplitude: standard deviation against the data's. Start fitted: frequency error and nrmse from "
-    "a start fitted to the first one and a half periods, since a single sample may lie off every "
-    "orbit of the model. R2: of the derivative, on a fit's own rows, which windows average."
+    "Amplitude: standard deviation against the data's. In files, started: from a start fitted to the "
+    "first one and a half periods, since a single sample may lie off every orbit of the model; r2: "
+    "of the derivative, on the rows of the fit, which windows average."
 )
 CAPTION = (
     "Refinement with windows of several lengths: loss on the fitted part, where each window has a "
@@ -91,7 +91,7 @@ class Fit:
     form: of the regression, one of those that the config names; None means the formulation;
     "balance" fits every process to the rate that a simulation records. relations: whether those of
     a structure hold. refine: whether trajectories are followed then. n_points, n_windows: of random
-    windows, for a form that has them; every combination is a fit of its own.
+    windows, for a form that has them; every combination is a fit of its own, `n_points_70`.
     """
 
     form: str | None = None
@@ -125,8 +125,9 @@ def expand(
         own = form.test_functions
         for n_windows, n_points in product(fit.n_windows or [own.n_windows], fit.n_points):
             boxes = replace(own, n_points=n_points, n_windows=n_windows)
-            several = f"_{n_windows}" if len(fit.n_windows) > 1 else ""
-            found[f"{name}{several}_{n_points}"] = fit, replace(form, test_functions=boxes)
+            varying = {"n_windows": n_windows} if len(fit.n_windows) > 1 else {}
+            words = (f"{key}_{value}" for key, value in (varying | {"n_points": n_points}).items())
+            found["_".join(words)] = fit, replace(form, test_functions=boxes)
     return found
 
 
@@ -157,8 +158,8 @@ class Fitted:
 
     model: SparseModel
     held_to: Constraint | None
-    from_sample: FreeRun
-    from_fit: FreeRun
+    from_sample: Evaluation
+    from_fit: Evaluation
     cpu_s: float
     r2: Mapping[str, float]
     refinement: Refinement | None = None
@@ -289,11 +290,11 @@ class Study:
             n_reweights=self.n_reweights,
         )  # fmt: skip
 
-    def evaluate(self, model: SparseModel, record: Record) -> tuple[FreeRun, FreeRun]:
+    def evaluate(self, model: SparseModel, record: Record) -> tuple[Evaluation, Evaluation]:
         """Free runs over the held-out part, from its first sample and from a fitted start."""
         held = record.held
         n = held.n_samples if self.rollout_s is None else samples_in(held, self.rollout_s)
-        run = partial(free_run, model, held, n_samples=n)
+        run = partial(evaluate, model, held, n_samples=n)
         return run(), run(initial=fitted_start(model, held))
 
     def _add_one(
@@ -446,7 +447,7 @@ class OneFit:
             row |= {f"f_error{suffix}": run.f_error, f"nrmse{suffix}": run.nrmse}
         return row
 
-    def with_seed(self, record: Record, seed: int, report: Report) -> FreeRun:
+    def with_seed(self, record: Record, seed: int, report: Report) -> Evaluation:
         """The run of the model of another draw of windows."""
         model, held_to, _ = self._start(record)
         assert held_to is not None
@@ -524,7 +525,7 @@ METHOD: Metrics[Fitted] = [
 ]
 
 
-def _ends(value: Callable[[FreeRun], float], runs: Sequence[FreeRun]) -> list[float]:
+def _ends(value: Callable[[Evaluation], float], runs: Sequence[Evaluation]) -> list[float]:
     """Lowest and highest value over the runs that have it; NaN if none has it."""
     values = np.array([value(run) for run in runs])
     known = values[np.isfinite(values)]
@@ -536,23 +537,23 @@ def _range(ends: Sequence[float], form: str = "{:.3f} to {:.3f}", factor: float 
     return "-" if np.isnan(low) else form.format(low, high)
 
 
-def _worst_amplitude(run: FreeRun) -> float:
+def _worst_amplitude(run: Evaluation) -> float:
     ratios = np.array(list(run.amplitude_ratio.values()))
     return float(ratios[np.argmax(np.abs(ratios - 1.0))])
 
 
-def _worst_waveform(run: FreeRun) -> float:
+def _worst_waveform(run: Evaluation) -> float:
     return max(run.waveform_error.values())
 
 
-def _n_living(runs: Sequence[FreeRun]) -> int:
-    return sum(run.verdict is Verdict.LIVES for run in runs)
+def _n_sustained(runs: Sequence[Evaluation]) -> int:
+    return sum(run.status is Status.SUSTAINED for run in runs)
 
 
 _PERCENT = partial(_range, form="{:+.2f} to {:+.2f} %", factor=100.0)
-SPREAD: Metrics[Sequence[FreeRun]] = [
+SPREAD: Metrics[Sequence[Evaluation]] = [
     Metric("n_draws", len),
-    Metric("n_living", _n_living, View.SHOWN, "live"),
+    Metric("n_sustained", _n_sustained, View.SHOWN, "sustained"),
     Metric("f_error", partial(_ends, lambda run: run.f_error), View.SHOWN, format=_PERCENT),
     Metric("nrmse", partial(_ends, lambda run: run.nrmse), View.SHOWN, format=_range),
     Metric("amplitude", partial(_ends, _worst_amplitude), View.SHOWN, format=_range),
@@ -596,15 +597,15 @@ class OverPoints:
     fits: Mapping[str, Fitted]
 
     @property
-    def living(self) -> list[str]:
-        return [p for p, fit in self.fits.items() if fit.from_sample.verdict is Verdict.LIVES]
+    def sustained(self) -> list[str]:
+        return [p for p, fit in self.fits.items() if fit.from_sample.status is Status.SUSTAINED]
 
     @property
     def elsewhere(self) -> str:
-        """What becomes of the model where it does not live, in words."""
-        runs = [fit.from_sample for p, fit in self.fits.items() if p not in self.living]
-        words = dict.fromkeys(str(run.verdict) for run in runs)
-        return ", ".join(f"{word} at {sum(str(r.verdict) == word for r in runs)}" for word in words)
+        """What becomes of the model at the others, in words."""
+        runs = [fit.from_sample for p, fit in self.fits.items() if p not in self.sustained]
+        words = dict.fromkeys(str(run.status) for run in runs)
+        return ", ".join(f"{word} at {sum(str(r.status) == word for r in runs)}" for word in words)
 
     @property
     def wrong(self) -> dict[str, int]:
@@ -612,7 +613,7 @@ class OverPoints:
         terms = [term for fit in self.fits.values() for term in fit.wrong]
         return {term: terms.count(term) for term in dict.fromkeys(terms)}
 
-    def worst(self, value: Callable[[FreeRun], float]) -> float:
+    def worst(self, value: Callable[[Evaluation], float]) -> float:
         """The largest modulus over the points that have a value; NaN if none has."""
         values = np.array([value(fit.from_sample) for fit in self.fits.values()])
         known = np.abs(values[np.isfinite(values)])
@@ -621,8 +622,8 @@ class OverPoints:
 
 OVER_POINTS: Metrics[OverPoints] = [
     Metric("n_free", lambda each: max(fit.n_free for fit in each.fits.values()), View.SHOWN, "free"),
-    Metric("n_living", lambda each: len(each.living), View.FILES | View.HEADLINE),
-    Metric("lives", lambda each: f"{len(each.living)} of {len(each.fits)}", View.SCREEN),
+    Metric("n_sustained", lambda each: len(each.sustained), View.FILES | View.HEADLINE),
+    Metric("sustained", lambda each: f"{len(each.sustained)} of {len(each.fits)}", View.SCREEN),
     Metric("elsewhere", lambda each: each.elsewhere, View.SHOWN),
     Metric("f_error", lambda each: each.worst(lambda r: r.f_error), View.SHOWN, "frequency off by",
            percent(2)),
@@ -667,16 +668,16 @@ def add_points(
         for name, fit in fits.items():
             report.add(*equations(fit.model, lead=name, on_screen=False))
             report.model(f"{name}_{number}", fit.model, shown=False)
-    n_all = sum(len(each.living) == len(found) for each in over.values())
+    n_all = sum(len(each.sustained) == len(found) for each in over.values())
     lines = [
-        Text(f"living at {n} of {len(found)}: {', '.join(names)}")
+        Text(f"sustained at {n} of {len(found)}: {', '.join(names)}")
         for n in range(len(found), 0, -1)
-        if (names := [name for name, each in over.items() if len(each.living) == n])
+        if (names := [name for name, each in over.items() if len(each.sustained) == n])
     ]
     report.found(
         Result(
-            f"Found: {n_all} of {len(over)} fits live at all of {len(found)} operating points",
-            lines or [Text("none lives at any point")],
+            f"Found: {n_all} of {len(over)} fits are sustained at all of {len(found)} operating points",
+            lines or [Text("none is sustained at any point")],
             load='pandas.read_csv("{}/tables/over_points.csv")',
         )
     )
