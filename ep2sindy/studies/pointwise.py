@@ -127,7 +127,7 @@ class Study:
                 search,
                 workers=workers,
                 block_points=self.block_points,
-                progress=Counted(report),
+                progress=CountedPoints(report),
             )
         wall_s = time.perf_counter() - begin
         rng = np.random.default_rng(report.seed)
@@ -140,7 +140,7 @@ class Study:
 
 
 @dataclass(frozen=True, eq=False)
-class Counted:
+class CountedPoints:
     """Progress of the run, and the number of points done in TensorBoard."""
 
     report: Report
