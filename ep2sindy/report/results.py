@@ -26,18 +26,8 @@ LABELS = {
     "periods": "periods in phase",
     "r2": "R2",
     "r2_test": "R2 on held-out rows",
-    "n_terms": "number of terms",
-    "d_pareto": "distance to the corner of the front",
-    "deviance": "deviance",
     "identified_percent": "identified (%)",
-    "mean_correct_terms": "correct terms (mean)",
-    "multiplier": "Floquet multiplier",
-    "share_reaching": "share of starts that reach the cycle",
-    "cpu_s": "CPU time (s)",
-    "cpu_ms": "CPU time (ms)",
-    "n_points": "number of points",
-    "map_right": "share of the map that is right",
-    "living": "the model that lives",
+    "d_pareto": "distance to the corner of the front",
 }
 
 
