@@ -17,7 +17,6 @@ from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies import points as studied
 from ep2sindy.studies.point_sources import point_sources
 from ep2sindy.studies.scan import scan_points
-from ep2sindy.studies.simulate import profile_samples
 from ep2sindy.studies.source import DivergedError, amiss, check_recorded, compile_kernels, doubts
 from tests import programs
 from tests.programs import summary_of
@@ -121,7 +120,7 @@ def test_fields_over_r_are_averaged_by_area(field: xr.Dataset) -> None:
     window = slice(0, 100)
     for figure in (breathing.profile_figure(both), breathing.space_time_figure(both, window)):
         assert all(ax.has_data() for ax in figure.axes)
-    assert profile_samples(both)["n_i_mean"].to_numpy() == pytest.approx(
+    assert breathing.profile_table(both)["n_i_mean"].to_numpy() == pytest.approx(
         expected.mean(axis=0), rel=1e-5
     )
 

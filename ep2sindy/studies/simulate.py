@@ -162,7 +162,7 @@ class Study:
         report.figure("profiles", draw, CAPTIONS["profiles"] + radial)
         draw = partial(breathing.space_time_figure, field, window)
         report.figure("maps", draw, CAPTIONS["maps"] + radial)
-        report.samples("profiles", profile_samples(field))
+        report.samples("profiles", breathing.profile_table(field))
 
     def _scan(self, report: Report, scan: Mapping[str, Sequence[Any]]) -> None:
         points = scan_points(self.data, scan)
@@ -184,15 +184,6 @@ def performance(field: xr.Dataset) -> dict[str, Any]:
         shares = {"I_d_std": "std_share", "I_beam_mean": "beam_share"}
         found |= {k: found.get(name, np.nan) / found["I_d_mean"] for name, k in shares.items()}
     return found
-
-
-def profile_samples(field: xr.Dataset) -> pd.DataFrame:
-    """Profiles along the axis: mean in time, band and whole range of each variable."""
-    ends = ("mean", "low", "high", "min", "max")
-    columns = {"z": field["z"].values}
-    for name, values in breathing.profile_table(field).items():
-        columns |= {f"{name}_{end}": each for end, each in zip(ends, values, strict=True)}
-    return pd.DataFrame(columns)
 
 
 def add_power(report: Report, field: xr.Dataset) -> None:
