@@ -14,11 +14,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from ep2sindy.data.fields import SPACE, write_netcdf
+from ep2sindy.data.fields import write_netcdf
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.discovery.pointwise import STATUSES, PointSearch, pointwise
 from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes, spread
-from ep2sindy.figures.maps import coefficient_maps, quality_maps, regime_map
+from ep2sindy.figures.maps import coefficient_maps, quality_maps, regime_map, space_axes
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
 from ep2sindy.report.document import Equation, Result, Table, Text
@@ -200,8 +200,7 @@ def count_points(report: Report, result: xr.Dataset, wall_s: float) -> str:
     """Count points by status, and those without a term by equation; returns both in words."""
     statuses = {name: int((result["status"] == k).sum()) for k, name in enumerate(STATUSES)}
     n_points, n_valid = int(result["status"].size), statuses[STATUSES[0]]
-    axes = [axis for axis in SPACE if axis in result.dims]
-    without = (result["n_terms"] == 0).sum(axes).to_series()
+    without = (result["n_terms"] == 0).sum(space_axes(result)).to_series()
     empty = {str(state): int(n) for state, n in without.items() if n}
     known = {name: n for name, n in statuses.items() if n}
     counts = {"n_points": n_points, "n_valid": n_valid}
@@ -217,22 +216,14 @@ def count_points(report: Report, result: xr.Dataset, wall_s: float) -> str:
 
 def found_regimes(regimes: Regimes, points: str) -> Result:
     """The regimes, their certainty, and the equations of the largest."""
-    sizes = regimes.table.groupby("regime")["n_points"].first()
-    largest = int(sizes.to_numpy().argmax())
-    lead = f"in the largest, {sizes[largest]} points"
+    lead = f"in the largest, {int((regimes.labels == 0).sum())} points"
+    largest = [Equation(s, t, lead=lead, on_screen=True) for s, t in regimes.equations(0).items()]
     count = f"{regimes.n_regimes} regime{'s' if regimes.n_regimes > 1 else ''}"
     limit = ", as many as max_regimes allows: the points may bear more" if regimes.at_limit else ""
-    known = regimes.confidence.values[np.isfinite(regimes.confidence.values)]
-    unsure = f"confidence below {UNSURE:g} at {(known < UNSURE).mean():.0%} of points"
+    unsure = float((regimes.confidence < UNSURE).sum() / regimes.confidence.count())
     return Result(
-        f"Found: {count}{limit}; {unsure}",
-        [
-            Text(points),
-            *(
-                Equation(state, terms, lead=lead, on_screen=True)
-                for state, terms in regimes.equations(largest).items()
-            ),
-        ],
+        f"Found: {count}{limit}; confidence below {UNSURE:g} at {unsure:.0%} of points",
+        [Text(points), *largest],
         load='xarray.open_dataset("{}/pointwise.nc")',
         picture="regimes",
     )
