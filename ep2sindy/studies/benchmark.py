@@ -332,21 +332,19 @@ def best_variant(cells: pd.DataFrame) -> Result:
 def _readable(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> Table:
     """One row per variant or published one, one column per system; noise levels share a cell."""
     table = merit_table(cells, published, merit)
+    old = table.index.get_level_values(1).to_numpy()
+    table = table[
+        old | table.notna().any(axis=1).to_numpy()
+    ]  # others leave the selection to the user
     digits = 2 if merit == "mean_correct_terms" else 0
+    shown = table.map(partial(places, n=digits)).T.groupby(level=0, sort=False).agg("/".join).T
+    shown.columns = [_heading(str(system), merit) for system in shown]
+    names = [f"{name}, thesis" if is_old else name for name, is_old in table.index]
     cpu_ms = 1e3 * cells.groupby("variant")["cpu_s_per_search"].mean()
-    rows: list[dict[str, str]] = []
-    italic: list[int] = []
-    for name, is_published in table.index:
-        values = table.loc[(name, is_published)]
-        if is_published:
-            italic.append(len(rows))
-        elif values.isna().all():
-            continue  # this variant leaves the selection to the user
-        row = {"variant": f"{name}, thesis" if is_published else name}
-        for system in cells["system"].unique():
-            row[_heading(system, merit)] = "/".join(places(v, digits) for v in values[system])
-        rows.append(row | {"CPU (ms)": "" if is_published else f"{cpu_ms[name]:.1f}"})
-    return Table(pd.DataFrame(rows), italic=italic)
+    times = ["" if is_old else f"{cpu_ms[name]:.1f}" for name, is_old in table.index]
+    shown = shown.assign(**{"CPU (ms)": times}).reset_index(drop=True)
+    shown.insert(0, "variant", names)
+    return Table(shown, italic=[k for k, (_, is_old) in enumerate(table.index) if is_old])
 
 
 def _not_selected(collected: pd.DataFrame) -> Table:
