@@ -146,7 +146,7 @@ class Study:
             counted = cells(outcomes)
             report.section(
                 "Realizations",
-                f"{self.n_realizations} realizations of every system and noise level.",
+                f"Realizations of every system and noise level: {self.n_realizations}.",
                 Text(INTRODUCTION, page_only=True),
             )
             if COLLECTION in set(outcomes["group"]):
@@ -293,9 +293,8 @@ def add_tables(
     report.samples("outcomes", outcomes)
     report.table("cells", beside, shown=False)
     levels = "/".join(f"{100 * noise:g}" for noise in cells["noise"].unique())
-    for merit in MERITS:
-        report.section(f"{TITLES[merit]}; noise {levels} %")
-        report.add(_readable(cells, published, merit))
+    report.section(f"By system; noise {levels} %")
+    report.add(*(_readable(cells, published, merit) for merit in MERITS))
     collected = outcomes[outcomes["group"] == COLLECTION]
     if len(collected):
         report.section("Systems that are not selected")
@@ -344,7 +343,9 @@ def _readable(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> Table
     times = ["" if is_old else f"{cpu_ms[name]:.1f}" for name, is_old in table.index]
     shown = shown.assign(**{"CPU (ms)": times}).reset_index(drop=True)
     shown.insert(0, "variant", names)
-    return Table(shown, italic=[k for k, (_, is_old) in enumerate(table.index) if is_old])
+    return Table(
+        shown, TITLES[merit], italic=[k for k, (_, is_old) in enumerate(table.index) if is_old]
+    )
 
 
 def _not_selected(collected: pd.DataFrame) -> Table:
