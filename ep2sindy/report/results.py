@@ -139,7 +139,7 @@ class ResultTable(Generic[Record]):
         return pd.DataFrame(rows, columns=known)
 
     def screen(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
-        """A row of formatted cells per record.
+        """A row of formatted cells per record, without columns that have no value.
 
         by_state: a row per record and state instead. The name, and metrics without states, are then
         shown only in a record's first row.
@@ -152,7 +152,8 @@ class ResultTable(Generic[Record]):
                 rows += _rows_of_states(first, values)
             else:
                 rows.append(first | self._cells(record))
-        return pd.DataFrame(rows)
+        frame = pd.DataFrame(rows)
+        return frame.loc[:, [not {*map(cell_text, frame[name])} <= {"", "-"} for name in frame]]
 
     def upright(self, heading: str = "quantity") -> pd.DataFrame:
         """A row per metric, and a column of formatted cells per record."""
