@@ -79,11 +79,14 @@ def add_figures(
     *,
     smoother: Smoother | None = None,
     since: str = series.SINCE_START,
+    suffix: str = "",
+    caption: str = "",
 ) -> None:
     """Add the named figures of CAPTIONS; phase portraits need two states or more.
 
     smoother: gives the data's derivative; without one there are no derivative figures.
-    since: the origin of the time axis of runs, in words.
+    since: the origin of the time axis of runs, in words. suffix: of the files. caption: instead of
+    the usual ones.
     """
     span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
     rollouts = {name: run.rollout for name, run in runs.items()}
@@ -104,7 +107,7 @@ def add_figures(
         drawn["phase"] = partial(series.phase_figure, data, rollouts, duration_s=span, **how)
     for name in names:
         if name in drawn:
-            report.figure(name, drawn[name], CAPTIONS[name])
+            report.figure(f"{name}{suffix}", drawn[name], caption or CAPTIONS[name])
 
 
 def terms_text(terms: Mapping[str, Sequence[str]]) -> str:
@@ -209,7 +212,9 @@ EVALUATION: Metrics[FreeRun] = [
     Metric("frequency_Hz", lambda run: run.frequency_Hz),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.HEADLINE),
     Metric("f_error", lambda run: run.f_error, COMPARED),
-    Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.SHOWN, "amplitude {}", "{:.3f}"),
+    Metric(
+        "amplitude_ratio", lambda run: run.amplitude_ratio, View.SHOWN, "amplitude {}", "{:.3f}"
+    ),
     Metric("waveform_error", lambda run: run.waveform_error, View.SHOWN, "waveform {}", "{:.3f}"),
     Metric("waveform_error", lambda run: largest(run.waveform_error), View.HEADLINE),
     Metric("nrmse", lambda run: run.nrmse, View.ALL, format="{:.3f}"),
