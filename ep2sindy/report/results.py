@@ -139,10 +139,10 @@ class ResultTable(Generic[Record]):
         return pd.DataFrame(rows, columns=known)
 
     def screen(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
-        """A row of formatted cells per record, without columns that have no value.
+        """A row of formatted cells per record.
 
         by_state: a row per record and state instead. The name, and metrics without states, are then
-        shown only in a record's first row.
+        shown only in a record's first row. Columns in which no cell has a value are left out.
         """
         rows: list[dict[str, object]] = []
         for name, record in self._named():
@@ -152,8 +152,9 @@ class ResultTable(Generic[Record]):
                 rows += _rows_of_states(first, values)
             else:
                 rows.append(first | self._cells(record))
-        frame = pd.DataFrame(rows)
-        return frame.loc[:, [not {*map(cell_text, frame[name])} <= {"", "-"} for name in frame]]
+        table = pd.DataFrame(rows)
+        empty = [n for n in table if all(cell_text(cell) in ("", "-") for cell in table[n])]
+        return table.drop(columns=empty)
 
     def upright(self, heading: str = "quantity") -> pd.DataFrame:
         """A row per metric, and a column of formatted cells per record."""

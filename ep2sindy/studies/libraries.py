@@ -40,10 +40,10 @@ from ep2sindy.studies.candidates import (
     selected_metrics,
     selected_rows,
 )
-from ep2sindy.studies.fits import Terms, n_before, split_in_time
 from ep2sindy.studies.forecasts import add_forecasts, skill_of, why_none
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, add_living, living_model
 from ep2sindy.studies.source import NO_ZONES, Sampling, Source, Zones, zones_of
+from ep2sindy.studies.structures import Terms, n_before, split_in_time
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts
 from ep2sindy.studies.views import (
     EVALUATED,

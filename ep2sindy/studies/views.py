@@ -36,6 +36,8 @@ CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",
     "trajectories": "Models integrated from the first sample (colour) over the data (grey). "
     f"{MARKS}",
+    "trajectories_started": "The same from a start fitted to the first one and a half periods.",
+    "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
     "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey); "
     "carets: a curve leaves the panel.",
     "phase": "Phase portraits of the integrated models (colour) over the data (grey), dots where "
@@ -80,13 +82,12 @@ def add_figures(
     smoother: Smoother | None = None,
     since: str = series.SINCE_START,
     suffix: str = "",
-    caption: str = "",
 ) -> None:
     """Add the named figures of CAPTIONS; phase portraits need two states or more.
 
     smoother: gives the data's derivative; without one there are no derivative figures.
-    since: the origin of the time axis of runs, in words. suffix: of the files. caption: instead of
-    the usual ones.
+    since: the origin of the time axis of runs, in words. suffix: to the names, for runs of another
+    kind, which CAPTIONS describes by such a name.
     """
     span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
     rollouts = {name: run.rollout for name, run in runs.items()}
@@ -107,7 +108,7 @@ def add_figures(
         drawn["phase"] = partial(series.phase_figure, data, rollouts, duration_s=span, **how)
     for name in names:
         if name in drawn:
-            report.figure(f"{name}{suffix}", drawn[name], caption or CAPTIONS[name])
+            report.figure(f"{name}{suffix}", drawn[name], CAPTIONS[f"{name}{suffix}"])
 
 
 def terms_text(terms: Mapping[str, Sequence[str]]) -> str:
