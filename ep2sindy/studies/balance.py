@@ -17,6 +17,7 @@ from ep2sindy.library.roles import constraint_of, process_amounts
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
@@ -249,12 +250,12 @@ class ModelBalance:
 
 
 def add_balance(
-    report: Report, name: str, found: ModelBalance, data: Trajectory, *, period_s: float | None
+    report: Report, name: str, found: ModelBalance, data: Trajectory, cycle: LimitCycle | None
 ) -> None:
     """Add the processes, then one row per term, and the model without it.
 
-    name: of the library. data: samples of the processes. period_s: of the model's cycle; without
-    one there is no figure.
+    name: of the library. data: samples of the processes. cycle: of the model; without one there is
+    no figure.
     """
     report.section(f"{name}: what the terms mean", level=3)
     if found.processes:
@@ -262,8 +263,8 @@ def add_balance(
         rows = ResultTable(found.processes, PROCESSES)
         report.table(f"balance_{name}", rows, title=title, note=NOTE)
     known = [each for each in found.processes if each.recorded is not None]
-    if known and period_s is not None:
-        shown = data.t - data.t[0] <= 2.0 * period_s
+    if known and cycle is not None:
+        shown = data.t - data.t[0] <= 2.0 * cycle.period_s
         parts = {each.name: (each.recorded[shown], each.modelled[shown]) for each in known}  # type: ignore[index]
         draw = partial(balance_figure, data.t[shown], parts, clock=data.clock)
         report.figure(f"balance_{name}", draw, CAPTION)
