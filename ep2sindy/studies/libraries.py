@@ -295,7 +295,8 @@ class Study:
         for name, result in results.items():
             text = f"{name}: equations {result.how}; run freely: {result.runs[0].text}"
             report.add(Text(text, page_only=True))
-            report.model(name, result.discovery.model, clock=clock)
+            held = result.discovery.constraint
+            report.model(name, result.discovery.model, clock=clock, held=held)
         selected = {name: result.runs[0] for name, result in results.items()}
         published = {f"{n}_thesis_terms": r.published for n, r in results.items() if r.published}
         is_living = any(result.living is not None for result in results.values())

@@ -157,6 +157,7 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
             where=f"the worst of {n_records} records" if n_records > 1 else "the record",
             seen=True,
             misfit=results[best].discovery.misfit,
+            held=results[best].discovery.constraint,
         )
     best = best_run({name: each.run for name, each in living.items()})
     free = living[best].free
