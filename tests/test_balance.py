@@ -9,8 +9,7 @@ import xarray as xr
 import ep2sindy as ep
 from ep2sindy.library.roles import constraint_of, sum_known
 from ep2sindy.studies.balance import compared_processes, model_balance
-from ep2sindy.studies.source import Zones, told_roles
-from ep2sindy.studies.structures import split_in_time
+from ep2sindy.studies.source import Zones, split_in_time, told_roles
 from tests.thrusters import brief
 
 STATES = ["n_i", "n_n"]

@@ -82,7 +82,9 @@ def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
 def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     found = summary_of(breathing_run)
     run, model = (found[key]["simple_living"] for key in ("evaluations", "models"))
-    assert run["status"] == found["evaluations"]["simple_refined"]["status"] == "lives"  # same terms
+    assert (
+        run["status"] == found["evaluations"]["simple_refined"]["status"] == "sustained"
+    )  # same terms
     assert run["f_error"] == pytest.approx(0.0, abs=1e-4)
     assert run["waveform_error"] == pytest.approx({"n_i": 0.0, "n_n": 0.0}, abs=1e-2)
     assert run["amplitude_ratio"] == pytest.approx({"n_i": 1.0, "n_n": 1.0}, abs=1e-2)
@@ -97,7 +99,7 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert low < ions < high
     terms = {(each["part"], each["term"]): each for each in found["terms_simple"]}
     assert len(terms) == 4
-    assert all(each["without_status"] != "lives" for each in terms.values())
+    assert all(each["without_status"] != "sustained" for each in terms.values())
     assert "balance_simple" not in found
     for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
         assert (breathing_run / "figures" / f"{figure}.png").is_file()
@@ -108,7 +110,7 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
 def test_the_page_says_the_model_that_lives_before_candidates(breathing_run: Path) -> None:
     page = (breathing_run / "report.html").read_text()
     order = [
-        "a model that lives", "the cycle is neutral", 'id="figure-free_run_simple"',
+        "a model selected by free runs (sustained)", "the cycle is neutral", 'id="figure-free_run_simple"',
         "what the terms mean", "forecasts over time held out", "The selected model of every library",
         "Run freely from the first sample", "simple: candidates", "velocity: candidates",
     ]  # fmt: skip
@@ -118,7 +120,12 @@ def test_the_page_says_the_model_that_lives_before_candidates(breathing_run: Pat
 
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:
     folder = breathing_run
-    files = ["config.yaml", "provenance.json", "tables/front_velocity.csv", "tables/evaluations.csv"]
+    files = [
+        "config.yaml",
+        "provenance.json",
+        "tables/front_velocity.csv",
+        "tables/evaluations.csv",
+    ]
     for name in [*files, "figures/data.png", "figures/trajectories.png"]:
         assert (folder / name).is_file(), name
     assert list(folder.glob("tensorboard/events*"))

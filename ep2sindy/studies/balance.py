@@ -12,10 +12,10 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.living import balance_figure
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.relations import Constraint, Process, constraint
 from ep2sindy.library.roles import constraint_of, process_amounts
 from ep2sindy.model.comparison import FreeRunBounds
-from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.report import Report
@@ -204,7 +204,7 @@ class TermRole:
     term: str
     coef: float
     is_known: bool
-    without: FreeRun | None
+    without: Evaluation | None
     counterpart: float = float("nan")
     fit_r2: float = float("nan")
 
@@ -308,7 +308,7 @@ def _roles(
     model: SparseModel,
     held_to: Constraint,
     processes: Sequence[ComparedProcess],
-    left_out: Sequence[FreeRun | None],
+    left_out: Sequence[Evaluation | None],
 ) -> list[TermRole]:
     """The terms of all processes, or of all equations if there are none."""
     if not processes:
@@ -337,7 +337,7 @@ def _without(
     progress: Progress,
     *,
     window: int | None,
-) -> FreeRun | None:
+) -> Evaluation | None:
     """The model refined under a constraint with fewer terms, and run; None if it is not finite."""
     from ep2sindy.refinement.refine import refine, with_coef  # loads torch, only for a refinement
 
@@ -350,7 +350,7 @@ def _without(
     )
     if found.status == "non_finite":
         return None
-    return free_run(found.model, held, initial=start_of(held, found.model), bounds=bounds)
+    return evaluate(found.model, held, initial=start_of(held, found.model), bounds=bounds)
 
 
 def _each_left_out(

@@ -14,10 +14,11 @@ from ep2sindy.data.quantities import KNOWN_UNITS
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression
+from ep2sindy.forecasting.evaluation import evaluate
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
-from ep2sindy.model.free_run import free_run, samples_in
+from ep2sindy.model.comparison import samples_in
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Table, Text
@@ -41,9 +42,16 @@ from ep2sindy.studies.library_result import (
     refitted_model,
 )
 from ep2sindy.studies.living import LivingSearch, add_living, living_model
-from ep2sindy.studies.source import NO_ZONES, Sampling, Source, Zones, zones_of
-from ep2sindy.studies.structures import Terms, n_before, split_in_time
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts
+from ep2sindy.studies.source import (
+    NO_ZONES,
+    Sampling,
+    Source,
+    Zones,
+    n_before,
+    split_in_time,
+    zones_of,
+)
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts, Terms
 from ep2sindy.studies.views import (
     EVALUATED,
     EVALUATION,
@@ -240,7 +248,7 @@ class Study:
         )  # fmt: skip
         with progress.stage(None, "", "free runs"):
             pairs = zip(runs, n_samples, strict=True)
-            over = [partial(free_run, run=run, n_samples=n) for run, n in pairs]
+            over = [partial(evaluate, run=run, n_samples=n) for run, n in pairs]
             return LibraryResult(
                 discovery=found,
                 runs=[run_over(found.model) for run_over in over],
@@ -264,7 +272,7 @@ class Study:
         for name, result in results.items():
             if result.living is not None and result.balance is not None:
                 add_living(report, name, result.living)
-                add_balance(report, name, result.balance, data, result.living.free.cycle)
+                add_balance(report, name, result.balance, data, result.living.run.cycle)
                 self._add_forecasts(report, name, data, result)
         self._add_selected(report, data, results)
         if len(files) > 1:

@@ -12,8 +12,8 @@ import numpy as np
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
+from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.forecasting.skill import ForecastSkill
-from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel, model_of
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.regression.front import Candidate, fit_support
@@ -48,10 +48,10 @@ class LibraryResult:
     """
 
     discovery: Discovery
-    runs: Sequence[FreeRun]
+    runs: Sequence[Evaluation]
     thesis: Coefficients
     refitted: Mapping[str, Candidate]
-    published: FreeRun | None
+    published: Evaluation | None
     living: Living | None
     balance: ModelBalance | None
     skill: ForecastSkill | None
@@ -97,7 +97,7 @@ THESIS_TERMS: Metrics[Candidate] = [
     Metric("r2_train", lambda fit: fit.r2_train),
     Metric("terms", lambda fit: fit.coef_by_term),
 ]
-RECORDS: Metrics[tuple[str, str, FreeRun]] = [
+RECORDS: Metrics[tuple[str, str, Evaluation]] = [
     Metric("model", lambda row: row[0], View.SHOWN),
     Metric("record", lambda row: row[1], View.SHOWN),
     *(metric.of(lambda row: row[2], view=View.SHOWN) for metric in EVALUATION),
@@ -120,7 +120,7 @@ def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
     add = partial(report.table, shown=False)
     label = next(iter(results.values())).discovery.method.selection.label
     living = {name: each.living for name, each in results.items() if each.living is not None}
-    runs: dict[str, FreeRun] = {}
+    runs: dict[str, Evaluation] = {}
     for name, result in results.items():
         if result.living is not None:
             runs |= {f"{name}_living": result.living.run, f"{name}_refined": result.living.refined}
@@ -160,14 +160,14 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
             held=results[best].discovery.constraint,
         )
     best = best_run({name: each.run for name, each in living.items()})
-    free = living[best].free
-    caution = [Text(free.caution, warning=True)] if free.caution else []
+    run = living[best].run
+    caution = [Text(run.caution, warning=True)] if run.caution else []
     tests = [result.discovery.noise_test for result in results.values()]
     return found_model(
         f"Found with the library {best}",
-        free.run,
+        run,
         file=f"{best}_living",
-        picture="trajectories" if free.cycle is None else f"free_run_{best}",
+        picture="trajectories" if run.cycle is None else f"free_run_{best}",
         more=[*caution, *left_over_of_all(tests)],
         where="held-out time",
         held=living[best].discovery.constraint,
