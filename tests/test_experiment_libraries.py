@@ -194,7 +194,7 @@ def test_a_record_in_years_reads_in_years_and_is_kept_in_seconds(years: Computed
 
 
 def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
-    assert years.summary["libraries"]["model"]["note"] == ""  # the section on the samples says it
+    assert years.summary["notes"]["model"] == ""  # the section on the samples says it
     (found,) = years.summary["samples_model"]
     data = years.report.tables["rollout_model"]
     # Of 91 samples, some of which the parameters take: 10 % is a standard error and a half.
@@ -210,7 +210,7 @@ def test_a_report_says_if_the_samples_speak_of_another_model(years: Computed) ->
     assert REPLACED not in years.page
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0).window(0, 200)
     found = replace(ep.discover(run), noise_test=NoiseTest())
-    add_estimate(years.report, "other", found, run)
+    add_estimate(years.report, "other", found)
     texts = [each.text for each in years.report.sections[-1].blocks if isinstance(each, Text)]
     assert REPLACED in texts
 
@@ -224,7 +224,7 @@ def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_pa
             "bootstraps.n=4", "forecasts=0",
         )
     )  # fmt: skip
-    note = found.summary["libraries"]["model"]["note"]
+    note = found.summary["notes"]["model"]
     log = " ".join(found.log.split())
     assert note
     assert log.count(note) == 1
@@ -274,7 +274,7 @@ def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
     chosen = ["formulation=weak", "selection=ebic", "depth=2"]
     left_out = ["~libraries.ionization", "~libraries.velocity"]
     result = computed(composed(*plain(predator_prey, tmp_path), *chosen, *left_out))
-    found = result.summary["selected"]
+    found = result.summary["equations"]
     assert np.isnan(found["simple/n_i"]["r2_test"])
     front = result.report.tables["front_simple"]
     for state, rows in front.groupby("equation"):

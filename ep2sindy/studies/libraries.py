@@ -228,12 +228,13 @@ class Study:
             exclude=barred, roles=self.roles, seed=rng, progress=progress,
         )  # fmt: skip
         runs = runs if found.estimate is None else found.estimate.runs
-        s, rows = self.rollout_s, Regression(self.formulation, bootstraps=self.bootstraps)
+        s = self.rollout_s
         n_samples = [run.n_samples if s is None else samples_in(run, s) for run in runs]
-        refitted = refit(found, thesis, rows, runs, rng)
+        refitted = refit(found, thesis, self.formulation, runs, rng)
         published = refitted_model(found, refitted)
         lives = beside = None
         if self.living is not None and not found.model.inputs:
+            rows = Regression(self.formulation, bootstraps=self.bootstraps)
             parts = split_in_time(runs[0], self.held_out or HELD_OUT)
             lives = living_model(
                 *parts, library, rows, self.living, found.model, zones, rng=rng, progress=progress
@@ -283,7 +284,7 @@ class Study:
                 self._add_forecasts(report, name, data, result)
             add_candidates(report, name, found, note=result.note, beside=result.beside)
             if found.estimate is not None:
-                add_estimate(report, name, found, data)
+                add_estimate(report, name, found)
         add_tables(report, results)
 
     def _add_forecasts(
