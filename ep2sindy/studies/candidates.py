@@ -9,6 +9,7 @@ from itertools import compress
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
 from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.result import Discovery
@@ -201,7 +202,7 @@ ESTIMATE: Metrics[Estimate] = [
     ),
     Metric(
         "noise_share",
-        lambda found: by_state(found, found.noise_std / found.runs[0].states.std(axis=0)),
+        lambda found: by_state(found, found.noise_std / _spread(found)),
         View.SHOWN, "of the state's std", lambda value: f"{100.0 * value:.2g} %",
     ),
     Metric("memory", lambda found: by_state(found, found.memory), View.SHOWN, format="{:.2f}"),
@@ -247,3 +248,9 @@ def by_state(found: Estimate, values: np.ndarray) -> dict[str, float]:
     """Values of the states that were measured."""
     pairs = zip(found.model.states, np.asarray(values).tolist(), strict=True)
     return dict(compress(pairs, np.isfinite(found.noise_std)))
+
+
+def _spread(found: Estimate) -> Float[np.ndarray, " n_states"]:
+    """Standard deviation of every state in the first record."""
+    spread: np.ndarray = found.runs[0].columns(found.model.states).std(axis=0)
+    return spread

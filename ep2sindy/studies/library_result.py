@@ -170,11 +170,12 @@ def refit(
     if not problems:
         assembled = formulation.assemble(runs, found.model.library, rng=rng)
         problems = {state: problem for problem in assembled for state in problem.equations}
-    usable = {
-        s: set(compress(each.library.names, usable_terms(each))) for s, each in problems.items()
-    }
-    told = {s: list(terms) for s, terms in published.items() if set(terms) <= usable.get(s, set())}
-    return {state: fit_support(problems[state], state, terms) for state, terms in told.items()}
+    fits = {}
+    for state, terms in published.items():
+        problem = problems.get(state)
+        if problem and set(terms) <= set(compress(problem.library.names, usable_terms(problem))):
+            fits[state] = fit_support(problem, state, list(terms))
+    return fits
 
 
 def refitted_model(found: Discovery, refitted: Mapping[str, Candidate]) -> SparseModel | None:
