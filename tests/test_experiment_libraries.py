@@ -15,8 +15,8 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Text
 from ep2sindy.runtime.files import write_json
-from ep2sindy.studies.libraries import Study
 from ep2sindy.studies.candidates import REPLACED, add_estimate
+from ep2sindy.studies.libraries import Study
 from tests.models import model_of
 from tests.programs import ROOT, Computed, composed, computed, on_file, summary_of
 
@@ -74,7 +74,7 @@ def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
     assert neutrals == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=0.02)
     run = summary["evaluations"]["simple"]
     assert run["frequency_Hz"] == pytest.approx(run["record_frequency_Hz"], rel=0.02)
-    assert run["record_frequency_Hz"]["n_i"] == 1e3 * summary["data"]["f_kHz"]
+    assert run["record_frequency_Hz"]["n_i"] == pytest.approx(1e3 * summary["data"]["f_kHz"])
     refitted = {"simple_living", "simple_refined", "simple_thesis_terms"}
     assert set(summary["models"]) >= {"simple", "ionization", "velocity"} | refitted
 
@@ -109,13 +109,16 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
 
 def test_the_page_says_the_model_that_lives_before_candidates(breathing_run: Path) -> None:
     page = (breathing_run / "report.html").read_text()
+    found, rest = page[page.index('id="found"') :].split("</section>", 1)
+    assert "the cycle is neutral: it neither attracts nor repels" in found
+    assert 'id="figure-free_run_simple"' in found
     order = [
-        "a model selected by free runs (sustained)", "the cycle is neutral", 'id="figure-free_run_simple"',
-        "what the terms mean", "forecasts over time held out", "The selected model of every library",
-        "Run freely from the first sample", "simple: candidates", "velocity: candidates",
+        "simple: a model selected by free runs (sustained)", "simple: what the terms mean",
+        "simple: forecasts over time held out", "The selected models",
+        "Run freely from the first sample", "simple: candidates", "ionization: candidates",
     ]  # fmt: skip
-    places = [page.index(text) for text in order]
-    assert places == sorted(places), order
+    titles = re.findall(r"<h[23][^>]*>(.*?)</h", rest)
+    assert [title for title in titles if title in order] == order
 
 
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:
@@ -275,7 +278,7 @@ def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
     left_out = ["~libraries.ionization", "~libraries.velocity"]
     result = computed(composed(*plain(predator_prey, tmp_path), *chosen, *left_out))
     found = result.summary["equations"]
-    assert np.isnan(found["simple/n_i"]["r2_test"])
+    assert found["simple/n_i"]["r2_test"] is None
     front = result.report.tables["front_simple"]
     for state, rows in front.groupby("equation"):
         assert rows.loc[rows["selected"], "EBIC"].item() == rows["EBIC"].min()

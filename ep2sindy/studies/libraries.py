@@ -56,7 +56,6 @@ from ep2sindy.studies.views import (
     EVALUATED,
     EVALUATION,
     FROM_DERIVATIVES,
-    INTEGRATED,
     PlotRange,
     add_figures,
     add_samples,
@@ -300,7 +299,7 @@ class Study:
     ) -> None:
         """The selected models of all libraries, and those of published terms, from the start."""
         clock, figures = data.clock, partial(add_figures, report, data=data, shown=self.figures)
-        report.section("The selected model of every library")
+        report.section("The selected model" if len(results) == 1 else "The selected models")
         for name, result in results.items():
             text = f"{name}: equations {result.how}; run freely: {result.runs[0].text}"
             report.add(Text(text, page_only=True))
@@ -311,7 +310,7 @@ class Study:
         is_living = any(result.living is not None for result in results.values())
         note = f"{FROM_DERIVATIVES} {EVALUATED}" if is_living else EVALUATED
         rows = ResultTable(selected | published, EVALUATION).screen("model", by_state=True)
-        report.section("Run freely from the first sample", Table(rows, INTEGRATED, note=note))
+        report.section("Run freely from the first sample", Table(rows, note=note))
         figures(FIGURES, runs=selected, smoother=self.formulation.smoother)
         add_samples(report, data, selected | published)
         for name, run in published.items():

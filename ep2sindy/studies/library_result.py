@@ -118,7 +118,8 @@ def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
     label = next(iter(results.values())).discovery.method.selection.label
     add("evaluations", ResultTable(runs, EVALUATION), heading="model")
     add("equations", ResultTable(rows, selected_metrics(label)), heading="of")
-    add("living", ResultTable(living, LIVING), heading="library")
+    if living:
+        add("living", ResultTable(living, LIVING), heading="library")
 
 
 def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
