@@ -59,7 +59,7 @@ def test_two_densities_alone_leave_out_what_needs_more_and_a_seed_fixes_what_is_
     for name, each in (("one", found), ("other", again)):
         write_json(tmp_path / name, each.summary)
     assert (tmp_path / "one").read_text() == (tmp_path / "other").read_text()
-    assert set(found.summary["models"]) == {"simple"}
+    assert set(found.summary["models"]) == {"simple", "simple_thesis_terms"}
     assert "the library ionization is left out: the data have no R_ion" in found.log
     assert "the library velocity is left out: the data have no R_ion, u_iz" in found.log
 
