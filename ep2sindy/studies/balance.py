@@ -61,8 +61,7 @@ class TermRole:
     part: what it is a term of: a process in words, or the state whose equation holds it. is_known:
     whether nothing was fitted, so that it is not left out. without: free run of the model refined
     without the process, or without the coefficient in all of its equations; None if it is known or
-    cannot be refined. counterpart: the coefficient by least squares of the recorded process on all
-    of the model's terms for it, with fit_r2; NaN if the record does not give it.
+    cannot be refined. process: of the term, whose counterpart the record may give.
     """
 
     part: str
@@ -70,12 +69,16 @@ class TermRole:
     coef: float
     is_known: bool
     without: Evaluation | None
-    counterpart: float = float("nan")
-    fit_r2: float = float("nan")
+    process: ComparedProcess | None = None
+
+    @property
+    def counterpart(self) -> float:
+        """The coefficient by least squares of the recorded process on all of its terms, or NaN."""
+        return np.nan if self.process is None else self.process.counterpart.get(self.term, np.nan)
 
     @property
     def ratio(self) -> float:
-        return self.coef / self.counterpart if self.counterpart else float("nan")
+        return self.coef / (self.counterpart or np.nan)
 
     @property
     def status(self) -> str:
@@ -91,12 +94,12 @@ TERMS: Metrics[TermRole] = [
     Metric("coefficient", lambda role: role.coef, View.SHOWN),
     Metric("counterpart", lambda role: role.counterpart, View.SHOWN, "by the record"),
     Metric("ratio", lambda role: role.ratio, View.SHOWN, format="{:.2f}"),
-    Metric("fit_r2", lambda role: role.fit_r2, View.SHOWN, "its R2", "{:.3f}"),
+    Metric("fit_r2", lambda r: r.process and r.process.fit_r2, View.SHOWN, "its R2", "{:.3f}"),
     Metric("without_status", lambda role: role.status, View.SHOWN, "without it"),
-    Metric("without_f_error", lambda role: role.without.f_error if role.without else np.nan),
+    Metric("without_f_error", lambda role: role.without and role.without.f_error),
     Metric(
         "without_waveform_error",
-        lambda role: largest(role.without.waveform_error) if role.without else np.nan,
+        lambda role: role.without and largest(role.without.waveform_error),
         View.SHOWN, "waveform", "{:.3f}",
     ),
 ]  # fmt: skip
@@ -188,8 +191,8 @@ def _roles(
     for each in processes:
         for term, coef in each.coef.items():
             k = by_process.get((each.ends, term))
-            run, beside = None if k is None else left_out[k], each.counterpart.get(term, np.nan)
-            found.append(TermRole(each.name, term, coef, k is None, run, beside, each.fit_r2))
+            run = None if k is None else left_out[k]
+            found.append(TermRole(each.name, term, coef, k is None, run, each))
     return found
 
 
