@@ -117,7 +117,9 @@ def test_a_hidden_state_that_shrinks_gains_no_freedom() -> None:
 
 
 def test_a_relation_sets_the_scale() -> None:
-    model = ep.discover(only("x"), hidden=["w"], relations=["x: x*w == 2"]).model
+    model = ep.discover(
+        only("x"), ep.polynomial(["x", "w"]).relate("x: x*w == 2"), hidden=["w"]
+    ).model
     assert model.terms("x") == {"x*w": 2.0}
     law = {"1": 1.0 / 9.0, "x": -1.0 / 3.0, "w": -1.0 / 3.0, "x*w": 1.0}  # w = g / 2
     assert dict(model.terms("w")) == pytest.approx(law, rel=0.05)
@@ -136,7 +138,7 @@ def test_ways_in_from_one_state() -> None:
 
 def test_ways_in_from_two_states_and_by_a_relation() -> None:
     library = ep.polynomial(["x", "y", "z"], degree=2)
-    ways = entrances(library, ["x", "y"], ["z"], ())
+    ways = entrances(library, ["x", "y"], ["z"])
     terms = {"z", "x*z", "y*z"}
     assert {(w.state, w.term) for (w,) in ways} == {(s, t) for s in "xy" for t in terms}
     fixed = relations_of(["2 * y: x*z == -4"])
@@ -144,7 +146,7 @@ def test_ways_in_from_two_states_and_by_a_relation() -> None:
         (Entrance("z", "y", "x*z", -2.0, given=True),)
     ]
     with pytest.raises(ValueError, match="'z' has none in"):
-        entrances(ep.polynomial(["x", "y"], degree=2), ["x", "y"], ["z"], ())
+        entrances(ep.polynomial(["x", "y"], degree=2), ["x", "y"], ["z"])
 
 
 def test_growth_rates_come_first_where_a_state_is_positive() -> None:
@@ -155,7 +157,7 @@ def test_growth_rates_come_first_where_a_state_is_positive() -> None:
         groups = list(with_guesses(Task([moved], library, hidden=["g"])))
         ((known, ways),) = groups[0]
         assert ways[0].term == first
-        assert known.terms == {"x": (first,)}
+        assert known.facts.only == {"x": (first,)}
         assert known.hidden == ()
 
 

@@ -123,14 +123,14 @@ class TrajectorySearch:
         Ambiguities are terms whose values at the samples are alike. Raises ValueError for roles
         with a rule that runs models.
         """
-        if task.roles is not None and self.selection.basis == "runs":
+        if task.facts.roles is not None and self.selection.basis == "runs":
             raise ValueError(
                 "a search of trajectories keeps roles by likelihood: selection must be Evidence(), "
                 f"{self.selection!r} came; Regression(selection=FreeRunScore()) judges by runs"
             )
         found = self._estimate(task, progress)
-        library = found.model.library  # with the terms of known equations
-        task = replace(task, runs=found.runs, hidden=(), library=library)
+        library = task.library.with_known_terms(task.states)
+        task = Task(found.runs, library)
         return replace(
             self._choose(found, task, progress),
             ambiguities=_ambiguities_of_samples(task),
@@ -272,16 +272,16 @@ class Regression:
             )
         if any(run.missing is not None for run in task.runs):
             task = replace(task, runs=[run.complete() for run in task.runs])
-        if task.roles is None:
+        if task.facts.roles is None:
             equations = self.search_equations(task, rng=rng, progress=progress)
             fronts = [equation.front for equation in equations]
             choice = self.choose(fronts, task, progress=progress)
         else:
-            choice = self._choose_under(task.roles, task, rng=rng, progress=progress)
+            choice = self._choose_under(task.facts.roles, task, rng=rng, progress=progress)
         found: list[Ambiguity] = []
         for rows in dict.fromkeys(front.rows for front in choice.fronts):
             # Known equations are not searched, so too few rows do no harm to them.
-            if not set(rows.equations) <= set(task.terms):
+            if not set(rows.equations) <= set(task.facts.only):
                 found += few_rows(rows)
             found += ambiguities(rows)
         remarks = _limits(task.runs)
@@ -304,7 +304,7 @@ class Regression:
                 "roles tie all equations together, so a rule must judge whole systems: selection "
                 f"must be FreeRunScore() or RefinedScore(), {self.selection!r} came"
             )
-        library = roles.with_known_terms(task.library, task.states)
+        library = task.library.with_known_terms(task.states)
         with progress.stage(None, "", "rows of the regression"):
             problems = self.formulation.assemble(task.runs, library, rng=rng)
         systems = search_conserving_systems(problems, task, roles, self.search, depth=self.depth)
@@ -324,7 +324,7 @@ class Regression:
                 draws = draw_resamples(problem, self.bootstraps, rng=rng)
             for k, equation in enumerate(problem.equations):
                 with progress.stage(len(draws.xx), "draw", f"search for {equation}'") as advance:
-                    allowed = task.allowed(equation)
+                    allowed = task.library.allowed(equation)
                     proposed = draws.search(self.search, k, advance, allowed=allowed)
                 found = task.complete(equation, proposed)
                 supports = pool(draws, k, found)

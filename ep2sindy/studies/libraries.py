@@ -231,10 +231,8 @@ class Study:
         """
         s, measured = self.rollout_s, runs[0]
         barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
-        found = discover(
-            list(runs), library, method, hidden=self.hidden, relations=self.relations,
-            exclude=barred, roles=self.roles, seed=rng, progress=progress,
-        )  # fmt: skip
+        known = library.exclude(barred).relate(*self.relations).with_roles(self.roles)
+        found = discover(list(runs), known, method, hidden=self.hidden, seed=rng, progress=progress)
         runs = runs if found.estimate is None else found.estimate.runs
         first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
         data, n_samples = first

@@ -1,0 +1,126 @@
+"""What is known of equations before they are searched, and the checks of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from ep2sindy.library.relations import Place, Relation
+from ep2sindy.library.roles import Roles
+from ep2sindy.library.terms import NamedTerms
+from ep2sindy.runtime.values import check_kind, check_list
+
+# State -> term -> function of the parameters -> its factor.
+Known = Mapping[str, Mapping[str, Mapping[str, float]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """What is known of the equations of a library; the methods of `Library` say it.
+
+    relations: between coefficients. only: for each state whose equation is known but for its
+    coefficients, all terms of that equation. excluded: for each state that is named, terms that its
+    equation may not have. known: coefficients that are functions of the operating point, in SI.
+    roles: of terms, for equations that conserve what states exchange.
+    Raises ValueError for what are no lists of names, an equation without terms, or roles beside
+    anything else.
+    """
+
+    relations: Sequence[Relation] = ()
+    only: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    excluded: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    known: Known = field(default_factory=dict)
+    roles: Roles | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("only", "excluded"):
+            terms = MappingProxyType(_by_state(name, getattr(self, name)))
+            object.__setattr__(self, name, terms)
+        if empty := [state for state, terms in self.only.items() if not terms]:
+            raise ValueError(f"an equation whose terms are given must have some: {empty} has none")
+        if self.roles is None:
+            return
+        check_kind("roles", self.roles, Roles, "ep.Roles(exchange=[('n_n', 'n_i')])")
+        if self.relations or self.only or self.excluded or self.known:
+            raise ValueError(
+                "roles say which terms the equations may have and how they are tied: relations, "
+                "terms, or coefficients came as well; give roles alone, or leave them out"
+            )
+
+    def __or__(self, more: Facts) -> Facts:
+        """These facts and more of them; of an equation told twice, the last terms hold."""
+        barred = {**self.excluded, **more.excluded}
+        return Facts(
+            (*self.relations, *more.relations),
+            {**self.only, **more.only},
+            {s: (*self.excluded.get(s, ()), *more.excluded.get(s, ())) for s in barred},
+            {**self.known, **more.known},
+            more.roles or self.roles,
+        )
+
+    @property
+    def places(self) -> Iterator[Place]:
+        """Every (state, term) that an equation is said to have."""
+        yield from ((state, term) for r in self.relations for _, state, term in r.factors)
+        for named in (self.only, self.known):
+            yield from ((state, term) for state, terms in named.items() for term in terms)
+
+    @property
+    def states(self) -> set[str]:
+        """Every state whose equation is spoken of, but for roles."""
+        return {*self.excluded, *(state for state, _ in self.places)}
+
+    def check(self, library: NamedTerms) -> None:
+        """Raise ValueError for an unknown term, one that is excluded and named, or none left."""
+        barred = {s: {*map(library.index, terms)} for s, terms in self.excluded.items()}
+        for state, places in barred.items():
+            if len(places) == len(library.names):
+                raise ValueError(
+                    f"exclude must leave terms to every equation: all {len(places)} of the library "
+                    f"came for {state!r}; leave some of them out of exclude"
+                )
+        for state, term in self.places:
+            if library.index(term) in barred.get(state, ()):
+                raise ValueError(
+                    f"a term is excluded, or it is named in terms and relations: {term!r} of "
+                    f"{state!r} came in both; leave it out of one of them"
+                )
+
+    @property
+    def lines(self) -> list[str]:
+        """A sentence on everything that is known."""
+        return [
+            *(relation.text for relation in self.relations),
+            *(f"{state}' has {', '.join(terms)}" for state, terms in self.only.items()),
+            *(f"{state}' has no {', '.join(terms)}" for state, terms in self.excluded.items()),
+            *(f"{state}: {own} is known" for state, terms in self.known.items() for own in terms),
+            *([repr(self.roles)] if self.roles else []),
+        ]
+
+
+def _by_state(key: str, given: object) -> dict[str, tuple[str, ...]]:
+    """The terms of every state that are named. Raises ValueError for what are no lists of names."""
+    method = {"excluded": "exclude"}.get(key, key)
+    example = f"{method}({{'x': ['x', 'x*y']}})"
+    if not isinstance(given, Mapping):
+        raise ValueError(f"terms must be lists by state, like {example}: {given!r} came")
+    found = {}
+    for state, names in given.items():
+        check_list(f"the terms of {state!r}", names)
+        if isinstance(names, Mapping) and names:
+            term, value = next(iter(names.items()))
+            raise ValueError(
+                f"{method} takes terms, without coefficients, like {example}: {dict(names)!r} came "
+                f"for {state!r}; a coefficient that is known is a relation, "
+                f"relate('{state}: {term} == {value}')"
+            )
+        if not isinstance(names, Sequence):
+            raise ValueError(f"terms must be a list for every state: {names!r} came for {state!r}")
+        if wrong := [name for name in names if not isinstance(name, str)]:
+            raise ValueError(
+                f"terms must be names, like {example}: {wrong[0]!r} came for {state!r}; the "
+                "constant term is '1'"
+            )
+        found[state] = tuple(names)
+    return found
