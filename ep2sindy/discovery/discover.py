@@ -62,7 +62,8 @@ def discover(
     the most central point; a TrajectorySearch then refines the coefficients of every point on its
     trajectories.
     Raises ValueError for facts of states that there are not, roles that the method cannot keep,
-    runs whose states or units differ, states or samples that repeat, runs that lack parameters, or points that do not suffice for the law.
+    runs whose states or units differ, states or samples that repeat, runs that lack parameters, or
+    points that do not suffice for the law.
 
     >>> growth = (0.5, 0.7, 0.9, 1.1)
     >>> runs = [ep.lotka_volterra(a=a).trajectory(noise=0.02, rng=0) for a in growth]

@@ -153,10 +153,10 @@ def estimate(
     delays are reported.
     library: with what is known of the equations, as for `discover`. hidden: states that nobody
     measured, which the library has; all ways in which they may enter are compared. courses: input
-    -> how it goes from one sample to the next, "held", "linear" or "smooth"; of others the likeliest
-    course is taken. limit_s: wall time after which the search ends with the best that it has, and
-    says so; of long records it takes parts first. progress: True shows bars, see `Progress`; an
-    interruption (Ctrl-C) then ends the search in the same way.
+    -> how it goes from one sample to the next, "held", "linear" or "smooth"; of others the
+    likeliest course is taken. limit_s: wall time after which the search ends with the best that it
+    has, and says so; of long records it takes parts first. progress: True shows bars, see
+    `Progress`; an interruption (Ctrl-C) then ends the search in the same way.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.estimate(run, ep.polynomial(["x", "y"], degree=2))
@@ -407,6 +407,6 @@ def _open_choice(
         return ""
     return (
         f"{problem.n_samples} samples do not tell these equations from others: the chance that all "
-        f"terms are right is {share:.0%}; name the terms that you know (Library.only), take a smaller "
-        "library, or a longer record"
+        f"terms are right is {share:.0%}; name the terms that you know (Library.only), take a "
+        "smaller library, or a longer record"
     )
