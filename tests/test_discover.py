@@ -175,7 +175,7 @@ def test_the_free_coefficients_of_related_equations_are_counted(
     terms = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
     task = Task([run], library.relate(*relations).only(terms))
     found = Regression().identify(task, rng=np.random.default_rng(0))
-    assert found.n_free == n_free
+    assert found.noise_test.n_free == n_free
 
 
 def random_front(state: str, names: list[str], rng: np.random.Generator) -> ParetoFront:

@@ -12,9 +12,9 @@ import numpy as np
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import IdentifiedEquations, as_in, judge_noise
-from ep2sindy.discovery.method import DiscoveryMethod, TrajectorySearch
-from ep2sindy.discovery.result import Discovery, join_points
+from ep2sindy.discovery.choice import judge_noise
+from ep2sindy.discovery.method import TrajectorySearch
+from ep2sindy.discovery.result import Discovery, DiscoveryMethod, join_points
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.operating.law import LawFunctions
 from ep2sindy.operating.records import group_by_point, most_central, values_of
@@ -145,25 +145,10 @@ def _discover_point(
     progress: Progress = SILENT,
 ) -> Discovery:
     task, rng = piece
-    return _discovery(method.identify(task, rng=rng, progress=progress), method, task.runs)
-
-
-def _discovery(
-    found: IdentifiedEquations, method: DiscoveryMethod, runs: Sequence[Trajectory]
-) -> Discovery:
-    test = judge_noise(found, runs)
+    found = method.identify(task, rng=rng, progress=progress)
+    test = judge_noise(found, task.runs)
     # Intervals of a model that does not explain the data would not cover the truth.
-    model = replace(found.model, clock=runs[0].clock)
-    return Discovery(
-        fronts={front.equation: front for front in found.fronts},
-        chosen={each.equation: as_in(found.model, each) for each in found.chosen},
-        model=replace(model, covariance=None) if test.misfit else model,
-        method=method,
-        ambiguities=found.ambiguities,
-        noise_test=test,
-        note=found.note or test.misfit,
-        remarks=found.remarks,
-        estimate=found.estimate,
-        constraint=found.constraint,
-        others=found.others,
-    )
+    covariance = None if test.misfit else found.model.covariance
+    model = replace(found.model, clock=task.runs[0].clock, covariance=covariance)
+    note = found.note or test.misfit
+    return replace(found, model=model, method=method, noise_test=test, note=note)

@@ -19,8 +19,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 
 if TYPE_CHECKING:
-    from ep2sindy.discovery.method import DiscoveryMethod
-    from ep2sindy.discovery.result import Discovery
+    from ep2sindy.discovery.result import Discovery, DiscoveryMethod
     from ep2sindy.library.library import Library
     from ep2sindy.model.model import SparseModel
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -19,7 +19,8 @@ from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import IdentifiedEquations, choose, choose_system
+from ep2sindy.discovery.choice import choose, choose_system, join_choice
+from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.cost import check_limit_s
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
@@ -46,32 +47,6 @@ class Finding:
 
     kept: Mapping[str, Sequence[frozenset[str]]]
     selected: Mapping[str, frozenset[str]] | None
-
-
-@runtime_checkable
-class DiscoveryMethod(Protocol):
-    """Protocol of a method that finds equations from runs: `TrajectorySearch`, or `Regression`.
-
-    selection: the rule that chooses among candidates; it is named in the headline of the result.
-    identify: answers a `Task`. A method of one's own may ask another one:
-
-    >>> class Smallest:
-    ...     selection = ep.Evidence()
-    ...
-    ...     def identify(self, task, *, rng, progress):
-    ...         own = ep.TrajectorySearch(max_terms=2)
-    ...         return own.identify(task, rng=rng, progress=progress)
-    >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
-    >>> list(ep.discover(run, method=Smallest()).model.terms("x"))
-    ['x', 'x*y']
-    """
-
-    @property
-    def selection(self) -> Selection: ...
-
-    def identify(
-        self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
-    ) -> IdentifiedEquations: ...
 
 
 @dataclass(frozen=True)
@@ -117,7 +92,7 @@ class TrajectorySearch:
 
     def identify(
         self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
-    ) -> IdentifiedEquations:
+    ) -> Discovery:
         """Estimate states and coefficients, and choose; the search is deterministic.
 
         Ambiguities are terms whose values at the samples are alike. Raises ValueError for roles
@@ -150,18 +125,18 @@ class TrajectorySearch:
             progress=progress,
         )
 
-    def _choose(self, found: Estimate, task: Task, progress: Progress) -> IdentifiedEquations:
+    def _choose(self, found: Estimate, task: Task, progress: Progress) -> Discovery:
         """Candidates of every equation with their scores, and the model by the selection rule."""
         fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
         decision = self.selection.decide(fronts, task, progress=progress)
         if decision.model is not None:
-            choice = choose_system(fronts, decision, task.runs, provenance=found.model.provenance)
+            provenance = found.model.provenance
+            choice = choose_system(fronts, decision, self, task.runs, provenance=provenance)
             return replace(choice, model=replace(choice.model, courses=found.model.courses))
         scored = [front.with_scores(s) for front, s in zip(fronts, decision.scores, strict=True)]
         best = [front.best for front in scored]
-        return IdentifiedEquations(
-            scored, best, found.model, found.note, constraint=found.constraint
-        )
+        choice = join_choice(scored, best, found.model, self)
+        return replace(choice, note=found.note, constraint=found.constraint)
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
@@ -263,7 +238,7 @@ class Regression:
 
     def identify(
         self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
-    ) -> IdentifiedEquations:
+    ) -> Discovery:
         """Assemble rows, search them, and choose. Raises ValueError for hidden states."""
         if task.hidden:
             raise ValueError(
@@ -279,7 +254,7 @@ class Regression:
         else:
             choice = self._choose_under(task.facts.roles, task, rng=rng, progress=progress)
         found: list[Ambiguity] = []
-        for rows in dict.fromkeys(front.rows for front in choice.fronts):
+        for rows in dict.fromkeys(front.rows for front in choice.fronts.values()):
             # Known equations are not searched, so too few rows do no harm to them.
             if not set(rows.equations) <= set(task.facts.only):
                 found += few_rows(rows)
@@ -289,7 +264,7 @@ class Regression:
 
     def _choose_under(
         self, roles: Roles, task: Task, *, rng: np.random.Generator, progress: Progress
-    ) -> IdentifiedEquations:
+    ) -> Discovery:
         """Search all equations at once for systems that keep the roles, and let the rule decide.
 
         The search is made once, on all training rows: bootstraps weigh one equation at a time.
@@ -310,7 +285,7 @@ class Regression:
         systems = search_conserving_systems(problems, task, roles, self.search, depth=self.depth)
         decision = self.selection.judge(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)
-        return choose_system(systems.fronts, decision, task.runs, provenance=provenance)
+        return choose_system(systems.fronts, decision, self, task.runs, provenance=provenance)
 
     def search_equations(
         self, task: Task, *, rng: np.random.Generator | int, progress: Progress = SILENT
@@ -334,10 +309,10 @@ class Regression:
 
     def choose(
         self, fronts: Sequence[ParetoFront], task: Task, *, progress: Progress = SILENT
-    ) -> IdentifiedEquations:
+    ) -> Discovery:
         """Select a candidate from every front, and fit it."""
         provenance = self.provenance | _labels(task)
-        return choose(fronts, self.selection, task, provenance=provenance, progress=progress)
+        return choose(fronts, self, task, provenance=provenance, progress=progress)
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int

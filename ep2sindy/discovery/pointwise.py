@@ -269,7 +269,7 @@ def search_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
     task = Task([run], search.library)
     equations = search.method.search_equations(task, rng=np.random.default_rng(search.seed))
     choice = search.method.choose([equation.front for equation in equations], task)
-    parts = zip(equations, choice.chosen, choice.model.coef.T, strict=True)
+    parts = zip(equations, choice.chosen.values(), choice.model.coef.T, strict=True)
     found = [_describe_equation(*part) for part in parts]
     point = {
         name: np.stack([row[name] for row in found], axis=dims.index("equation"))

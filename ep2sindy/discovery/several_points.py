@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import as_in
-from ep2sindy.discovery.method import DiscoveryMethod, Regression, TrajectorySearch
-from ep2sindy.discovery.result import Discovery, join_points
+from ep2sindy.discovery.choice import join_choice
+from ep2sindy.discovery.method import Regression, TrajectorySearch
+from ep2sindy.discovery.result import Discovery, DiscoveryMethod, join_points
 from ep2sindy.discovery.shared_support import SharedFront, check_shared, search_shared
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
@@ -116,12 +116,10 @@ class PointsTask:
         number: int,
     ) -> Discovery:
         model = fits.models[number]
-        own = {front.equation: front.points[label] for front in fronts}
-        return Discovery(
-            fronts=own,
-            chosen={state: as_in(model, front.best) for state, front in own.items()},
+        own = [front.points[label] for front in fronts]
+        return replace(
+            join_choice(own, [front.best for front in own], model, self.regression),
             model=replace(model, clock=self.points[label][0].clock),
-            method=self.regression,
             ambiguities=tuple(dict.fromkeys(a for part in problems for a in ambiguities(part))),
             constraint=fits.relations.at(fits.points[[number]])[0],
         )

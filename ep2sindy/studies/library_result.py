@@ -11,9 +11,8 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.method import Regression
-from ep2sindy.discovery.result import Discovery
+from ep2sindy.discovery.result import Discovery, NoiseTest
 from ep2sindy.estimation.estimate import Estimate, Rival
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.equations import equation_text
