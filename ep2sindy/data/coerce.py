@@ -220,7 +220,7 @@ class Task:
             known[0, [library.index(name) for name in facts.only[equation]]] = True
             return [known] * len(found)
         # At another point a coefficient may be another number than zero: its term is in.
-        told = [Relation(((1.0, s, t),), 1.0, "") for s, own in facts.known.items() for t in own]
+        told = [Relation(((1.0, *place),), 1.0, "") for place in facts.known_factors]
         relations = [*facts.relations, *told]
         return [complete(masks, library, equation, relations) for masks in found]
 

@@ -22,7 +22,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import choose, choose_system, join_choice
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.cost import check_limit_s
-from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
+from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate
 from ep2sindy.library.library import Library
 from ep2sindy.library.roles import Roles
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
@@ -115,8 +115,10 @@ class TrajectorySearch:
 
     def _estimate(self, task: Task, progress: Progress) -> Estimate:
         provenance = self.provenance | _labels(task)
-        return estimate_task(
-            task,
+        return estimate(
+            task.runs,
+            task.library,
+            hidden=task.hidden,
             max_terms=self.max_terms,
             align=self.align,
             courses=self.courses,

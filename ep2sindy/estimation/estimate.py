@@ -37,7 +37,7 @@ from ep2sindy.library.relations import Constraint
 from ep2sindy.library.roles import constraint_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.gram_kernels import invert_gram
-from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
+from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
@@ -167,39 +167,22 @@ def estimate(
     more samples than there are or more memory, an unknown input or course, or whatever a `Task`
     refuses.
     """
-    return estimate_task(
-        Task(trajectories_of(runs, partial=True), library, hidden),
-        max_terms=max_terms, align=align, courses=courses, units=units, provenance=provenance,
-        limit_s=limit_s, progress=as_progress(progress),
-    )  # fmt: skip
-
-
-def estimate_task(
-    task: Task,
-    *,
-    max_terms: int | None,
-    align: bool,
-    courses: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    provenance: Mapping[str, str] | None = None,
-    limit_s: float | None = None,
-    progress: Progress = SILENT,
-) -> Estimate:
-    """Answer a task by `estimate`."""
+    task = Task(trajectories_of(runs, partial=True), library, hidden)
     if max_terms is not None:
         max_terms = check_count("max_terms", max_terms)
     check_limit_s(limit_s)
     facts = task.facts
     tied = bool(facts.relations or facts.known or facts.roles or task.hidden)
     bytes_each = check_size(task.runs, task.library, facts.only, tied=tied, limit_s=limit_s)
-    monitor, found, part = SearchMonitor(progress, limit_s), None, task.runs
+    watch = as_progress(progress)
+    monitor, found, part = SearchMonitor(watch, limit_s), None, task.runs
     settings = _Settings(max_terms, align, courses, monitor)
     for larger in growing_parts(task.runs, bytes_each, monitor):
         latest = _answer(replace(task, runs=larger), settings)
         if found is None or not monitor.ended:  # a larger part tells more, once it is done with
             found, part = latest, larger
     assert found is not None
-    answer, runs = found
+    answer, fitted = found
     some, n = (sum(run.n_samples for run in each) for each in (part, task.runs))
     if some < n:
         words = (
@@ -211,8 +194,8 @@ def estimate_task(
     if facts.roles is not None:
         played = compress(answer.solution.problem.processes, answer.solution.fit.free != 0.0)
         constraint = constraint_of(library, task.states, list(played), facts.roles.told)
-    model = _model(answer, library, units or runs[0].units, provenance or {})
-    return replace(_report(answer, model, runs, progress), constraint=constraint)
+    model = _model(answer, library, units or fitted[0].units, provenance or {})
+    return replace(_report(answer, model, fitted, watch), constraint=constraint)
 
 
 class _Settings(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -60,11 +60,18 @@ class Facts:
         )
 
     @property
-    def places(self) -> Iterator[Place]:
+    def known_factors(self) -> dict[Place, Mapping[str, float]]:
+        """(state, term) -> function of the parameters -> its factor, of known coefficients."""
+        return {
+            (s, str(term)): own for s, terms in self.known.items() for term, own in terms.items()
+        }
+
+    @property
+    def places(self) -> list[Place]:
         """Every (state, term) that an equation is said to have."""
-        yield from ((state, term) for r in self.relations for _, state, term in r.factors)
-        for named in (self.only, self.known):
-            yield from ((state, term) for state, terms in named.items() for term in terms)
+        named = [(state, term) for r in self.relations for _, state, term in r.factors]
+        named += [(state, term) for state, terms in self.only.items() for term in terms]
+        return [*named, *self.known_factors]
 
     @property
     def states(self) -> set[str]:
@@ -94,7 +101,7 @@ class Facts:
             *(relation.text for relation in self.relations),
             *(f"{state}' has {', '.join(terms)}" for state, terms in self.only.items()),
             *(f"{state}' has no {', '.join(terms)}" for state, terms in self.excluded.items()),
-            *(f"{state}: {own} is known" for state, terms in self.known.items() for own in terms),
+            *(f"{state}: {term} by the point" for state, term in self.known_factors),
             *([repr(self.roles)] if self.roles else []),
         ]
 
@@ -115,11 +122,9 @@ def _by_state(key: str, given: object) -> dict[str, tuple[str, ...]]:
                 f"for {state!r}; a coefficient that is known is a relation, "
                 f"relate('{state}: {term} == {value}')"
             )
-        if not isinstance(names, Sequence):
-            raise ValueError(f"terms must be a list for every state: {names!r} came for {state!r}")
-        if wrong := [name for name in names if not isinstance(name, str)]:
+        if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
             raise ValueError(
-                f"terms must be names, like {example}: {wrong[0]!r} came for {state!r}; the "
+                f"terms must be lists of names, like {example}: {names!r} came for {state!r}; the "
                 "constant term is '1'"
             )
         found[state] = tuple(names)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from array_api_compat import array_namespace
 from jaxtyping import Bool, Float, Int
-from numpy import ndarray
 
 from ep2sindy.library.facts import Facts, Known
 from ep2sindy.library.functions import Function, variable_factor
@@ -135,16 +134,13 @@ class Library:
 
     def at_operating_point(self, parameters: Mapping[str, float]) -> Library:
         """This library with relations in place of `known`: the numbers at an operating point."""
-        if not self.facts.known:
-            return self
         told = []
-        for state, terms in self.facts.known.items():
-            for term, factors in terms.items():
-                functions = functions_of_point(list(parameters), f"{state}: {term}", factors)
-                values = functions.evaluate(np.array([*parameters.values()]))
-                value = float(values @ np.array([*factors.values()]))
-                told.append(Relation(((1.0, state, term),), value, f"{state}: {term} == {value!r}"))
-        return replace(self, facts=replace(self.facts, known={})).relate(*told)
+        for (state, term), factors in self.facts.known_factors.items():
+            functions = functions_of_point(list(parameters), f"{state}: {term}", factors)
+            values = functions.evaluate(np.array([*parameters.values()]))
+            value = float(values @ np.array([*factors.values()]))
+            told.append(Relation(((1.0, state, term),), value, f"{state}: {term} == {value!r}"))
+        return replace(self, facts=replace(self.facts, known={})).relate(*told) if told else self
 
     def with_known_terms(self, states: Sequence[str]) -> Library:
         """With all terms of equations that the roles know; those added stand in no other.
@@ -191,10 +187,10 @@ class Library:
         return table
 
     def __repr__(self) -> str:
-        return library_text(self.variables, self.names, self.degrees, self.facts.lines)
+        return library_text(self)
 
     def _repr_html_(self) -> str:
-        return library_html(self.names, self.degrees, self.facts.lines)
+        return library_html(self)
 
     def index(self, name: str) -> int:
         """Position of a term; factors may come in any order. Raises ValueError if absent."""
@@ -368,8 +364,7 @@ def functions_of_point(
     except ValueError as error:
         raise ValueError(
             f"the known coefficient {coefficient} must be a sum of functions of "
-            f"{list(parameters)}, such as {{{[*parameters, 'p'][0]}: 2.0}}: {error}; runs have "
-            "their operating point in Trajectory.parameters"
+            f"{list(parameters)}, the Trajectory.parameters, such as {{p: 2.0}}: {error}"
         ) from error
 
 
@@ -418,36 +413,30 @@ def polynomial(
 # Display of a library, on a screen or in a notebook.
 
 
-def library_text(
-    variables: Sequence[str],
-    names: Sequence[str],
-    degrees: Int[ndarray, " terms"],
-    known: Sequence[str],
-) -> str:
+def library_text(library: Library) -> str:
     """Terms of a library by degree, and what is known, as text that fits one screen."""
-    lines = [f"Library of {len(names)} terms over {', '.join(variables)}"]
-    by_degree = list(_by_degree(names, degrees).items())
+    lines = [f"Library of {len(library)} terms over {', '.join(library.variables)}"]
+    by_degree = list(_by_degree(library).items())
     for k, (degree, found) in enumerate(by_degree):
         left = N_LINES - len(lines) - (len(by_degree) - k - 1)
         head = f"{len(found)} of degree {degree}:"
         lines += wrap([head, *found], what="terms", n_lines=max(1, min(6, left)))
-    return one_screen([*lines, *(f"known: {line}" for line in known)])
+    return one_screen([*lines, *(f"known: {line}" for line in library.facts.lines)])
 
 
-def library_html(
-    names: Sequence[str], degrees: Int[ndarray, " terms"], known: Sequence[str]
-) -> str:
-    """Terms of a library by degree, as an HTML table."""
+def library_html(library: Library) -> str:
+    """Terms of a library by degree, and what is known, as an HTML table."""
     rows = [
         [str(degree), str(len(found)), html.escape(cut(", ".join(found), 1000))]
-        for degree, found in _by_degree(names, degrees).items()
+        for degree, found in _by_degree(library).items()
     ]
-    rows += [["known", "", html.escape(cut(line, 1000))] for line in known]
+    rows += [["known", "", html.escape(cut(line, 1000))] for line in library.facts.lines]
     return html_table(["degree", "terms", ""], rows)
 
 
-def _by_degree(names: Sequence[str], degrees: Int[ndarray, " terms"]) -> dict[int, list[str]]:
-    found: dict[int, list[str]] = {degree: [] for degree in sorted(set(degrees.tolist()))}
-    for name, degree in zip(names, degrees.tolist(), strict=True):
+def _by_degree(library: Library) -> dict[int, list[str]]:
+    degrees = library.degrees.tolist()
+    found: dict[int, list[str]] = {degree: [] for degree in sorted(set(degrees))}
+    for name, degree in zip(library.names, degrees, strict=True):
         found[degree].append(name)
     return found

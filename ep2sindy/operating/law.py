@@ -386,11 +386,10 @@ def constrain_law(
     given = library.facts.relations
     functions = named_terms(list(parameters), ["1"])
     told = {}
-    for state, terms in library.facts.known.items():
-        for term, factors in terms.items():
-            own = functions_of_point(parameters, f"{state}: {term}", factors)
-            functions = functions + own
-            told[state, str(term)] = dict(zip(own.names, factors.values(), strict=True))
+    for (state, term), factors in library.facts.known_factors.items():
+        own = functions_of_point(parameters, f"{state}: {term}", factors)
+        functions = functions + own
+        told[state, term] = dict(zip(own.names, factors.values(), strict=True))
     columns = []
     for name in functions.names:
         # Relations are linear in their values: one function of the parameters at a time.
