@@ -8,6 +8,7 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import _hidden_names
 from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_guess_by, with_guesses
 from ep2sindy.estimation.likelihood import TrajectoryFit, hessian_on, observe
 from ep2sindy.estimation.noise import noise_beside
@@ -116,6 +117,14 @@ def test_a_hidden_state_that_shrinks_gains_no_freedom() -> None:
     assert sizes[1][1] == pytest.approx(1e-6 * sizes[0][1])
 
 
+def test_a_number_of_hidden_states_makes_names_that_no_run_has() -> None:
+    assert _hidden_names(1, ["x"]) == ["h"]
+    assert _hidden_names(2, ["x", "h1"]) == ["h2", "h3"]
+    assert _hidden_names(["w"], ["x"]) == ["w"]
+    with pytest.raises(ValueError, match="hidden must be a whole number, zero or more: -1 came"):
+        ep.discover(only("x"), hidden=-1)
+
+
 def test_a_relation_sets_the_scale() -> None:
     model = ep.discover(
         only("x"), ep.polynomial(["x", "w"]).relate("x: x*w == 2"), hidden=["w"]
@@ -214,7 +223,7 @@ def test_what_was_not_measured_counts_nothing() -> None:
     ("call", "message"),
     [
         (lambda: ep.discover(only("x"), hidden=["x"]), "one that no run has: .'x'. came with"),
-        (lambda: ep.discover(only("x"), hidden=["g", "g"]), "hidden states must differ"),
+        (lambda: ep.discover(only("x"), hidden=["g", "g"]), "'g'. came with samples or twice"),
         (
             lambda: ep.discover(only("x"), method=ep.Regression(), hidden=["g"]),
             "a regression needs samples of every state",

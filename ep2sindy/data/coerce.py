@@ -7,6 +7,7 @@ that agree, and a library with what is known of the equations.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -192,8 +193,9 @@ class Task:
             roles.processes(self.library, self.states)
             for state in roles.positive:
                 check_nonnegative(state, [run.columns([state])[:, 0] for run in self.runs])
-        if unknown := sorted(self.facts.states - {*self.states}):
-            raise ValueError(f"unknown state {unknown[0]!r}; there are {list(self.states)}")
+        for state in (*self.facts.excluded, *(state for state, _ in self.facts.places)):
+            if state not in self.states:
+                raise ValueError(f"unknown state {state!r}; there are {list(self.states)}")
 
     @property
     def facts(self) -> Facts:
@@ -227,14 +229,12 @@ class Task:
     def _check_hidden(self) -> None:
         for name in self.hidden:
             check_state(name)
-        measured = [name for run in self.runs for name in run.names]
-        if twice := [name for name in self.hidden if name in measured]:
+        measured = {name for run in self.runs for name in run.names}
+        if twice := [name for name, n in Counter([*measured, *self.hidden]).items() if n > 1]:
             raise ValueError(
-                f"a hidden state is one that no run has: {twice} came with samples; leave them "
-                "out of hidden, or out of the runs"
+                f"a hidden state is one that no run has: {twice} came with samples or twice; leave "
+                "them out of hidden, or out of the runs"
             )
-        if len(set(self.hidden)) < len(self.hidden):
-            raise ValueError(f"hidden states must differ: {list(self.hidden)} came")
         if self.hidden and self.facts.roles is not None:
             raise ValueError(
                 f"roles need samples of every state: {list(self.hidden)} came as hidden; give "

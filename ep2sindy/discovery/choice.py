@@ -113,9 +113,11 @@ def join_choice(
     method: DiscoveryMethod,
 ) -> Discovery:
     """The candidates of every equation, and those that were chosen as they are in the model."""
+    terms = {each.equation: model.terms(each.equation) for each in chosen}
+    coef = [np.array([terms[c.equation].get(name, 0.0) for name in c.terms]) for c in chosen]
     return Discovery(
         {front.equation: front for front in fronts},
-        {each.equation: as_in(model, each) for each in chosen},
+        {c.equation: replace(c, coef=own) for c, own in zip(chosen, coef, strict=True)},
         model,
         method,
     )
@@ -203,12 +205,6 @@ def _describe_misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> 
 def fit_last(front: ParetoFront, candidate: Candidate) -> Candidate:
     """Final fit of a selected candidate, weighted if the noise of its rows is known."""
     return candidate if front.rows.noisy is None else reweight(front.rows, candidate)
-
-
-def as_in(model: SparseModel, candidate: Candidate) -> Candidate:
-    """A candidate with the coefficients that it has in a model."""
-    terms = model.terms(candidate.equation)
-    return replace(candidate, coef=np.array([terms.get(name, 0.0) for name in candidate.terms]))
 
 
 def assemble_model(

@@ -84,9 +84,13 @@ def discover(
     if not together and all(run.parameters == task.runs[0].parameters for run in task.runs):
         return _discover_point((task, rng), method=method, progress=watch)
     points = group_by_point(task.runs, [v for v in library.variables if v not in hidden])
-    if not together:
-        return _discover_each(task, points, method, rng, workers or Serial(), watch)
-    return _discover_together(task, points, method, law, rng, watch)
+    if together:
+        return _discover_together(task, points, method, law, rng, watch)
+    tasks = [replace(task, runs=own) for own in points.values()]
+    pieces = list(zip(tasks, rng.spawn(len(tasks)), strict=True))
+    stage = watch.stage(len(pieces), "point", "discovery")
+    found = collect(workers or Serial(), partial(_discover_point, method=method), pieces, stage)
+    return join_points(dict(zip(points, found, strict=True)), values_of(points))
 
 
 def _hidden_names(hidden: Sequence[str] | int, taken: Sequence[str]) -> Sequence[str]:
@@ -96,22 +100,6 @@ def _hidden_names(hidden: Sequence[str] | int, taken: Sequence[str]) -> Sequence
     n = check_count("hidden", hidden, 0)
     names = chain(["h"] * (n == 1), map("h{}".format, count(1)))
     return list(islice((name for name in names if name not in taken), n))
-
-
-def _discover_each(
-    task: Task,
-    points: Mapping[str, Sequence[Trajectory]],
-    method: DiscoveryMethod,
-    rng: np.random.Generator,
-    workers: Workers,
-    progress: Progress,
-) -> Discovery:
-    """Every point searched alone."""
-    tasks = [replace(task, runs=runs) for runs in points.values()]
-    pieces = list(zip(tasks, rng.spawn(len(tasks)), strict=True))
-    stage = progress.stage(len(pieces), "point", "discovery")
-    found = collect(workers, partial(_discover_point, method=method), pieces, stage)
-    return join_points(dict(zip(points, found, strict=True)), values_of(points))
 
 
 def _discover_together(

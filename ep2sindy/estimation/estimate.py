@@ -139,7 +139,6 @@ def estimate(
     align: bool = False,
     hidden: Sequence[str] = (),
     courses: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
     limit_s: float | None = None,
     progress: Progress | bool = False,
@@ -194,7 +193,7 @@ def estimate(
     if facts.roles is not None:
         played = compress(answer.solution.problem.processes, answer.solution.fit.free != 0.0)
         constraint = constraint_of(library, task.states, list(played), facts.roles.told)
-    model = _model(answer, library, units or fitted[0].units, provenance or {})
+    model = _model(answer, library, fitted[0].units, provenance or {})
     return replace(_report(answer, model, fitted, watch), constraint=constraint)
 
 

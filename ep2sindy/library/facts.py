@@ -35,8 +35,7 @@ class Facts:
 
     def __post_init__(self) -> None:
         for name in ("only", "excluded"):
-            terms = MappingProxyType(_by_state(name, getattr(self, name)))
-            object.__setattr__(self, name, terms)
+            object.__setattr__(self, name, _by_state(getattr(self, name)))
         if empty := [state for state, terms in self.only.items() if not terms]:
             raise ValueError(f"an equation whose terms are given must have some: {empty} has none")
         if self.roles is None:
@@ -73,11 +72,6 @@ class Facts:
         named += [(state, term) for state, terms in self.only.items() for term in terms]
         return [*named, *self.known_factors]
 
-    @property
-    def states(self) -> set[str]:
-        """Every state whose equation is spoken of, but for roles."""
-        return {*self.excluded, *(state for state, _ in self.places)}
-
     def check(self, library: NamedTerms) -> None:
         """Raise ValueError for an unknown term, one that is excluded and named, or none left."""
         barred = {s: {*map(library.index, terms)} for s, terms in self.excluded.items()}
@@ -106,26 +100,16 @@ class Facts:
         ]
 
 
-def _by_state(key: str, given: object) -> dict[str, tuple[str, ...]]:
+def _by_state(given: object) -> Mapping[str, tuple[str, ...]]:
     """The terms of every state that are named. Raises ValueError for what are no lists of names."""
-    method = {"excluded": "exclude"}.get(key, key)
-    example = f"{method}({{'x': ['x', 'x*y']}})"
+    example = "{'x': ['x', 'x*y']}"
     if not isinstance(given, Mapping):
         raise ValueError(f"terms must be lists by state, like {example}: {given!r} came")
-    found = {}
     for state, names in given.items():
         check_list(f"the terms of {state!r}", names)
-        if isinstance(names, Mapping) and names:
-            term, value = next(iter(names.items()))
-            raise ValueError(
-                f"{method} takes terms, without coefficients, like {example}: {dict(names)!r} came "
-                f"for {state!r}; a coefficient that is known is a relation, "
-                f"relate('{state}: {term} == {value}')"
-            )
         if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
             raise ValueError(
                 f"terms must be lists of names, like {example}: {names!r} came for {state!r}; the "
-                "constant term is '1'"
+                "constant is '1', and a coefficient that is known is a relation, 'x: x == 0.5'"
             )
-        found[state] = tuple(names)
-    return found
+    return MappingProxyType({state: tuple(names) for state, names in given.items()})

@@ -47,8 +47,8 @@ class Library:
     >>> library.relate("x: x*y == -1 * y: x*y")
     Library of 6 terms over x, y
     1 of degree 0: 1
-    2 of degree 1: x, y
-    3 of degree 2: x^2, x*y, y^2
+    2 of degree 1: x y
+    3 of degree 2: x^2 x*y y^2
     known: x: x*y == -1 * y: x*y
     known: x' has no x^2
     """
@@ -187,10 +187,31 @@ class Library:
         return table
 
     def __repr__(self) -> str:
-        return library_text(self)
+        """Terms by degree, and what is known, as text that fits one screen."""
+        lines = [f"Library of {len(self)} terms over {', '.join(self.variables)}"]
+        by_degree = list(self._by_degree.items())
+        for k, (degree, found) in enumerate(by_degree):
+            left = N_LINES - len(lines) - (len(by_degree) - k - 1)
+            head = f"{len(found)} of degree {degree}:"
+            lines += wrap([head, *found], what="terms", n_lines=max(1, min(6, left)))
+        return one_screen([*lines, *(f"known: {line}" for line in self.facts.lines)])
 
     def _repr_html_(self) -> str:
-        return library_html(self)
+        """Terms by degree, and what is known, as a table."""
+        rows = [
+            [str(degree), str(len(found)), html.escape(cut(", ".join(found), 1000))]
+            for degree, found in self._by_degree.items()
+        ]
+        rows += [["known", "", html.escape(cut(line, 1000))] for line in self.facts.lines]
+        return html_table(["degree", "terms", ""], rows)
+
+    @property
+    def _by_degree(self) -> dict[int, list[str]]:
+        degrees = self.degrees.tolist()
+        found: dict[int, list[str]] = {degree: [] for degree in sorted(set(degrees))}
+        for name, degree in zip(self.names, degrees, strict=True):
+            found[degree].append(name)
+        return found
 
     def index(self, name: str) -> int:
         """Position of a term; factors may come in any order. Raises ValueError if absent."""
@@ -408,35 +429,3 @@ def polynomial(
     ]
     full = Library(variables, np.array(rows, dtype=np.int64), factors)
     return full + named_terms(variables, products) if products else full
-
-
-# Display of a library, on a screen or in a notebook.
-
-
-def library_text(library: Library) -> str:
-    """Terms of a library by degree, and what is known, as text that fits one screen."""
-    lines = [f"Library of {len(library)} terms over {', '.join(library.variables)}"]
-    by_degree = list(_by_degree(library).items())
-    for k, (degree, found) in enumerate(by_degree):
-        left = N_LINES - len(lines) - (len(by_degree) - k - 1)
-        head = f"{len(found)} of degree {degree}:"
-        lines += wrap([head, *found], what="terms", n_lines=max(1, min(6, left)))
-    return one_screen([*lines, *(f"known: {line}" for line in library.facts.lines)])
-
-
-def library_html(library: Library) -> str:
-    """Terms of a library by degree, and what is known, as an HTML table."""
-    rows = [
-        [str(degree), str(len(found)), html.escape(cut(", ".join(found), 1000))]
-        for degree, found in _by_degree(library).items()
-    ]
-    rows += [["known", "", html.escape(cut(line, 1000))] for line in library.facts.lines]
-    return html_table(["degree", "terms", ""], rows)
-
-
-def _by_degree(library: Library) -> dict[int, list[str]]:
-    degrees = library.degrees.tolist()
-    found: dict[int, list[str]] = {degree: [] for degree in sorted(set(degrees))}
-    for name, degree in zip(library.names, degrees, strict=True):
-        found[degree].append(name)
-    return found
