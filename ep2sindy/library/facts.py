@@ -38,6 +38,12 @@ class Facts:
             object.__setattr__(self, name, _by_state(getattr(self, name)))
         if empty := [state for state, terms in self.only.items() if not terms]:
             raise ValueError(f"an equation whose terms are given must have some: {empty} has none")
+        for place, factors in self.known_factors.items():
+            if not isinstance(factors, Mapping):
+                raise ValueError(
+                    "a known coefficient is a sum of functions of the parameters, such as "
+                    f"{{'x': {{'x*y': {{'1': 2.0}}}}}}: {factors!r} came for {place}"
+                )
         if self.roles is None:
             return
         check_kind("roles", self.roles, Roles, "ep.Roles(exchange=[('n_n', 'n_i')])")
