@@ -33,7 +33,6 @@ from ep2sindy.forecasting.forecast import RollingStarts, calibrate, spread_start
 from ep2sindy.forecasting.skill import forecast_skill, horizon_errors
 from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.library.relations import relations_of
 from ep2sindy.model.comparison import REPEATS, FreeRunBounds
 from ep2sindy.model.display import model_lines
 from ep2sindy.model.model import SparseModel
@@ -227,10 +226,10 @@ class SignalSearch:
             states = self._embed(past, n_states)
         found = discover(
             states.run,
-            self.library(states.run.state_names, self._fit_functions(states), self.degree),
+            states.known_in(
+                self.library(states.run.state_names, self._fit_functions(states), self.degree)
+            ),
             self._method_for(states),
-            relations=states.relations,
-            terms=states.terms,
             seed=seed,
             progress=progress,
         )
@@ -291,8 +290,7 @@ def _measure_misfit(method: AnyMethod, states: Embedded, library: Library) -> fl
     if isinstance(method, TrajectorySearch):
         method = Regression(search=BestSubset(max_terms=method.max_terms or FIRST_MAX_TERMS))
     try:
-        task = Task([states.run], library, relations_of(states.relations), states.terms)
-        equations = method.search_equations(task, rng=0)
+        equations = method.search_equations(Task([states.run], states.known_in(library)), rng=0)
     except ValueError:
         return float("inf")
     fronts = [each.front for each in equations if each.front.equation in states.searched]

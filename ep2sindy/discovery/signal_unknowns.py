@@ -115,10 +115,8 @@ def fit_offset(
             partial(
                 discover,
                 replace(run, states=run.states + shift),
-                library,
+                library.relate(f"{x}: {x}*{g} == 1").only({x: [g, f"{x}*{g}"]}),
                 method,
-                relations=[f"{x}: {x}*{g} == 1"],
-                terms={x: [g, f"{x}*{g}"]},
                 hidden=[g],
                 progress=progress,
             )

@@ -13,6 +13,7 @@ from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.values import check_count
 from ep2sindy.signals.log_smoother import LogSmoother
@@ -60,9 +61,9 @@ class Embedding(Protocol):
 class Embedded:
     """A signal as a trajectory of states, with the equations that are known exactly.
 
-    embedding: that made the states. relations, terms: in the form that `discover` takes. noise_std:
-    standard deviation of the noise in the signal, in its unit; it includes components faster than
-    the smoother follows. reason: why this embedding was taken, in words.
+    embedding: that made the states. relations, terms: known of their equations, see `known_in`.
+    noise_std: standard deviation of the noise in the signal, in its unit; it includes components
+    faster than the smoother follows. reason: why this embedding was taken, in words.
     """
 
     embedding: Embedding
@@ -76,6 +77,10 @@ class Embedded:
     def searched(self) -> list[str]:
         """States whose equations are not known."""
         return [name for name in self.run.state_names if name not in self.terms]
+
+    def known_in(self, library: Library) -> Library:
+        """A library of the states, with the equations that are known."""
+        return library.relate(*self.relations).only(self.terms)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import pandas as pd
 from ep2sindy.data.trajectory import point_label
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
+from ep2sindy.library.facts import Known
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.given_models import (
@@ -26,7 +27,7 @@ from ep2sindy.operating.given_models import (
     fit_models,
     fits_of,
 )
-from ep2sindy.operating.law import Known, LawFunctions, constrain_law, make_basis
+from ep2sindy.operating.law import LawFunctions, constrain_law, make_basis
 from ep2sindy.operating.quantities import Quantity
 from ep2sindy.operating.records import OperatingRecord, branches_of, read_points
 from ep2sindy.regression.formulations import Differential, RandomSplit, WeightedWeak
@@ -248,9 +249,8 @@ class Study:
         search = BestSubset(max_terms=sizes[-1], n_best=n_best)
         rows = Differential(split=RandomSplit(test_fraction=0.0)) if signal else WeightedWeak()
         found = discover(
-            runs, library, Regression(rows, search, depth=n_best), shared=True, seed=run.seed,
-            terms=known, relations=signal.relations if signal else (),
-            progress=run.watch,
+            runs, signal.known_in(library) if signal else library,
+            Regression(rows, search, depth=n_best), shared=True, seed=run.seed, progress=run.watch,
         )  # fmt: skip
         supports = {
             state: [known[state]]
@@ -298,8 +298,9 @@ class Study:
         for name, own in models.items():
             try:
                 relations = constrain_law(
-                    library, terms[name], own.relations, own.known, parameters=parameters
-                )
+                    library.relate(*own.relations).known(own.known),
+                    terms[name], parameters=parameters,
+                )  # fmt: skip
                 for quantity in own.quantities.values():
                     quantity.place(relations.common, library)
             except ValueError as error:
