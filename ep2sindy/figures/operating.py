@@ -36,7 +36,7 @@ MAX_LINES = 5  # number of the other parameters' values that are drawn
 FADED = 0.35  # opacity of a map's colours beyond the points that the law was fitted to
 WRONG = "#d00000"  # marks where the law says otherwise than the record; no colour of the map
 MARKERS = "os^Dv<>"  # seven, of eight colours: a pair recurs after 56
-PUBLISHED = "published"  # the kind of estimate that comes from a publication
+PUBLISHED = "thesis"  # the kind of estimate that comes from a publication
 
 FILLED: dict[str, Any] = {"marker": "o", "ms": 3.5}
 OPEN: dict[str, Any] = {"marker": "o", "ms": 6.0, "mfc": "none"}
