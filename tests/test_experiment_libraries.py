@@ -79,7 +79,7 @@ def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
 def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     found = summary_of(breathing_run)["models"]
     living = found["simple"]["living"]
-    assert living["verdict"] == "lives"
+    assert living["status"] == "sustained"
     assert living["n_terms"] == 4
     assert living["f_error"] == pytest.approx(0.0, abs=1e-4)
     assert living["waveform_error"] == pytest.approx({"n_i": 0.0, "n_n": 0.0}, abs=1e-2)
@@ -90,11 +90,11 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert ions["value"] == pytest.approx(-1.64e5, rel=1e-4)
     low, high = ions["spread_over_windows"]  # no interval of a rate: the model itself may miss it
     assert low < ions["value"] < high
-    assert living["by_derivatives"]["verdict"] == "lives"  # the same terms here
+    assert living["by_derivatives"]["status"] == "sustained"  # the same terms here
     assert found["velocity"]["living"] is None  # it has inputs
     terms = {(r["state"], r["term"]): r for r in found["simple"]["balance"]["terms"]}
     assert len(terms) == 4
-    assert all(each["without_verdict"] != "lives" for each in terms.values())
+    assert all(each["without_verdict"] != "sustained" for each in terms.values())
     assert found["simple"]["balance"]["processes"] == []
     for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
         assert (breathing_run / "figures" / f"{figure}.png").is_file()

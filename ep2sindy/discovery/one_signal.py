@@ -28,14 +28,14 @@ from ep2sindy.discovery.signal_unknowns import (
     search_hidden,
 )
 from ep2sindy.estimation.problem import FIRST_MAX_TERMS
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.forecasting.forecast import RollingStarts, calibrate, spread_starts
-from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill, horizon_errors
+from ep2sindy.forecasting.skill import forecast_skill, horizon_errors
 from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import relations_of
 from ep2sindy.model.comparison import REPEATS, FreeRunBounds
 from ep2sindy.model.display import model_lines
-from ep2sindy.model.free_run import FreeCycle, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.formulations import WeightedWeak
@@ -180,7 +180,7 @@ class SignalSearch:
         best = attempts[0]
         for other in attempts[1:]:
             best = other if other.error < CLEARLY * best.error else best
-        return evaluate(signal, past, best, attempts, progress=progress)
+        return run_on_rest(signal, past, best, attempts, progress=progress)
 
     def fitted_part(self, signal: Trace) -> Trace:
         """The samples to fit; all of them if the record is too short to hold out a part."""
@@ -304,19 +304,16 @@ class SignalDiscovery:
     """The model found from one signal, and its tests on the end of the record.
 
     signal: as prepared. best: the attempt that was chosen among `attempts`, in other numbers of
-    states. states: all of the record, the signal as measured. measured: the test data, the end that
-    was not fitted, or all of a short record. free: the run of the model over them, from a start
-    that was fitted to the samples before, and its cycle. skill: of forecasts of the test data; None
-    without any.
+    states. states: all of the record, the signal as measured. evaluation: of the model over the end
+    that was not fitted, or over all of a short record, from a start that was fitted to the samples
+    before; with its forecasts if an end was left.
     """
 
     signal: Trace
     best: Attempt = field(repr=False)
     attempts: Sequence[Attempt] = field(repr=False)
     states: Trajectory
-    measured: Trajectory
-    free: FreeCycle
-    skill: ForecastSkill | None = field(repr=False)
+    evaluation: Evaluation = field(repr=False)
 
     @property
     def discovery(self) -> Discovery:
@@ -328,7 +325,7 @@ class SignalDiscovery:
 
     @property
     def is_held_out(self) -> bool:
-        return self.skill is not None
+        return self.evaluation.forecasts is not None
 
     @property
     def where(self) -> str:
@@ -339,7 +336,8 @@ class SignalDiscovery:
     @property
     def words(self) -> str:
         """How the run went."""
-        return self.free.run.words(seen=not self.is_held_out, misfit=self.discovery.misfit)
+        misfit = "; it does not explain the data" if self.discovery.misfit else ""
+        return f"{self.evaluation.text}{misfit}"
 
     def __repr__(self) -> str:
         states = self.best.states
@@ -403,11 +401,11 @@ def method_by_runs() -> Regression:
     return Regression(WeightedWeak(), search, rule, Bootstraps(n=0), depth=8)
 
 
-def evaluate(
+def run_on_rest(
     signal: Trace, past: Trace, best: Attempt, attempts: Sequence[Attempt], *,
-    progress: Progress = SILENT,
+    progress: Progress,
 ) -> SignalDiscovery:  # fmt: skip
-    """Run the model freely over the held-out part, and forecast it again and again.
+    """Run the model freely over the held-out part, which it also forecasts when it is asked to.
 
     The start is fitted to the samples before the held-out part. Without such a part, the whole
     record is compared, from the first of its states.
@@ -422,10 +420,12 @@ def evaluate(
         first, fitted = n_fitted - 1, complete_states(past, known)
         estimator = calibrate(estimator, fitted, states_of=before, progress=progress)
         start = estimator.filter(before(fitted)).mean
-    measured, names = whole.window(first, whole.n_samples), [signal.name]
-    with progress.stage(None, "", "free run and limit cycle"):
-        cycle = FreeCycle.of(free_run(model, measured, initial=start, judged=names))
-    skill = None if is_whole else forecast_skill(
-        model, whole, n_fitted=n_fitted, states_of=before, estimator=estimator, progress=progress
-    )  # fmt: skip
-    return SignalDiscovery(signal, best, attempts, whole, measured, cycle, skill)
+    measured = whole.window(first, whole.n_samples)
+    evaluation = evaluate(best.found, measured, initial=start, judged=[signal.name])
+    if not is_whole:
+        skill = partial(
+            forecast_skill, model, whole, n_fitted=n_fitted, states_of=before,
+            estimator=estimator, progress=progress,
+        )  # fmt: skip
+        evaluation = replace(evaluation, forecasts=skill)
+    return SignalDiscovery(signal, best, attempts, whole, evaluation)

@@ -18,11 +18,11 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import TrajectorySearch
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.estimate import Estimate
+from ep2sindy.forecasting.evaluation import evaluate
 from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import number_text
-from ep2sindy.model.comparison import SPIRALS, Verdict
-from ep2sindy.model.free_run import FreeCycle, free_run
+from ep2sindy.model.comparison import SPIRALS
 from ep2sindy.runtime.parallel import Once, at_once
 from ep2sindy.runtime.progress import Progress
 from ep2sindy.signals.embedding import Embedded
@@ -33,8 +33,6 @@ MAX_FITTED = 3000  # samples from the end of the fitted part that the search see
 # Means, in standard deviations, of the signals from which an offset is looked for: the search for
 # the growth rate finds its way from some of them alone.
 SHIFTS = (0.3, 0.0, 0.1, -0.3)
-
-ENDURING = (Verdict.LIVES, Verdict.FOLLOWS, Verdict.ALIKE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +140,9 @@ def _endures(estimate: Estimate, signal: str) -> bool:
     Nor may its cycle repel: a departure that grew would show in a record that keeps its amplitude.
     """
     (record,), (path,) = estimate.runs, estimate.paths
-    free = FreeCycle.of(free_run(estimate.model, record, initial=path[0], judged=[signal]))
-    if free.run.verdict not in ENDURING or free.cycle is None:
-        return free.run.verdict in ENDURING
+    free = evaluate(estimate.model, record, initial=path[0], judged=[signal])
+    if not free.is_similar or free.cycle is None:
+        return free.is_similar
     n_periods = float(record.t[-1] - record.t[0]) / free.cycle.period_s
     return free.multiplier**n_periods < SPIRALS
 

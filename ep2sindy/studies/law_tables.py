@@ -11,6 +11,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from ep2sindy.figures.operating import cycle_figure, laws_figure, left_out_figure
+from ep2sindy.model.comparison import Status
 from ep2sindy.operating.law import LawFunctions, OperatingLaw, read_law
 from ep2sindy.operating.left_out import (
     LawTrial,
@@ -19,7 +20,7 @@ from ep2sindy.operating.left_out import (
     run_left_out,
     window_errors,
 )
-from ep2sindy.operating.map import Fate, MapPoint, law_map, map_points
+from ep2sindy.operating.map import MapPoint, law_map, map_points
 from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.operating.records import OperatingRecord, Point, most_central
 from ep2sindy.regression.pooled import fewest_of_least
@@ -41,8 +42,8 @@ INTERVALS = (
 LEFT_OUT = (
     "Each point in turn read off the law of the others, and run freely from one sample of its "
     "record, where the states move least. Errors are those against the record's cycle; a model "
-    "lives within 1 % of frequency, 10 % of amplitude and 0.2 standard deviations of waveform; "
-    "enclosed: whether the others enclose it."
+    "lives, its oscillation sustained, within 1 % of frequency, 10 % of amplitude and 0.2 standard "
+    "deviations of waveform; enclosed: whether the others enclose it."
 )
 TRIED = (
     "error: mean over the points left out, by the law of the others, of what windows of the record "
@@ -306,7 +307,7 @@ def _add_left_out(report: Report, found: FoundLaw) -> None:
             lambda ratio: relative(ratio - 1.0),
         ),
         Metric("waveform", lambda p: p.run.waveform_error, View.SHOWN, "waveform {}", "{:.3f}"),
-        Metric("verdict", lambda p: str(p.run.verdict), View.SHOWN),
+        Metric("status", lambda p: str(p.run.status), View.SHOWN),
     ]
     report.section("Points left out")
     report.table("left_out", ResultTable(found.runs, metrics), note=LEFT_OUT)
@@ -329,13 +330,13 @@ def _add_map(
     report: Report, found: FoundLaw, points: pd.DataFrame, labels: Mapping[str, str]
 ) -> str:
     """Add the map, if there is one; returns at how many points the law is right."""
-    says = np.array([point.fate is Fate.OSCILLATES for point in found.at_points])
+    says = np.array([point.status is Status.SUSTAINED for point in found.at_points])
     does = (points["status"] == Oscillation.OSCILLATING).to_numpy()
     report.headline["map_right"] = float((says == does).mean())
     parameters, table = list(found.records[0].parameters), pd.DataFrame([p.row for p in found.map])
     report.section("Where it oscillates")
     report.samples("map", table)
-    if any(point.fate is Fate.OSCILLATES for point in found.map):
+    if any(point.status is Status.SUSTAINED for point in found.map):
         draw = partial(
             cycle_figure, table, points, branch=found.cycle, parameters=parameters, labels=labels
         )

@@ -17,11 +17,12 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.figures.fronts import front_figure
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
-from ep2sindy.model.free_run import FreeRun, free_run, samples_in
+from ep2sindy.model.comparison import samples_in
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import Formulation
@@ -253,13 +254,13 @@ class Study:
         with progress.stage(None, "", "free runs"):
             return LibraryResult(
                 discovery=found,
-                selected=free_run(found.model, data, n_samples=n_samples),
+                selected=evaluate(found.model, data, n_samples=n_samples),
                 given=published,
                 refitted=refitted,
                 published=run_refitted(found, refitted, data, n_samples),
                 living=lives,
                 balance=beside,
-                elsewhere=[free_run(found.model, run, n_samples=n) for run, n in others],
+                elsewhere=[evaluate(found.model, run, n_samples=n) for run, n in others],
                 skill=skill,
             )
 
@@ -338,12 +339,12 @@ class Outcome:
     files: Sequence[str] = ()
 
     @property
-    def published(self) -> dict[str, FreeRun]:
+    def published(self) -> dict[str, Evaluation]:
         """Free runs of the models of published terms, if these could be fitted to our data."""
         return {n: r.published for n, r in self.results.items() if r.published is not None}
 
     @property
-    def selected(self) -> dict[str, FreeRun]:
+    def selected(self) -> dict[str, Evaluation]:
         return {name: result.selected for name, result in self.results.items()}
 
     @property
@@ -374,13 +375,13 @@ class Outcome:
         return found | ({"records": self.records.csv()} if len(self.files) > 1 else {})
 
     @property
-    def comparison(self) -> ResultTable[FreeRun]:
+    def comparison(self) -> ResultTable[Evaluation]:
         """One row per model: frequencies, trajectory error, and the verdict on the trajectory."""
         published = {f"{name}, thesis's terms": each for name, each in self.published.items()}
         return ResultTable(self.selected | published, frequencies(self.data))
 
     @property
-    def records(self) -> ResultTable[tuple[str, str, FreeRun]]:
+    def records(self) -> ResultTable[tuple[str, str, Evaluation]]:
         """One row per model and record."""
         runs = [
             (name, file, each)
@@ -430,7 +431,7 @@ class Outcome:
     def _cautions(self, best: str) -> list[Block]:
         """A neutral cycle of the living model, and what fits of derivatives leave beyond noise."""
         tests = [result.discovery.noise_test for result in self.results.values()]
-        caution = self.living[best].free.caution
+        caution = self.living[best].run.caution
         return [*([Text(caution, warning=True)] if caution else []), *left_over_of_all(tests)]
 
     def sections(self) -> list[Section]:
@@ -460,7 +461,7 @@ class Outcome:
         for name, result in self.results.items():
             living, clock = result.living, self.data.clock
             run = result.selected if living is None else living.run
-            text = f"{name}: equations {result.how}; run freely: {run.words(seen=living is None)}"
+            text = f"{name}: equations {result.how}; run freely: {run.text}"
             blocks.append(Text(text, page_only=True))
             held = None if living is None else living.discovery.constraint
             shown = partial(display_equation, run.model, clock=clock, held=held, on_screen=False)

@@ -15,10 +15,10 @@ from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.estimate import Estimate, Rival
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import Clock
-from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.regression.front import Candidate, LeftOver, ParetoFront, fit_support
@@ -68,17 +68,17 @@ class LibraryResult:
     """
 
     discovery: Discovery
-    selected: FreeRun
+    selected: Evaluation
     given: Mapping[str, Mapping[str, float]]
     refitted: Mapping[str, Candidate]
-    published: FreeRun | None
+    published: Evaluation | None
     living: Living | None = None
     balance: ModelBalance | None = None
-    elsewhere: Sequence[FreeRun] = ()
+    elsewhere: Sequence[Evaluation] = ()
     skill: ForecastSkill | None = None
 
     @property
-    def runs(self) -> list[FreeRun]:
+    def runs(self) -> list[Evaluation]:
         """Free runs of the selected model over every record."""
         return [self.selected, *self.elsewhere]
 
@@ -169,7 +169,7 @@ class CandidateRow:
         return dict(zip(self.candidate.terms, self.candidate.inclusion.tolist(), strict=True))
 
 
-TRAJECTORY: Metrics[FreeRun] = [
+TRAJECTORY: Metrics[Evaluation] = [
     Metric(
         "f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]],
         View.JSON | View.HEADLINE,
@@ -242,7 +242,7 @@ def _rows_by_state(
 
 def run_refitted(
     found: Discovery, refitted: Mapping[str, Candidate], data: Trajectory, n_samples: int
-) -> FreeRun | None:
+) -> Evaluation | None:
     if set(refitted) != set(data.state_names):
         return None
     coef = [refitted[state].coef_by_term for state in data.state_names]
@@ -253,7 +253,7 @@ def run_refitted(
         units=data.units,
         provenance={**found.model.provenance, "search": "published terms, refitted"},
     )
-    return free_run(model, data, n_samples=n_samples)
+    return evaluate(model, data, n_samples=n_samples)
 
 
 def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Section:
@@ -349,7 +349,7 @@ def column_note(label: str) -> str:
     return f"{rule}." if label == "deviance" else f"{rule}. {COLUMNS}"
 
 
-def _published_summary(run: FreeRun, refitted: Mapping[str, Candidate]) -> dict[str, Any]:
+def _published_summary(run: Evaluation, refitted: Mapping[str, Candidate]) -> dict[str, Any]:
     """Summary of the published terms as fitted to our data."""
     return {
         "equations": {
@@ -443,7 +443,7 @@ ESTIMATE: Metrics[Estimate] = [
 ]  # fmt: skip
 
 
-def frequencies(data: Trajectory) -> Metrics[FreeRun]:
+def frequencies(data: Trajectory) -> Metrics[Evaluation]:
     """Metrics of models' runs against the data: frequencies by state, trajectory error, verdict."""
     text = data.clock.frequency_text
     f_data = {
@@ -451,7 +451,7 @@ def frequencies(data: Trajectory) -> Metrics[FreeRun]:
         for state, column in zip(data.state_names, data.states.T, strict=True)
     }
 
-    def both(run: FreeRun) -> dict[str, float]:
+    def both(run: Evaluation) -> dict[str, float]:
         pairs = [(f"data_{s}", f"model_{s}", f, run.frequency_Hz[s]) for s, f in f_data.items()]
         return {k: v for data, model, f, own in pairs for k, v in ((data, f), (model, own))}
 
@@ -460,15 +460,13 @@ def frequencies(data: Trajectory) -> Metrics[FreeRun]:
         Metric("f_data", lambda run: f_data, View.SCREEN, "frequency of the data", text),
         Metric("f_model", lambda run: run.frequency_Hz, View.SCREEN, "of the model", text),
         Metric("nrmse", lambda run: run.nrmse, View.SHOWN, format="{:.3f}"),
-        Metric("verdict", lambda run: run.text, View.CSV),
-        Metric("verdict", lambda run: run.words(seen=True), View.SCREEN),
+        Metric("status", lambda run: run.text, View.CSV | View.SCREEN),
     ]
 
 
-RECORDS: Metrics[tuple[str, str, FreeRun]] = [
+RECORDS: Metrics[tuple[str, str, Evaluation]] = [
     Metric("model", lambda row: row[0], View.SHOWN),
     Metric("record", lambda row: row[1], View.SHOWN),
     Metric("nrmse", lambda row: row[2].nrmse, View.SHOWN, format="{:.3f}"),
-    Metric("verdict", lambda row: row[2].text, View.CSV),
-    Metric("verdict", lambda row: row[2].words(seen=True), View.SCREEN),
+    Metric("status", lambda row: row[2].text, View.CSV | View.SCREEN),
 ]

@@ -20,13 +20,13 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.figures import living as figures
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.model.comparison import FreeRunBounds, Verdict
+from ep2sindy.model.comparison import FreeRunBounds, Status
 from ep2sindy.model.display import grouped
-from ep2sindy.model.free_run import FreeCycle, FreeRun, free_run
 from ep2sindy.model.mass_action import consequences
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LimitCycle
@@ -163,30 +163,26 @@ class Refined:
     """A refinement of the model selected by derivatives: its status and its free run."""
 
     status: str
-    run: FreeRun
+    run: Evaluation
 
 
 @dataclass(frozen=True, eq=False)
 class Living:
     """A closed model and its run over the held-out part.
 
-    free: the run, which starts at the first held-out sample, smoothed by a Kalman smoother so that
-    the sample's noise is not attributed to the model, and its cycle. by_derivatives: the equations
-    selected by their derivatives, refined with the same terms.
+    run: it starts at the first held-out sample, smoothed by a Kalman smoother so that the sample's
+    noise is not attributed to the model. by_derivatives: the equations selected by their
+    derivatives, refined with the same terms.
     """
 
     discovery: Discovery
     held: Trajectory
-    free: FreeCycle
+    run: Evaluation
     by_derivatives: Refined
 
     @property
-    def run(self) -> FreeRun:
-        return self.free.run
-
-    @property
     def cycle(self) -> LimitCycle | None:
-        return self.free.cycle
+        return self.run.cycle
 
     @property
     def model(self) -> SparseModel:
@@ -213,7 +209,7 @@ class Living:
             *pictures(self.figures(name)),
             *self._others(),
         ]
-        lives = self.run.verdict is Verdict.LIVES
+        lives = self.run.status is Status.SUSTAINED
         ending = "lives" if lives else f"does not live ({self.run.text})"
         return Section(f"{name}: a model that {ending}", blocks)
 
@@ -250,7 +246,7 @@ class Living:
 LIVING: Metrics[Living] = [
     Metric("terms", lambda found: _terms(found.model), View.JSON),
     Metric("n_terms", lambda found: found.n_terms),
-    Metric("verdict", lambda found: str(found.run.verdict)),
+    Metric("status", lambda found: str(found.run.status)),
     Metric(
         "frequency",
         lambda found: found.run.rollout.clock.frequency_text(
@@ -268,14 +264,14 @@ LIVING: Metrics[Living] = [
     ),
     Metric("waveform_error", lambda found: found.run.waveform_error, View.SHOWN, format="{:.3f}"),
     Metric("waveform_error", lambda found: max(found.run.waveform_error.values()), View.HEADLINE),
-    Metric("verdict", lambda found: found.run.text, View.SCREEN),
+    Metric("status", lambda found: found.run.text, View.SCREEN),
     Metric("periods", lambda found: found.run.periods),
     Metric("floquet", lambda found: found.cycle and _multipliers(found.cycle), View.JSON),
-    Metric("stability", lambda found: found.cycle and str(found.cycle.stability)),
-    Metric("share_reaching", lambda found: found.free.share),
+    Metric("stability", lambda found: found.cycle and found.cycle.stability),
+    Metric("share_reaching", lambda found: found.run.share_reaching),
     Metric("rest", lambda found: _rest(found), View.JSON),
-    Metric("status_by_derivatives", lambda found: found.by_derivatives.status, View.CSV),
-    Metric("verdict_by_derivatives", lambda found: str(found.by_derivatives.run.verdict), View.CSV),
+    Metric("refinement_by_derivatives", lambda found: found.by_derivatives.status, View.CSV),
+    Metric("status_by_derivatives", lambda found: str(found.by_derivatives.run.status), View.CSV),
     Metric("coefficients", lambda found: _with_intervals(found.model), View.JSON),
     Metric("text", lambda found: _text(found), View.JSON),
     Metric("proved", lambda found: consequences(found.model), View.JSON),
@@ -293,8 +289,8 @@ OTHERS: Metrics[OtherSystem] = [
     Metric("deviation", lambda each: each.deviation, View.SHOWN, format="{:.2f}"),
 ]
 REFINED: Metrics[Refined] = [
-    Metric("status", lambda refined: refined.status),
-    Metric("verdict", lambda refined: str(refined.run.verdict)),
+    Metric("refinement", lambda refined: refined.status),
+    Metric("status", lambda refined: str(refined.run.status)),
     Metric("text", lambda refined: refined.run.model.text()),
 ]
 
@@ -322,7 +318,7 @@ def _terms(model: SparseModel) -> dict[str, list[str]]:
 
 
 def _rest(living: Living) -> dict[str, Any] | None:
-    rest = living.free.rest
+    rest = living.run.rest
     if rest is None:
         return None
     state = dict(zip(living.model.states, rest.state.tolist(), strict=True))
@@ -347,7 +343,7 @@ def _with_intervals(model: SparseModel) -> dict[str, dict[str, Any]]:
     }
 
 
-def run_title(run: FreeRun) -> str:
+def run_title(run: Evaluation) -> str:
     """The title of the table of a run, with how long it is in phase if the record has a period."""
     in_phase = "" if np.isnan(run.periods) else f"; in phase for {round(run.periods)} periods"
     return f"run freely from one sample over held-out time{in_phase}"
@@ -358,7 +354,7 @@ def _note(living: Living) -> str:
     proved = consequences(living.model)
     found = [f"By its terms {'; '.join(proved)}."] if proved else []
     found.append(f"Selection: {living.discovery.note}.")
-    found += [living.free.text] if living.free.text else []
+    found += [living.run.cycle_text] if living.run.cycle_text else []
     found += [f"Misfit: {living.discovery.misfit}."] if living.discovery.misfit else []
     found.append(
         "Amplitude: ratio of standard deviations; waveform error: RMS difference in standard "
@@ -401,11 +397,8 @@ def living_model(
     selected: the model selected by derivatives, which is refined for comparison.
     """
     found = settings.found(train, library, rows, zones, rng=rng, progress=progress)
-    with progress.stage(None, "", "free run and limit cycle"):
-        start = start_of(held, found.model)
-        run = free_run(found.model, held, initial=start, bounds=settings.bounds)
-        free = FreeCycle.of(run)
-    return Living(found, held, free, _refined(selected, train, held, progress))
+    run = evaluate(found, held, initial=start_of(held, found.model), bounds=settings.bounds)
+    return Living(found, held, run, _refined(selected, train, held, progress))
 
 
 def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:
@@ -430,4 +423,4 @@ def _refined(
     from ep2sindy.refinement.refine import refine  # loads torch, only for a refinement
 
     found = refine(model, [train], window=two_periods(train), seed=0, progress=progress)
-    return Refined(found.status, free_run(found.model, held, initial=start_of(held, model)))
+    return Refined(found.status, evaluate(found.model, held, initial=start_of(held, model)))

@@ -232,7 +232,7 @@ class Study:
         points = points_table(results, records)
         if law is not None:
             if law.at_points:
-                points["law"] = [str(point.fate) for point in law.at_points]
+                points["law"] = [str(point.status) for point in law.at_points]
             of_law = add_law(report, law, points, self.labels)
             found = replace(found, blocks=[*found.blocks, Text(law.text)]) if found else of_law
         assert found is not None

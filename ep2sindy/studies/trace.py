@@ -23,9 +23,9 @@ from ep2sindy.discovery.result import Discovery
 from ep2sindy.discovery.signal_unknowns import HiddenStates, fit_offset
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.figures.living import cycle_figure, find_waveforms, free_run_figure, waveform_figure
+from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.library.equations import equation_text
-from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeRun
+from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.document import (
@@ -224,12 +224,12 @@ class Outcome:
         return self.found.method.selection.basis == "runs"
 
     @property
-    def run(self) -> FreeRun:
-        return self.tested.free.run
+    def run(self) -> Evaluation:
+        return self.tested.evaluation
 
     @property
     def cycle(self) -> LimitCycle | None:
-        return self.tested.free.cycle
+        return self.run.cycle
 
     @property
     def model(self) -> SparseModel:
@@ -244,11 +244,11 @@ class Outcome:
 
     def tables(self) -> dict[str, pd.DataFrame]:
         fronts = {f"front_{state}": self._front(state).csv() for state in self.searched}
-        run, skill = self.tested.states, self.tested.skill
+        run, skill = self.tested.states, self.run.forecast
         samples = dict(zip(run.state_names, run.states.T, strict=True))
         return {
             **fronts,
-            **rollout_tables(self.tested.measured, {"trace": self.run}),
+            **rollout_tables(self.run.record, {"trace": self.run}),
             "states": pd.DataFrame({"t_s": run.t, **samples}),
             "coefficients": coefficients(self.models(), heading="model"),
         } | ({} if skill is None else {"forecasts": forecast_errors(skill)})
@@ -259,7 +259,7 @@ class Outcome:
         return ResultTable(candidate_rows(front), metrics)
 
     def figures(self) -> dict[str, Captioned]:
-        held, rollout = self.tested.measured, self.run.rollout
+        held, rollout = self.run.record, self.run.rollout
         period_s = self.tested.signal.period_s
         drawn: dict[str, Any] = {
             "free_run": partial(free_run_figure, held, rollout, period_s=period_s)
@@ -272,12 +272,12 @@ class Outcome:
         drawn["front"] = partial(front_figure, fronts, label=self.label)
         captions = CAPTIONS if self.by_runs else CAPTIONS | {"front": SCORED}
         pictures_of = {name: Captioned(draw, captions[name]) for name, draw in drawn.items()}
-        if self.tested.skill is not None:
-            pictures_of["forecast"] = forecast_picture(self.tested.states, self.tested.skill)
+        if self.run.forecast is not None:
+            pictures_of["forecast"] = forecast_picture(self.tested.states, self.run.forecast)
         return pictures_of
 
     def in_short(self) -> Result:
-        caution = self.tested.free.caution
+        caution = self.run.caution
         return found_model(
             f"Found from {self.tested.signal.name}",
             self.run,
@@ -290,7 +290,7 @@ class Outcome:
         )
 
     def sections(self) -> list[Section]:
-        forecasts = [] if self.tested.skill is None else [forecast_section(self.tested.skill)]
+        forecasts = [] if self.run.forecast is None else [forecast_section(self.run.forecast)]
         search, name = [self._search_section()], self.tested.signal.name
         if (estimate := self.found.estimate) is not None:
             of_model = self.found.noise_test.tested
@@ -354,7 +354,7 @@ class Outcome:
         if self.cycle is None:
             is_asked = self.tested.signal.cycle is not None
             return [("the model has no cycle near its run", True)] if is_asked else []
-        return [(self.tested.free.text, self.run.verdict is not Verdict.LIVES)]
+        return [(self.run.cycle_text, self.run.status is not Status.SUSTAINED)]
 
     def n_terms(self, *, known: bool) -> int:
         states = [s for s in self.model.states if (s not in self.searched) == known]
@@ -381,7 +381,7 @@ class Outcome:
             },
             "misfit": self.found.misfit,
             "living": facts(self, FREE_RUN),
-            "forecast": self.tested.skill and self.tested.skill.summary(),
+            "forecast": self.run.forecast and self.run.forecast.summary(),
         }
 
     def headline(self) -> Mapping[str, float]:
@@ -389,14 +389,14 @@ class Outcome:
 
 
 def _data_frequency(tested: SignalDiscovery) -> str:
-    cycle = find_cycle(tested.measured.t, tested.measured.states[:, :1])
+    cycle = find_cycle(tested.evaluation.record.t, tested.evaluation.record.states[:, :1])
     return tested.signal.clock.frequency_text(cycle.frequency_Hz if cycle else float("nan"))
 
 
 COMPARED = View.JSON | View.HEADLINE
 FREE_RUN: Metrics[Outcome] = [
-    Metric("verdict", lambda o: o.run.text, View.JSON),
-    Metric("verdict", lambda o: o.tested.words, View.SCREEN),
+    Metric("status", lambda o: o.run.text, View.JSON),
+    Metric("status", lambda o: o.tested.words, View.SCREEN),
     Metric("note", lambda o: o.found.note, View.JSON),
     Metric("held_out", lambda o: o.tested.is_held_out, View.JSON),
     Metric("frequency of the data", lambda o: _data_frequency(o.tested), View.SCREEN),
@@ -420,8 +420,8 @@ FREE_RUN: Metrics[Outcome] = [
         View.SCREEN,
     ),
     Metric("stability", lambda o: o.cycle.stability if o.cycle else None, View.JSON),
-    Metric("multiplier", lambda o: o.tested.free.multiplier, COMPARED),
-    Metric("share_reaching", lambda o: o.tested.free.share, COMPARED),
+    Metric("multiplier", lambda o: o.run.multiplier, COMPARED),
+    Metric("share_reaching", lambda o: o.run.share_reaching, COMPARED),
 ]  # fmt: skip
 CANDIDATES: Metrics[CandidateRow] = [
     Metric("terms", lambda row: row.candidate.n_terms, View.SHOWN),
