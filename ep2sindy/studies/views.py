@@ -223,7 +223,7 @@ CYCLE: Metrics[Evaluation] = [
     Metric("stability", lambda run: run.cycle and run.cycle.stability),
     Metric("multiplier", lambda run: run.multiplier, COMPARED),
     Metric("share_reaching", lambda run: run.share_reaching, COMPARED),
-    Metric("rest", _rest),
+    Metric("rest", lambda run: _rest(run)),
     Metric("rest_growth_per_s", lambda run: run.rest and run.rest.growth_per_s),
     Metric("rest_frequency_Hz", lambda run: run.rest and run.rest.frequency_Hz),
 ]
@@ -234,8 +234,8 @@ EVALUATED = (
 )
 
 
-def _rest(free: Evaluation) -> dict[str, float] | None:
+def _rest(run: Evaluation) -> dict[str, float] | None:
     """Where the model rests inside its cycle, by state; None if it does not."""
-    if free.rest is None:
+    if run.rest is None:
         return None
-    return dict(zip(free.run.model.states, free.rest.state.tolist(), strict=True))
+    return dict(zip(run.model.states, run.rest.state.tolist(), strict=True))
