@@ -156,7 +156,8 @@ def left_out_figure(rows: pd.DataFrame) -> Figure:
 def _draw_frequencies(ax: Axes, rows: pd.DataFrame) -> None:
     """Draw frequencies of the free runs against those of the records."""
     factor, unit = frequency_scale(rows["f_kHz"])
-    known = factor * rows[["f_kHz", "f_model_kHz"]].to_numpy(float)
+    f, ratio = factor * rows["f_kHz"], 1.0 + rows["f_error"]
+    known = np.stack([f, f * ratio], axis=1)
     for enclosed, words in ((True, "enclosed by the others"), (False, "outside them")):
         face = COLOURS[0] if enclosed else "white"
         mark: dict[str, Any] = {"color": COLOURS[0], "mfc": face, "ms": 6, "label": words}
@@ -172,9 +173,10 @@ def _draw_frequencies(ax: Axes, rows: pd.DataFrame) -> None:
 def _draw_shapes(ax: Axes, rows: pd.DataFrame) -> None:
     """Draw waveform errors against amplitude errors."""
     names = [str(name) for name in rows]
-    states = [name.removeprefix("amplitude_") for name in names if name.startswith("amplitude_")]
+    of = "amplitude_ratio_"
+    states = [name.removeprefix(of) for name in names if name.startswith(of)]
     for state, marker, colour in zip(states, cycle(MARKERS), cycle(MORE_COLOURS), strict=False):
-        off, error = 100.0 * (rows[f"amplitude_{state}"] - 1.0), rows[f"waveform_{state}"]
+        off, error = 100.0 * (rows[f"{of}{state}"] - 1.0), rows[f"waveform_error_{state}"]
         near = (off.abs() <= FAR_PERCENT) & (error <= FAR_WAVEFORM)
         mark: dict[str, Any] = {"ls": "none", "marker": marker, "color": colour, "ms": 6}
         ax.plot(off[near], error[near], mfc="none", label=f"${latex_name(state)}$", **mark)

@@ -30,7 +30,7 @@ from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, ResultTable, View, percent
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.spectrum import Oscillation
-from ep2sindy.studies.views import terms_text
+from ep2sindy.studies.views import EVALUATION, terms_text
 
 N_TOGETHER = 24  # points of a map computed as one piece: the records are sent with each piece
 
@@ -63,16 +63,11 @@ CAPTIONS = {
     "state, those beyond the panel filled on its edge; band and line are the bounds of a "
     "model that lives.",
     "map": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
-    "over the operating parameters, white without a cycle, and of the records in the same colours "
-    "(circles); crosses: points that do not oscillate; diamonds: records of another cycle, not "
-    "fitted here. Red: the law says otherwise than the record. Black line: where the law's cycle "
-    "ends; dashed: where its fixed point turns stable. Faded: beyond what the points that the law "
-    "was fitted to enclose, where it is extrapolated.",
-    "line": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
-    "over the operating parameter (line, ending where the cycle does), and of the records "
-    "(circles); crosses at zero amplitude: points that do not oscillate; diamonds: records of "
-    "another cycle, not fitted here. Red: the law says otherwise than the record. Faded: beyond "
-    "the points that the law was fitted to, where it is extrapolated.",
+    "over the operating parameters, none where it does not oscillate, and of the records (circles); "
+    "crosses: points that do not oscillate; diamonds: records of another cycle, not fitted here. "
+    "Red: the law says otherwise than the record. Black line on a map: where the law's cycle ends; "
+    "dashed: where its fixed point turns stable. Faded: beyond what the points that the law was "
+    "fitted to enclose, where it is extrapolated.",
 }
 
 
@@ -286,33 +281,18 @@ def _coefficients(found: FoundLaw) -> pd.DataFrame:
 
 
 def _add_left_out(report: Report, found: FoundLaw) -> None:
-    clock, relative = found.runs[0].run.rollout.clock, percent(2, sign=True)
-
-    def f_kHz(left_out: LeftOutRun) -> float:
-        return 1e-3 * left_out.record.cycle.frequency_Hz
-
     metrics: list[Metric[LeftOutRun]] = [
         *map(_parameter, found.records[0].parameters),
         Metric(
             "enclosed", lambda p: p.inside, View.SHOWN, format=lambda own: "yes" if own else "no"
         ),
-        Metric("f_kHz", f_kHz, View.SHOWN, "f", lambda f: clock.frequency_text(1e3 * f)),
-        Metric("f_model_kHz", lambda p: f_kHz(p) * (1.0 + p.run.f_error)),
-        Metric("f_error", lambda p: p.run.f_error, View.SHOWN, format=relative),
-        Metric(
-            "amplitude",
-            lambda p: p.run.amplitude_ratio,
-            View.SHOWN,
-            "amplitude {}",
-            lambda ratio: relative(ratio - 1.0),
-        ),
-        Metric("waveform", lambda p: p.run.waveform_error, View.SHOWN, "waveform {}", "{:.3f}"),
-        Metric("status", lambda p: str(p.run.status), View.SHOWN),
+        Metric("f_kHz", lambda p: 1e-3 * p.record.cycle.frequency_Hz),
+        *(metric.of(lambda p: p.run, view=View.SHOWN) for metric in EVALUATION),
     ]
     report.section("Points left out")
     report.table("left_out", ResultTable(found.runs, metrics), note=LEFT_OUT)
     left_out = report.tables["left_out"]
-    if left_out["f_model_kHz"].notna().any():
+    if left_out["f_error"].notna().any():
         report.figure("left_out", partial(left_out_figure, left_out), CAPTIONS["left_out"])
     if not found.statistics["n_lives"]:
         report.warn(
@@ -340,7 +320,7 @@ def _add_map(
         draw = partial(
             cycle_figure, table, points, branch=found.cycle, parameters=parameters, labels=labels
         )
-        report.figure("map", draw, CAPTIONS["map" if len(parameters) == 2 else "line"])
+        report.figure("map", draw, CAPTIONS["map"])
     elif found.map:
         report.add("Nowhere on the map does the law's model oscillate.")
     text = f"Oscillating or not, the law is right at {(says == does).sum()} of {len(does)} points"
