@@ -175,7 +175,7 @@ def test_a_map_on_which_nothing_oscillates_is_no_figure(
 
 def test_without_a_model_the_terms_are_searched_for(tmp_path: Path) -> None:
     records = own_records(tmp_path, 0.6, 0.9, 1.2)
-    found = programs.computed(composed(*records, "models=null", "degree=3", "map_points=1"))
+    found = programs.computed(composed(*records, "models=null", "+degree=3", "map_points=1"))
     names = [trial["fit"] for trial in found.summary["trials"]]
     assert names == ["found_1", "found_1_refined", "found_2", "found_2_refined"]
     terms = found.summary["models"]["point_0_law"]["equations"]

@@ -312,8 +312,8 @@ def trends_figure(
     estimates: a column per parameter, then kind, quantity, value, low, high; a column of panels per
     quantity, in several blocks if they are many. The first kind is drawn filled, the others open.
     laws: by quantity, of the first kind, drawn as lines between its points. trends: one row of
-    panels each, (parameter, values of the others). labels: names of parameters, quantities and
-    kinds on axes and in the legend; by default their own.
+    panels each, (parameter, values of the others). labels: names of parameters and quantities on
+    axes; by default their own.
     """
     marks: dict[str, dict[str, Any]] = {
         kind: {"color": colour, "marker": marker, "ms": 5, "mfc": "none" if k else colour}
@@ -334,7 +334,7 @@ def trends_figure(
             if at and ax.get_subplotspec().is_first_col():
                 ax.set_ylabel(f"at {style.held_label(at, labels)}".replace(", ", ",\n"))
     entries = [
-        Line2D([], [], ls="none", label=labels.get(kind, kind), **mark)
+        Line2D([], [], ls="none", label=kind, **mark)
         for kind, mark in marks.items()
     ]
     if laws:

@@ -63,7 +63,7 @@ CAPTIONS = {
     "state, those beyond the panel filled on its edge; band and line are the bounds of a "
     "model that lives.",
     "map": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
-    "over the operating parameters, none where it does not oscillate, and of the records (circles); "
+    "over the operating parameters, none where it rests, and of the records (circles); "
     "crosses: points that do not oscillate; diamonds: records of another cycle, not fitted here. "
     "Red: the law says otherwise than the record. Black line on a map: where the law's cycle ends; "
     "dashed: where its fixed point turns stable. Faded: beyond what the points that the law was "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -354,23 +355,18 @@ def embed_points(opened: Sequence[OpenedPoint]) -> tuple[list[OpenedPoint], Embe
 
     A record that does not oscillate for long enough has no part in it; its status says so.
     """
-    traces, quiet = {}, {}
+    traces, made = {}, list(opened)
     for k, point in enumerate(opened):
         if point.run is not None:
-            try:
+            made[k] = replace(point, run=None, status=Oscillation.NO_PERIOD)
+            with suppress(ValueError):
                 traces[k] = prepare_signal(point.run)
-            except ValueError as error:
-                quiet[k] = replace(
-                    point, run=None, status=Oscillation.NO_PERIOD, notes=[*point.notes, str(error)]
-                )
     if not traces:
         raise ValueError("no signal oscillates for six periods: record for longer")
-    states = dict(zip(traces, embed(list(traces.values())), strict=True))
-    made = [
-        replace(point, run=states[k].run) if k in states else quiet.get(k, point)
-        for k, point in enumerate(opened)
-    ]
-    return made, next(iter(states.values()))
+    states = embed(list(traces.values()))
+    for k, own in zip(traces, states, strict=True):
+        made[k] = replace(opened[k], run=own.run)
+    return made, states[0]
 
 
 def records_of(
