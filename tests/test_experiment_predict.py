@@ -144,7 +144,6 @@ def test_points_that_are_quiet_have_no_law(tmp_path: Path) -> None:
 def test_own_records_make_a_law_of_the_model_that_is_chosen_and_its_line(tmp_path: Path) -> None:
     held = "+models.held={terms: {n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}, known: {n_n: {n_i: {1: 1}}}}"
     found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2), held))
-    assert found.log.count("<- chosen") == 1
     table = found.report.tables["trials"]
     assert table["fit"][table["chosen"]].item().startswith("held")
     assert table["fit"].tolist() == ["own", "own_refined", "held", "held_refined"]
@@ -154,7 +153,7 @@ def test_own_records_make_a_law_of_the_model_that_is_chosen_and_its_line(tmp_pat
     assert set(found.report.figures) == {"laws", "left_out", "map"}
     found.check_figures(*found.report.figures)
     log = " ".join(found.log.split())
-    assert "Found: a law over a, of which 3 of 3 points left out live, by held" in log
+    assert re.search("Found: a law of held.* over a, by which 3 of 3 points left out live", log)
     assert re.search(r"\d mHz", log)
 
 

@@ -219,10 +219,11 @@ def add_law(
     report.samples("law_coefficients", alone)
     draw = partial(laws_figure, alone, law, parameters=parameters, labels=labels)
     report.figure("laws", draw, CAPTIONS["laws"])
-    shown, head = [Text(found.text)], f"Found: a law over {', '.join(law.parameters)}"
+    shown = [Text(found.text)]
+    head = f"Found: a law of {choice.name} over {', '.join(law.parameters)}"
     if found.runs:
         head += (
-            f", of which {found.statistics['n_lives']} of {len(found.runs)} points left out live"
+            f", by which {found.statistics['n_lives']} of {len(found.runs)} points left out live"
         )
         _add_left_out(report, found)
         shown.append(Text(_add_map(report, found, points, labels)))
@@ -232,7 +233,7 @@ def add_law(
     middle = found.records[most_central(choice.fits.points)]
     model = read_law(law, middle.parameters)
     return Result(
-        f"{head}, by {choice.name}",
+        head,
         [*equations(model, lead=f"at {middle.label}"), *shown],
         load='ep.operating.OperatingLaw.load("{}/law.json")',
         picture=next(name for name in ("map", "left_out", "laws") if name in report.figures),
@@ -283,9 +284,7 @@ def _coefficients(found: FoundLaw) -> pd.DataFrame:
 def _add_left_out(report: Report, found: FoundLaw) -> None:
     metrics: list[Metric[LeftOutRun]] = [
         *map(_parameter, found.records[0].parameters),
-        Metric(
-            "enclosed", lambda p: p.inside, View.SHOWN, format=lambda own: "yes" if own else "no"
-        ),
+        Metric("enclosed", lambda p: p.inside, View.SHOWN),
         Metric("f_kHz", lambda p: 1e-3 * p.record.cycle.frequency_Hz),
         *(metric.of(lambda p: p.run, view=View.SHOWN) for metric in EVALUATION),
     ]
@@ -338,9 +337,6 @@ def _metrics(found: FoundLaw) -> list[Metric[LawTrial]]:
     def nine_in_ten(trial: LawTrial) -> float:
         return float(np.quantile(trial.errors, 0.9))
 
-    def chosen(trial: LawTrial) -> bool:
-        return trial is found.choice
-
     return [
         Metric("fit", lambda trial: trial.name, View.SHOWN),
         Metric("terms", terms),
@@ -348,5 +344,5 @@ def _metrics(found: FoundLaw) -> list[Metric[LawTrial]]:
         Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
         Metric("error", lambda trial: found.errors[trial.name], View.SHOWN, format="{:.3g}"),
         Metric("nine_in_ten", nine_in_ten, View.SHOWN, format="{:.3g}"),
-        Metric("chosen", chosen, View.SHOWN, format=lambda own: "<- chosen" * own),
+        Metric("chosen", lambda trial: trial is found.choice, View.SHOWN),
     ]
