@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.living import balance_figure
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
-from ep2sindy.library.relations import Constraint, Process, constraint
-from ep2sindy.library.roles import constraint_of, process_amounts
+from ep2sindy.library.relations import Constraint, constraint
+from ep2sindy.library.roles import constraint_of
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures

@@ -205,6 +205,13 @@ def run_words(run: Evaluation) -> str:
     return "; ".join(found) or run.text
 
 
+def _rest(run: Evaluation) -> dict[str, float] | None:
+    """Where the model rests inside its cycle, by state; None if it does not."""
+    if run.rest is None:
+        return None
+    return dict(zip(run.model.states, run.rest.state.tolist(), strict=True))
+
+
 COMPARED = View.FILES | View.HEADLINE
 # How a model runs beside a record: of every model, in every study.
 EVALUATION: Metrics[Evaluation] = [
@@ -223,7 +230,7 @@ CYCLE: Metrics[Evaluation] = [
     Metric("stability", lambda run: run.cycle and run.cycle.stability),
     Metric("multiplier", lambda run: run.multiplier, COMPARED),
     Metric("share_reaching", lambda run: run.share_reaching, COMPARED),
-    Metric("rest", lambda run: _rest(run)),
+    Metric("rest", _rest),
     Metric("rest_growth_per_s", lambda run: run.rest and run.rest.growth_per_s),
     Metric("rest_frequency_Hz", lambda run: run.rest and run.rest.frequency_Hz),
 ]
@@ -232,10 +239,3 @@ EVALUATED = (
     "standard deviations. nrmse: RMS error of the trajectory, in standard deviations; 1 is no "
     "better than a constant. Periods in phase: until it is a quarter of a period off."
 )
-
-
-def _rest(run: Evaluation) -> dict[str, float] | None:
-    """Where the model rests inside its cycle, by state; None if it does not."""
-    if run.rest is None:
-        return None
-    return dict(zip(run.model.states, run.rest.state.tolist(), strict=True))
