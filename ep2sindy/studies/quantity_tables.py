@@ -91,7 +91,8 @@ def add_quantities(
     for key in ("loo_error", "search_error"):  # also of laws that are not found
         report.headline |= {f"{name}/{key}": np.nan for name in names}
     rows = {f"{fit}/{name}": (fit, name, law) for (fit, name), law in laws.items()}
-    report.table("control_laws", ResultTable(rows, CONTROL_LAW), note=CONTROL)
+    bold = [k for k, (fit, _) in enumerate(laws) if fit == best]
+    report.table("control_laws", ResultTable(rows, CONTROL_LAW), note=CONTROL, bold=bold)
     lines = lines_of([result.parameters for result in results if result.fits] or [{}])
     report.section("Trends")
     _add_figures(report, estimates, laws, published, lines, errors, labels)
@@ -101,12 +102,8 @@ def add_quantities(
     units = next((each.model.units for r in results for each in r.fits.values()), {})
     for fit, own in estimates.groupby("fit", sort=False):
         headings = {n: _heading(n, q.unit(library, units)) for n, q in fits[str(fit)].items()}
-        report.add(
-            Table(
-                _by_point(own, rows_at(report.tables["fits"], {"fit": fit}), headings),
-                title=str(fit),
-            )
-        )
+        scores = rows_at(report.tables["fits"], {"fit": fit})
+        report.add(Table(_by_point(own, scores, headings), title=str(fit)))
     shown = [
         _equation(name, law, fits[fit][name].unit(library, units), percent(2)(law.search_error))
         for (fit, name), law in laws.items()
