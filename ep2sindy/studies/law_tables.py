@@ -111,14 +111,11 @@ class FoundLaw:
         )
         if not self.runs:
             return f"{windows}."
-        most = f"nine in ten within {text(found['f_90'])}"
-        if not np.isfinite(found["f_90"]):
-            most = "more than one in ten do not oscillate"
         return (
             f"{windows}, and run freely {found['n_lives']} of {found['n']} points live, diverging: "
-            f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} "
-            f"({most}), the worst state's amplitude {text(found['amplitude_median'])} and waveform "
-            f"{places(found['waveform_median'], 3)}."
+            f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} (nine "
+            f"in ten within {text(found['f_90'])}), the worst state's amplitude "
+            f"{text(found['amplitude_median'])} and waveform {places(found['waveform_median'], 3)}."
         )
 
 
