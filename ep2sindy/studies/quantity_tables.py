@@ -80,16 +80,21 @@ def add_quantities(
     suffice for laws. published: see `read_published`. labels: of parameters and quantities on axes.
     Returns the control laws of the fit that does best at points left out.
     """
-    fits = {name + end: own.quantities for name, own in models.items() for end in ("", REFINED)}
+    known = next((each.model.units for r in results for each in r.fits.values()), None)
+    units = {
+        (model + end, name): quantity.unit(library, known) if known else ""
+        for model, given in models.items()
+        for end in ("", REFINED)
+        for name, quantity in given.quantities.items()
+    }
     estimates = estimates_of(results, published)
     laws = control_laws(estimates, list(results[0].parameters))
     best = min((fit for fit, _ in laws), key=lambda fit: errors.get(fit, np.inf), default="")
     report.summary["best_fit"] = best or None
     missing = f"a law needs {LEAST_POINTS} points, and all parameters to vary over them"
     report.section("Control laws", *([] if laws else [f"None: {missing}."]))
-    names = [f"{fit}/{name}" for fit, own in fits.items() for name in own]
     for key in ("loo_error", "search_error"):  # also of laws that are not found
-        report.headline |= {f"{name}/{key}": np.nan for name in names}
+        report.headline |= {f"{fit}/{name}/{key}": np.nan for fit, name in units}
     rows = {f"{fit}/{name}": (fit, name, law) for (fit, name), law in laws.items()}
     bold = [k for k, (fit, _) in enumerate(laws) if fit == best]
     report.table("control_laws", ResultTable(rows, CONTROL_LAW), note=CONTROL, bold=bold)
@@ -97,15 +102,9 @@ def add_quantities(
     report.section("Trends")
     _add_figures(report, estimates, laws, published, lines, errors, labels)
     report.table("trends", trends(estimates, published, lines), note=TRENDS)
-    report.section("Quantities", INTERVALS)
-    report.table("quantities", estimates, shown=False)
-    units = next((each.model.units for r in results for each in r.fits.values()), {})
-    for fit, own in estimates.groupby("fit", sort=False):
-        headings = {n: _heading(n, q.unit(library, units)) for n, q in fits[str(fit)].items()}
-        scores = rows_at(report.tables["fits"], {"fit": fit})
-        report.add(Table(_by_point(own, scores, headings), title=str(fit)))
+    _add_values(report, estimates, units)
     shown = [
-        _equation(name, law, fits[fit][name].unit(library, units), percent(2)(law.search_error))
+        _equation(name, law, units[fit, name], percent(2)(law.search_error))
         for (fit, name), law in laws.items()
         if fit == best
     ]
@@ -222,22 +221,27 @@ def _add_figures(
         )
 
 
-def _by_point(
-    estimates: pd.DataFrame, fits: pd.DataFrame, headings: Mapping[str, str]
-) -> pd.DataFrame:
-    """One row per point: quantities of a fit, its scores, and its status.
+def _add_values(
+    report: Report, estimates: pd.DataFrame, units: Mapping[tuple[str, str], str]
+) -> None:
+    """Add the quantities of every fit, one row per point, with the scores of the fit.
 
-    A quantity is `0.0241 ±0.0001 (0.025)`: value, half the interval's width, published value.
+    They are shown as `0.0241 ±0.0001 (0.025)`: value, half the interval's width, published value.
     """
-    reach = 0.5 * (estimates["high"] - estimates["low"])
-    cells = [
-        with_error(value, error) + ("" if np.isnan(thesis) else f" ({thesis:.3g})")
-        for value, error, thesis in zip(estimates["value"], reach, estimates["thesis"], strict=True)
-    ]
-    parameters = list(fits.columns[: fits.columns.get_loc("fit")])
-    table = estimates.assign(cell=cells, heading=estimates["quantity"].map(headings))
-    wide = table.set_index([*parameters, "heading"])["cell"].unstack(sort=False)
-    return wide.join(fits.drop(columns="fit").set_index(parameters)).reset_index()
+    report.section("Quantities", INTERVALS)
+    report.table("quantities", estimates, shown=False)
+    for fit, own in estimates.groupby("fit", sort=False):
+        scores = rows_at(report.tables["fits"], {"fit": fit}).drop(columns="fit")
+        point = list(scores.columns[: scores.columns.get_loc("status")])
+        reach = 0.5 * (own["high"] - own["low"])
+        cells = [
+            with_error(value, error) + ("" if np.isnan(thesis) else f" ({thesis:.3g})")
+            for value, error, thesis in zip(own["value"], reach, own["thesis"], strict=True)
+        ]
+        headings = [_heading(name, units[str(fit), name]) for name in own["quantity"]]
+        wide = own.assign(cell=cells, heading=headings).set_index([*point, "heading"])["cell"]
+        table = wide.unstack(sort=False).join(scores.set_index(point)).reset_index()
+        report.add(Table(table, title=str(fit)))
 
 
 def _equation(name: str, law: ControlLaw, unit: str = "", error: str = "") -> Equation:
