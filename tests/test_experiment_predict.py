@@ -169,7 +169,7 @@ def test_a_map_on_which_nothing_oscillates_is_no_figure(
     found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2)))
     assert set(found.report.figures) == {"laws", "left_out"}
     assert found.report.result.picture == "left_out"
-    assert "Nowhere on the map does the law's model oscillate." in found.page
+    assert "Nowhere on the map does the law's model oscillate." in found.log
 
 
 def test_without_a_model_the_terms_are_searched_for(tmp_path: Path) -> None:
