@@ -170,6 +170,13 @@ class Constraint:
         """Values of all coefficients from the values z of the free ones."""
         return self.C @ z + self.d
 
+    def equations(self, z: Float[np.ndarray, " free"]) -> dict[str, dict[str, float]]:
+        """The same by state and term."""
+        found: dict[str, dict[str, float]] = {state: {} for state in self.states}
+        for (state, term), value in zip(self.coefficients, self.coef(z).tolist(), strict=True):
+            found[state][term] = value
+        return found
+
 
 def constraint(
     library: Library,

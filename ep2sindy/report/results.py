@@ -68,9 +68,9 @@ class Metric(Generic[Record]):
 
     key: its name in files and headlines. value: function that takes it from a record; a mapping
     gives one value for each state (or other part), in CSV files in columns `<key>_<state>`.
-    heading: of its column on the screen, with `{}` for the state; the key by default. format: of
-    its cell, such as `{:.3f}` (a dash for a missing number), or a function of the value; three
-    digits by default.
+    heading: of its column on the screen, by default the key; `{}` in it stands for the state, and
+    for nothing in a table with a row for each state. format: of its cell, such as `{:.3f}` (a dash
+    for a missing number), or a function of the value; three digits by default.
     """
 
     key: str
@@ -97,7 +97,7 @@ class Metric(Generic[Record]):
         """The formatted value by heading: one cell, or one for each state."""
         heading = self.heading or self.key.replace("_", " ")
         if not isinstance(value, Mapping):
-            return {heading: self.cell(value)}
+            return {heading.replace("{}", "").strip(): self.cell(value)}
         return {heading.format(part): self.cell(each) for part, each in value.items()}
 
     def of(
@@ -142,7 +142,7 @@ class ResultTable(Generic[Record]):
         """A row of formatted cells per record.
 
         by_state: a row per record and state instead. The name, and metrics without states, are then
-        shown only in a record's first row.
+        shown only in a record's first row. Columns in which no cell has a value are left out.
         """
         rows: list[dict[str, object]] = []
         for name, record in self._named():
@@ -152,7 +152,9 @@ class ResultTable(Generic[Record]):
                 rows += _rows_of_states(first, values)
             else:
                 rows.append(first | self._cells(record))
-        return pd.DataFrame(rows)
+        table = pd.DataFrame(rows)
+        empty = [n for n in table if all(cell_text(cell) in ("", "-") for cell in table[n])]
+        return table.drop(columns=empty)
 
     def upright(self, heading: str = "quantity") -> pd.DataFrame:
         """A row per metric, and a column of formatted cells per record."""

@@ -1,172 +1,452 @@
-"""Fits of known terms to the first part of a record, all tested alike on the rest.
+"""Fits of known structures, side by side: `+exp=weak`, `constrained`, `ils` and `theories`.
 
-Shared by the experiments that fit known terms: the config entry for terms, the fits, and their
-tables and figures.
+A config names structures, and the ways in which their coefficients are found. Every model is then
+run freely over the same part of a record.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
-from operator import add
+from functools import cached_property, partial
+from itertools import count, product
 from time import process_time
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.library import Library, named_terms
+from ep2sindy.data.trajectory import Trajectory, point_label
+from ep2sindy.figures.windows import loss_against_window_figure
+from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
-from ep2sindy.library.terms import variables_of
-from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.comparison import Verdict
+from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.windows import dominant_window
+from ep2sindy.model.scores import r2
+from ep2sindy.refinement.windows import MIN_SAMPLES, dominant_window
 from ep2sindy.regression.constrained import constrained_fit
-from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Block, Captioned, Result, Section, Table, Text, pictures
-from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
+from ep2sindy.regression.formulations import Weak
+from ep2sindy.regression.rows import Formulation, RegressionRows
+from ep2sindy.regression.windows import Boxes
+from ep2sindy.report.document import Text
+from ep2sindy.report.models import equations, interval_table
+from ep2sindy.report.report import Report
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
+from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.forecasts import LEAST_SAMPLES, is_short
-from ep2sindy.studies.source import data_summary
-from ep2sindy.studies.study import Check
-from ep2sindy.studies.views import (
-    MARKS,
-    MODEL,
-    PlotRange,
-    best_run,
-    coefficients,
-    equation_sections,
-    found_model,
-    frequency_words,
-    intervals,
-    rollout_tables,
-    run_figures,
-    trajectories,
+from ep2sindy.studies.balance import compared_processes
+from ep2sindy.studies.point_sources import Points, given_points
+from ep2sindy.studies.source import NO_ZONES, Source, Zones, zones_of
+from ep2sindy.studies.structures import Structure, Structures, balance_model, split_in_time
+from ep2sindy.studies.study import (
+    Check,
+    Count,
+    CountOrNone,
+    Positive,
+    PositiveOrAll,
+    ShareOrNone,
 )
+from ep2sindy.studies.views import PlotRange, add_figures, add_samples, best_run, found_model
 
-Terms = Mapping[str, Sequence[int | str]]  # by state; the constant term 1 may be a number
-Relations = Annotated[
-    Sequence[str],
-    Check(
-        "a list of relations, such as ['x: x*y == -1 * y: x*y']",
-        lambda value: isinstance(value, list) and bool(value),
-    ),
-]
+if TYPE_CHECKING:
+    from ep2sindy.refinement.problem import Iteration, RefinementSettings
+    from ep2sindy.refinement.refine import Refinement
+
+BALANCE = "balance"  # the form of a fit of every process to the recorded balance
 DIVERGED = 10.0  # residual, in std, at samples that a run diverges before
-TITLE = "integrated over held-out time from its first sample (nrmse 1: no better than a constant)"
+STARTED = "started"
 INTERVALS = (
-    "The intervals say how far the windows' residuals move the coefficients; starts are fitted "
-    "with them."
+    "The intervals say how far noise, or the residuals of windows, move the coefficients if these "
+    "terms are the whole law; what the terms lack, they do not count."
 )
-CAPTIONS = {
-    "trajectories": "Models integrated over held-out time from its first sample (colour) over the "
-    f"data (grey). {MARKS}",
-    "trajectories_started": "The same from a start fitted to the first one and a half periods.",
-}
 NOTE = (
-    "Data, held out: {}. Amplitude: standard deviation against the data's. Start fitted: frequency "
-    "error and nrmse from a start fitted to the first one and a half periods."
+    "Amplitude: standard deviation against the data's. Start fitted: frequency error and nrmse from "
+    "a start fitted to the first one and a half periods, since a single sample may lie off every "
+    "orbit of the model. R2: of the derivative, on a fit's own rows, which windows average."
 )
-SINCE = "time since start of held-out part"
-FIGURES = ("phase", "spectra")
-COMPARED = ("f_error", "nrmse", "amplitude_ratio")
+CAPTION = (
+    "Refinement with windows of several lengths: loss on the fitted part, where each window has a "
+    "start of its own; frequency error and nrmse of the run, from its first sample (full) "
+    "and from a fitted start (dashed). The dotted line marks one period, the grey one 1 %."
+)
+FIGURES = ("trajectories", "phase", "spectra")
+
+Whole = Annotated[int, Check("a whole number, zero or more", lambda x: type(x) is int and x >= 0)]
 
 
-def terms_of(
-    given: Terms, *, states: Sequence[str], key: str = "model"
-) -> tuple[Library, dict[str, list[str]]]:
-    """The terms of every state, and a library that holds each of them once.
+@dataclass(frozen=True)
+class Fit:
+    """A way of finding coefficients.
 
-    key: the config's key for this model, for error messages.
+    form: of the regression, one of those that the config names; None means the formulation;
+    "balance" fits every process to the rate that a simulation records. relations: whether those of
+    a structure hold. refine: whether trajectories are followed then. n_points, n_windows: of random
+    windows, for a form that has them; every combination is a fit of its own.
     """
-    if set(given) != set(states) or not all(given.values()):
-        came = {state: list(names) for state, names in given.items()}
-        raise ValueError(
-            f"{key} must list the terms of every state of {list(states)}, such as "
-            f"{{x: [x, x*y]}}: {came} came"
-        )
-    terms = {state: [str(name) for name in given[state]] for state in states}
-    factors = [
-        variable for names in terms.values() for name in names for variable in variables_of(name)
-    ]
-    variables = list(dict.fromkeys([*states, *factors]))
-    named = reduce(add, (named_terms(variables, names) for names in terms.values()))
-    return named.take(np.argsort(named.degrees, kind="stable")), terms
+
+    form: str | None = None
+    relations: bool = True
+    refine: bool = False
+    n_points: Sequence[int] = ()
+    n_windows: Sequence[int] = ()
+
+
+def expand(
+    fits: Mapping[str, Fit], forms: Mapping[str, Formulation], usual: Formulation
+) -> dict[str, tuple[Fit, Formulation | None]]:
+    """Every fit with its form, one for each number and length of windows; None for the balance.
+
+    Raises ValueError for a form that is not named, or without random windows where such are asked.
+    """
+    found: dict[str, tuple[Fit, Formulation | None]] = {}
+    for name, fit in fits.items():
+        if fit.form not in (None, BALANCE, *forms):
+            raise ValueError(
+                f"fits.{name}.form must be null, {BALANCE} or one of {list(forms)}: got {fit.form!r}"
+            )
+        form = usual if fit.form is None else forms.get(fit.form)
+        if not fit.n_points:
+            found[name] = fit, form
+            continue
+        if not (isinstance(form, Weak) and isinstance(form.test_functions, Boxes)):
+            raise ValueError(
+                f"fits.{name}.n_points is for a form of random windows (Weak with Boxes): got {form}"
+            )
+        own = form.test_functions
+        for n_windows, n_points in product(fit.n_windows or [own.n_windows], fit.n_points):
+            boxes = replace(own, n_points=n_points, n_windows=n_windows)
+            several = f"_{n_windows}" if len(fit.n_windows) > 1 else ""
+            found[f"{name}{several}_{n_points}"] = fit, replace(form, test_functions=boxes)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
-    """A fit and its performance on the held-out part.
+class Record:
+    """A record to fit: at a point, if there are several; its parts; and what its zones tell."""
 
-    from_sample: the run started at the first sample. from_fit: the run started at an initial state
-    fitted to the first samples, because a single sample may lie off every orbit of the model.
-    cpu_s: time of the fit, without the time of the model that it starts from. status, loss: those
-    of a refinement; None and NaN for least squares.
+    label: str
+    data: Trajectory
+    train: Trajectory
+    held: Trajectory
+    zones: Zones = NO_ZONES
+
+    @cached_property
+    def period_s(self) -> float:
+        return 1.0 / dominant_frequency(self.train.t, self.train.states[:, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A model of one structure, fitted in one way, and its free runs over the same samples.
+
+    from_sample: from the first sample. from_fit: from a start fitted to the first samples. cpu_s:
+    of the fit, without that of the model which it starts from. r2: of the derivative, by state, on
+    the rows of the fit. refinement: how trajectories were followed, if they were. wrong: the terms
+    whose sign contradicts the recorded balance.
     """
 
     model: SparseModel
+    held_to: Constraint | None
     from_sample: FreeRun
     from_fit: FreeRun
     cpu_s: float
-    status: str | None = None
-    loss: float = float("nan")
+    r2: Mapping[str, float]
+    refinement: Refinement | None = None
+    wrong: Sequence[str] = ()
+
+    @property
+    def n_free(self) -> int:
+        return 0 if self.held_to is None else len(self.held_to.free)
 
 
-def n_before(run: Trajectory, held_out: float) -> int:
-    """Number of samples before the last `held_out` share of a record."""
-    return round(run.n_samples * (1.0 - held_out))
+@dataclass(frozen=True)
+class Study:
+    """Fit structures of models in several ways, run every model freely, and compare them.
 
-
-def split_in_time(run: Trajectory, held_out: float) -> tuple[Trajectory, Trajectory]:
-    """The first part of a record, and the last `held_out` share of its samples.
-
-    Raises ValueError if either part would have fewer than LEAST_SAMPLES samples.
+    models: structures by name. fits: the ways of fitting, by name. forms: forms of the regression
+    besides the formulation, by name. held_out: share at the end of the record over which models
+    run; None fits and runs over all of it. rollout_s: longest run; None means to the end.
+    n_windows, periods: number and length of the windows of refinements; window: the same in
+    samples, in place of periods. windows: lengths for loss against window length. n_draws: number
+    of draws of windows, for the spread of the refinements.
+    points: operating points, at each of which all is fitted; None for one record. parameters: their
+    places in the data group. thesis: published coefficients, shown beside ours.
     """
-    n_train = n_before(run, held_out)
-    if is_short(run, n_train):
-        raise ValueError(
-            f"held_out={held_out} must leave {LEAST_SAMPLES} samples on either side: the data have "
-            f"{run.n_samples}"
+
+    source: Source
+    formulation: Formulation
+    models: Structures
+    fits: Mapping[str, Fit]
+    figures: PlotRange
+    forms: Mapping[str, Formulation] = field(default_factory=dict)
+    held_out: ShareOrNone = None
+    rollout_s: PositiveOrAll = None
+    n_windows: Count = 30
+    periods: Positive = 2.0
+    window: CountOrNone = None
+    windows: Sequence[int] = ()
+    n_draws: Whole = 0
+    points: Points | None = None
+    parameters: Mapping[str, str | None] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _ = self._ways
+        for name, structure in self.models.items():
+            structure.library(name, self.source.states)
+            if unknown := {*(structure.fits or ())} - {*self.fits}:
+                raise ValueError(
+                    f"models.{name}.fits must name some of {list(self.fits)}: got {sorted(unknown)}"
+                )
+
+    @cached_property
+    def _ways(self) -> dict[str, tuple[Fit, Formulation | None]]:
+        return expand(self.fits, self.forms, self.formulation)
+
+    def run(self, report: Report) -> None:
+        libraries = {n: s.library(n, self.source.states) for n, s in self.models.items()}
+        found = [
+            (record, dict(self._fit_all(record, libraries, report)))
+            for record in self._records(libraries, report)
+        ]
+        if self.points is None:
+            self._add_one(*found[0], libraries, report)
+        else:
+            add_points({record.label: fits for record, fits in found}, self.models, report)
+
+    def _records(self, libraries: Mapping[str, Library], report: Report) -> Iterator[Record]:
+        """The record, or one at every operating point."""
+        if self.points is None:
+            field, data = self.source.opened(libraries.values(), report)
+            yield self._parted("", data, zones_of(self.source, field, report))
+            return
+        given = given_points(self.points, self.parameters, self.source)
+        inputs = self.source.inputs(libraries.values())
+        for point in count_pieces(report.watch, given.sources(self.source), "operating point"):
+            field = point.source.field()
+            label = point_label(point.parameters)
+            data = point.source.trajectory.trajectory(field, inputs=inputs, label=label)
+            data = replace(data, parameters=point.parameters)
+            yield self._parted(label, data, zones_of(point.source, field, report))
+
+    def _parted(self, label: str, data: Trajectory, zones: Zones) -> Record:
+        parts = (data, data) if self.held_out is None else split_in_time(data, self.held_out)
+        record = Record(label, data, *parts, zones)
+        asked = {"window": [self.window or MIN_SAMPLES], "windows": self.windows}
+        for key, lengths in asked.items():
+            for length in lengths:
+                if not MIN_SAMPLES <= length <= record.train.n_samples:
+                    raise ValueError(
+                        f"{key} must hold {MIN_SAMPLES} samples or more and fit the first part of "
+                        f"the data, {record.train.n_samples} samples: got {length}"
+                    )
+        return record
+
+    def _fit_all(
+        self, record: Record, libraries: Mapping[str, Library], report: Report
+    ) -> Iterator[tuple[str, Fitted]]:
+        """Every structure in every way that it takes part in.
+
+        The fits of one structure have the same random numbers, so that they differ by the way
+        alone.
+        """
+        streams = np.random.default_rng(report.seed).spawn(len(self.models))
+        seeds = {n: int(each.integers(2**63)) for n, each in zip(self.models, streams, strict=True)}
+        pieces = [
+            (name, way)
+            for (name, structure), way in product(self.models.items(), self._ways)
+            if structure.fits is None or self._is_of(way, structure.fits)
+        ]
+        for name, way in count_pieces(report.watch, pieces, "fit", record.label):
+            structure, title = self.models[name], name_of(name, way, self.models)
+            one = OneFit(self, structure, libraries[name], *self._ways[way], seeds[name])
+            yield title, one.fitted(record, report, title)
+
+    def _is_of(self, way: str, fits: Sequence[str]) -> bool:
+        return any(self._ways[way][0] is self.fits[name] for name in fits)
+
+    def settings(self, constraint: Constraint) -> RefinementSettings:
+        from ep2sindy.refinement.problem import RefinementSettings  # PyTorch takes seconds to load
+
+        periods = self.periods if self.window is None else None
+        return RefinementSettings(self.n_windows, self.window, periods, constraint=constraint)
+
+    def evaluate(self, model: SparseModel, record: Record) -> tuple[FreeRun, FreeRun]:
+        """Free runs over the held-out part, from its first sample and from a fitted start."""
+        held = record.held
+        n = held.n_samples if self.rollout_s is None else samples_in(held, self.rollout_s)
+        run = partial(free_run, model, held, n_samples=n)
+        return run(), run(initial=fitted_start(model, held))
+
+    def _add_one(
+        self,
+        record: Record,
+        fits: Mapping[str, Fitted],
+        libraries: Mapping[str, Library],
+        report: Report,
+    ) -> None:
+        """Everything on the fits of one record."""
+        held, clock = record.held, record.held.clock
+        report.summary["data"]["n_held_out"] = held.n_samples if self.held_out else 0
+        f_Hz = dominant_frequency(held.t, held.states[:, 0])
+        where = "held-out time" if self.held_out else "the record"
+        report.section(f"Run freely over {where}")
+        report.table(
+            "fits",
+            ResultTable(fits, METHOD),
+            heading="fit",
+            title="from the first sample (nrmse 1: no better than a constant)",
+            note=f"The data have {clock.frequency_text(f_Hz)}. {NOTE}",
         )
-    return run.window(0, n_train), run.window(n_train, run.n_samples)
+        runs = {name: each.from_sample for name, each in fits.items()}
+        add_figures(report, FIGURES, held, runs, self.figures)
+        add_samples(report, held, runs)
+        started = {name: each.from_fit for name, each in fits.items()}
+        add_figures(report, ["trajectories"], held, started, self.figures, suffix=STARTED)
+        report.section("Equations", *(f"relation: {text}" for text in self._relations))
+        if any(each.model.covariance is not None for each in fits.values()):
+            report.add(Text(INTERVALS, page_only=True))
+        for name, each in fits.items():
+            report.section(name, *equations(each.model, clock), level=3)
+            report.add(*interval_table(each.model, clock, page_only=True))
+            report.model(name, each.model, shown=False)
+        self._add_windows(record, libraries, report)
+        best = best_run(runs)
+        report.found(
+            found_model(
+                f"Found by the fit {best}", runs[best], file=best, picture="trajectories",
+                more=[Text(f"the best of {len(fits)} fits")], where=where, seen=not self.held_out,
+            )
+        )  # fmt: skip
+
+    @property
+    def _relations(self) -> list[str]:
+        return list(dict.fromkeys(t for each in self.models.values() for t in each.relations))
+
+    def _add_windows(
+        self, record: Record, libraries: Mapping[str, Library], report: Report
+    ) -> None:
+        """Loss against the length of windows, and how far results depend on their draw."""
+        refined = {w: way for w, way in self._ways.items() if way[0].refine}
+        pairs = list(product(self.models.items(), refined.items()))
+        ones = {
+            name_of(name, way, self.models): OneFit(self, structure, libraries[name], *how, 0)
+            for (name, structure), (way, how) in pairs
+            if structure.fits is None or self._is_of(way, structure.fits)
+        }
+        if self.windows and ones:
+            rows = [
+                {"fit": name, "window": length, **one.with_window(record, length, report)}
+                for name, one in ones.items()
+                for length in count_pieces(report.watch, self.windows, "window length", name)
+            ]
+            table = pd.DataFrame(rows)
+            period = record.period_s / record.train.dt_s
+            table.insert(2, "periods", (table["window"] - 1) / period)
+            report.section("Loss against window length")
+            report.table("loss_against_window", table, shown=False)
+            draw = partial(loss_against_window_figure, table, period=period)
+            report.figure("loss_against_window", draw, CAPTION)
+        if self.n_draws and ones:
+            draws = {
+                name: [
+                    one.with_seed(record, seed, report)
+                    for seed in count_pieces(report.watch, range(self.n_draws), "draw", name)
+                ]
+                for name, one in ones.items()
+            }
+            report.section(f"Over {self.n_draws} draws of windows")
+            report.table(
+                "spread",
+                ResultTable(draws, SPREAD),
+                heading="fit",
+                title="lowest and highest, from the first sample",
+                note="Amplitude and waveform are those of the state that is farthest off.",
+            )
 
 
-def fit_and_evaluate(
-    train: Trajectory,
-    held: Trajectory,
-    library: Library,
-    constraint: Constraint,
-    formulation: Formulation,
-    *,
-    rng: np.random.Generator,
-) -> Evaluation:
-    """Fit by least squares under the constraint, in one form of the regression.
+@dataclass(frozen=True, eq=False)
+class OneFit:
+    """One structure fitted in one way."""
 
-    There is no covariance: smoothed rows and overlapping windows are not independent, and intervals
-    that assume independence would be too narrow.
-    """
-    begun = process_time()
-    model = constrained_fit(
-        formulation.assemble([train], library, rng=rng),
-        constraint,
-        units=train.units,
-        provenance={"formulation": repr(formulation), "trajectories": train.label},
-    )
-    cpu_s = process_time() - begun
-    model = replace(model, covariance=None)
-    return Evaluation(model, *runs_of(model, held), cpu_s)
+    study: Study
+    structure: Structure
+    library: Library
+    fit: Fit
+    form: Formulation | None
+    seed: int
+
+    def fitted(self, record: Record, report: Report, title: str) -> Fitted:
+        begun = process_time()
+        model, held_to, scores = self._start(record)
+        refinement = None
+        if self.fit.refine and held_to is not None:
+            begun = process_time()
+            refinement = self._refine(
+                model, held_to, record, callback=watcher(report.board.scalars, title, held_to),
+                progress=report.watch,
+            )  # fmt: skip
+            model, scores = refinement.model, {}
+        cpu_s = process_time() - begun
+        runs = self.study.evaluate(model, record)
+        wrong = wrong_signs(model, held_to, record)
+        return Fitted(model, held_to, *runs, cpu_s, scores, refinement, wrong)
+
+    def _start(self, record: Record) -> tuple[SparseModel, Constraint | None, Mapping[str, float]]:
+        """The model by least squares, or as it is given, with R2 by state."""
+        train = record.train
+        if self.structure.coefficients:
+            return self.structure.given(self.library, train), None, {}
+        held_to = self.structure.constraint(
+            self.library, record.data, record.zones, relations=self.fit.relations
+        )
+        if self.form is None:
+            model, _ = balance_model(self.library, held_to, record.data, record.zones)
+            return model, held_to, {}
+        rows = self.form.assemble([train], self.library, rng=np.random.default_rng(self.seed))
+        words = {"formulation": repr(self.form), "trajectories": train.label}
+        model = constrained_fit(rows, held_to, units=train.units, provenance=words)
+        # Smoothed rows and overlapping windows are not independent: their intervals would be too
+        # narrow. Rows that know the noise of their samples are.
+        if any(problem.noisy is None for problem in rows):
+            model = replace(model, covariance=None)
+        return model, held_to, rows_r2(model, rows)
+
+    def _refine(
+        self, model: SparseModel, held_to: Constraint, record: Record, **how: Any
+    ) -> Refinement:
+        from ep2sindy.refinement.refine import refine  # PyTorch takes seconds to load
+
+        how = {"seed": 0} | how
+        return refine(model, [record.train], self.study.settings(held_to), **how)
+
+    def with_window(self, record: Record, window: int, report: Report) -> dict[str, Any]:
+        """The refinement with windows of this length, and how its model runs."""
+        model, held_to, _ = self._start(record)
+        assert held_to is not None
+        study = replace(self.study, window=window)
+        found = replace(self, study=study)._refine(model, held_to, record, progress=report.watch)
+        row = {"loss": found.loss, "status": str(found.status), "text": found.model.text()}
+        for run, suffix in zip(study.evaluate(found.model, record), ("", "_started"), strict=True):
+            row |= {f"f_error{suffix}": run.f_error, f"nrmse{suffix}": run.nrmse}
+        return row
+
+    def with_seed(self, record: Record, seed: int, report: Report) -> FreeRun:
+        """The run of the model of another draw of windows."""
+        model, held_to, _ = self._start(record)
+        assert held_to is not None
+        found = self._refine(model, held_to, record, seed=seed, progress=report.watch)
+        return self.study.evaluate(found.model, record)[0]
 
 
-def runs_of(model: SparseModel, held: Trajectory) -> tuple[FreeRun, FreeRun]:
-    """Free runs over the held-out part, from its first sample and from a fitted start."""
-    return free_run(model, held), free_run(model, held, initial=_fitted_start(model, held))
+def name_of(structure: str, way: str, models: Mapping[str, Structure]) -> str:
+    """What a fit is called: by its way, and by its structure if there are several."""
+    return way if len(models) == 1 else f"{structure}_{way}"
 
 
-def _fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_states"]:
+def fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_states"]:
     """Initial state whose trajectory is closest to the first one and a half periods of data.
 
     Distances are in standard deviations of the data. The search starts from the first sample.
@@ -184,158 +464,160 @@ def _fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_
     return least_squares(residual, data[0] / std, diff_step=1e-4).x * std
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Fits of known terms, each run freely over the same samples.
-
-    data: these samples. seen: whether they were fitted. runs: by name of the fit. labels: readable
-    names. kind: what a fit is called, such as `method`. fits: one row per fit and state. shown: the
-    same for reading. about: blocks before the equations. drawn: figures, of which the first shows
-    what was found. findings: the summary. numbers: the headline. of_best: what is said of the fit
-    that runs best, by name. more_tables, more_sections: what the study itself adds.
-    """
-
-    data: Trajectory
-    seen: bool
-    runs: Mapping[str, FreeRun]
-    labels: Mapping[str, str]
-    kind: str
-    fits: pd.DataFrame
-    shown: Table
-    about: Sequence[Block]
-    drawn: Mapping[str, Captioned]
-    findings: dict[str, Any]
-    numbers: Mapping[str, float]
-    of_best: Mapping[str, str] = field(default_factory=dict)
-    more_tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    more_sections: Sequence[Section] = ()
-
-    def models(self) -> dict[str, SparseModel]:
-        return {name: run.model for name, run in self.runs.items()}
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        return {
-            **rollout_tables(self.data, self.runs),
-            f"{self.kind}s": self.fits,
-            "coefficients": coefficients(self.models(), heading=self.kind),
-            **self.more_tables,
-        }
-
-    def figures(self) -> Mapping[str, Captioned]:
-        return self.drawn
-
-    def in_short(self) -> Result:
-        """The model that runs best."""
-        best = best_run(self.runs)
-        return found_model(
-            f"Found by the {self.kind} {self.labels[best]}",
-            self.runs[best],
-            file=best,
-            picture=next(iter(self.drawn)),
-            more=[Text(f"{self.of_best.get(best, '')}the best of {len(self.runs)} {self.kind}s")],
-            where="the record" if self.seen else "held-out time",
-            seen=self.seen,
-        )
-
-    def sections(self) -> list[Section]:
-        models = {self.labels[name]: model for name, model in self.models().items()}
-        shown: list[Block] = [self.shown, *pictures(self.drawn)]
-        return [
-            Section("Equations", self.about),
-            *equation_sections(models, self.data.clock, page_only=not self.seen),
-            Section("Integrated" if self.seen else "Held-out time", shown),
-            *self.more_sections,
-        ]
-
-    def summary(self) -> dict[str, Any]:
-        return self.findings
-
-    def headline(self) -> Mapping[str, float]:
-        return self.numbers
+def rows_r2(model: SparseModel, problems: Sequence[RegressionRows]) -> dict[str, float]:
+    """R2 of the derivative by state, on the rows of a fit."""
+    found = {}
+    for problem in problems:
+        for k, state in enumerate(problem.equations):
+            coef = model.coef[:, model.states.index(state)]
+            columns = np.flatnonzero(coef)
+            prediction = coef[None, columns] @ problem.theta[:, columns].T
+            found[state] = float(r2(truth=problem.target[:, k], prediction=prediction)[0])
+    return found
 
 
-def held_out_outcome(
-    train: Trajectory,
-    held: Trajectory,
-    judged: Mapping[str, Evaluation],
-    labels: Mapping[str, str],
-    relations: Sequence[str],
-    shown: PlotRange,
-    findings: Mapping[str, Any],
-) -> Outcome:
-    """The outcome of models that were fitted to `train` and tested on `held`.
-
-    relations: those that the constrained models obey. findings: what the study itself adds.
-    """
-    f_data_Hz = dominant_frequency(held.t, held.states[:, 0])
-    n_samples = {"n_samples": train.n_samples + held.n_samples, "n_held_out": held.n_samples}
-    data = data_summary(train) | n_samples | {"f_kHz": 1e-3 * f_data_Hz}
-    fits = ResultTable(judged, METHOD)
-    labelled = {labels[name]: each for name, each in judged.items()}
-    rows = ResultTable(labelled, METHOD).screen("method")
-    if rows["status"].isna().all():  # least squares has no status
-        del rows["status"]
-    known = any(each.model.covariance is not None for each in judged.values())
-    relation_lines = [Text(f"relation: {text}") for text in relations]
-    return Outcome(
-        data=held,
-        seen=False,
-        runs={name: each.from_sample for name, each in judged.items()},
-        labels=labels,
-        kind="method",
-        fits=fits.csv("method", by_state=True),
-        shown=Table(rows, title=TITLE, note=NOTE.format(held.clock.frequency_text(f_data_Hz))),
-        about=[*relation_lines, *([Text(INTERVALS, page_only=True)] if known else [])],
-        drawn=held_out_figures(held, labelled, shown),
-        findings={"data": data, **findings},
-        numbers=fits.headline(),
-    )
-
-
-def held_out_figures(
-    held: Trajectory, labelled: Mapping[str, Evaluation], shown: PlotRange
-) -> dict[str, Captioned]:
-    """Runs from the first sample and from a fitted start, phase portraits and spectra."""
-    sample = {name: each.from_sample for name, each in labelled.items()}
-    fit = {name: each.from_fit for name, each in labelled.items()}
-    runs = {
-        name: trajectories(held, models, shown, caption, since=SINCE)
-        for (name, caption), models in zip(CAPTIONS.items(), (sample, fit), strict=True)
-    }
-    return runs | run_figures(FIGURES, held, sample, shown)
-
-
-# Metrics of a free run. CSV has values by state; JSON and headlines have the first state's.
-RUN: Metrics[FreeRun] = [
-    Metric("f", frequency_words, View.SCREEN),
-    Metric("f_Hz", lambda run: run.frequency_Hz, View.CSV),
-    Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.JSON),
-    Metric("f_error", lambda run: run.f_error, View.FILES | View.HEADLINE),
-    Metric("nrmse", lambda run: run.nrmse, View.ALL),
-    Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.CSV),
-    Metric(
-        "amplitude_ratio", lambda run: run.amplitude_ratio[run.model.states[0]],
-        View.JSON | View.HEADLINE,
-    ),
-    Metric("amplitude", lambda run: run.amplitude_ratio, View.SCREEN, "amplitude {}"),
-    Metric("waveform_error", lambda run: run.waveform_error[run.model.states[0]], View.JSON),
-    Metric("periods", lambda run: run.periods, View.JSON),
-    Metric("verdict", lambda run: run.text, View.JSON | View.SCREEN),
-]  # fmt: skip
-METHOD: Metrics[Evaluation] = [
-    *(metric.of(lambda judged: judged.model) for metric in MODEL),
-    *(metric.of(lambda judged: judged.from_sample) for metric in RUN),
-    *(metric.of(lambda judged: judged.from_fit, "{}_started", View.CSV) for metric in RUN),
-    Metric("start fitted", lambda judged: _started_text(judged.from_fit), View.SCREEN),
-    Metric("fitted_start", lambda judged: facts(judged.from_fit, RUN), View.JSON),
-    Metric("ci95", lambda judged: intervals(judged.model), View.JSON),
-    Metric("loss", lambda judged: judged.loss),
-    Metric("status", lambda judged: judged.status, View.SHOWN),
-    Metric("cpu_s", lambda judged: judged.cpu_s, View.ALL, "CPU s"),
-]
+def wrong_signs(model: SparseModel, held_to: Constraint | None, record: Record) -> list[str]:
+    """Terms of processes whose sign is not that by which the recorded balance has them."""
+    if held_to is None or not held_to.processes or not record.zones.balances:
+        return []
+    return [
+        f"{process.name}: {term}"
+        for process in compared_processes(model, held_to, record.data, record.zones)
+        for term, coef in process.coef.items()
+        if coef * process.counterpart.get(term, coef) < 0.0
+    ]
 
 
 def _started_text(run: FreeRun) -> str:
     """Frequency error and nrmse; the verdict of a run without a frequency."""
     has_none = np.isnan(run.f_error)
     return run.text if has_none else f"{100 * run.f_error:+.1f} %, {run.nrmse:.2f}"
+
+
+METHOD: Metrics[Fitted] = [
+    Metric("n_free", lambda fitted: fitted.n_free, View.SHOWN, "free"),
+    *(metric.of(lambda fitted: fitted.from_sample) for metric in RUN),
+    *(metric.of(lambda fitted: fitted.from_fit, "{}_started", View.FILES) for metric in RUN),
+    Metric("start fitted", lambda fitted: _started_text(fitted.from_fit), View.SCREEN),
+    Metric("wrong_signs", lambda fitted: "; ".join(fitted.wrong), View.SHOWN, "signs wrong"),
+    Metric("r2", lambda fitted: fitted.r2, View.ALL, "R2 {}", "{:.3f}"),
+    Metric("loss", lambda fitted: fitted.refinement and fitted.refinement.loss),
+    Metric(
+        "refinement",
+        lambda fitted: fitted.refinement and str(fitted.refinement.status),
+        View.SHOWN,
+    ),
+    Metric("cpu_s", lambda fitted: fitted.cpu_s, View.ALL, "CPU s"),
+]
+
+
+def _ends(value: Callable[[FreeRun], float], runs: Sequence[FreeRun]) -> list[float]:
+    """Lowest and highest value over the runs that have it; NaN if none has it."""
+    values = np.array([value(run) for run in runs])
+    known = values[np.isfinite(values)]
+    return [float(known.min()), float(known.max())] if known.size else [np.nan, np.nan]
+
+
+def _range(ends: Sequence[float], form: str = "{:.3f} to {:.3f}", factor: float = 1.0) -> str:
+    low, high = (factor * value for value in ends)
+    return "-" if np.isnan(low) else form.format(low, high)
+
+
+def _worst_amplitude(run: FreeRun) -> float:
+    ratios = np.array(list(run.amplitude_ratio.values()))
+    return float(ratios[np.argmax(np.abs(ratios - 1.0))])
+
+
+def _worst_waveform(run: FreeRun) -> float:
+    return max(run.waveform_error.values())
+
+
+def _n_living(runs: Sequence[FreeRun]) -> int:
+    return sum(run.verdict is Verdict.LIVES for run in runs)
+
+
+_PERCENT = partial(_range, form="{:+.2f} to {:+.2f} %", factor=100.0)
+SPREAD: Metrics[Sequence[FreeRun]] = [
+    Metric("n_draws", len),
+    Metric("n_living", _n_living, View.SHOWN, "live"),
+    Metric("f_error", partial(_ends, lambda run: run.f_error), View.SHOWN, format=_PERCENT),
+    Metric("nrmse", partial(_ends, lambda run: run.nrmse), View.SHOWN, format=_range),
+    Metric("amplitude", partial(_ends, _worst_amplitude), View.SHOWN, format=_range),
+    Metric("waveform", partial(_ends, _worst_waveform), View.SHOWN, format=_range),
+]
+
+
+def watcher(
+    tell: Callable[..., None], name: str, constraint: Constraint
+) -> Callable[[Iteration], None]:
+    """A callback that logs every iteration of a refinement as scalars; the step is its number.
+
+    At step zero are the scalings before the first iteration, which are one.
+    """
+    free = [constraint.coefficients[k] for k in constraint.free]
+    names = [f"{name}/scaling/{state}/{term.replace('*', '.')}" for state, term in free]
+    tell(dict.fromkeys(names, 1.0), step=0)
+    steps = count(1)
+
+    def watch(iteration: Iteration) -> None:
+        scalars = {
+            f"{name}/loss": iteration.loss,
+            f"{name}/step": iteration.step,
+            f"{name}/defect": iteration.defect,
+            f"{name}/window_stage": iteration.memory,
+        }
+        scalars |= dict(zip(names, iteration.scaling.tolist(), strict=True))
+        tell(scalars, step=next(steps))
+
+    return watch
+
+
+# Fits at several operating points.
+
+
+@dataclass(frozen=True, eq=False)
+class OverPoints:
+    """One fit at every operating point, by label."""
+
+    structure: Structure
+    fits: Mapping[str, Fitted]
+
+    @property
+    def living(self) -> list[str]:
+        return [p for p, fit in self.fits.items() if fit.from_sample.verdict is Verdict.LIVES]
+
+    @property
+    def elsewhere(self) -> str:
+        """What becomes of the model where it does not live, in words."""
+        runs = [fit.from_sample for p, fit in self.fits.items() if p not in self.living]
+        words = dict.fromkeys(str(run.verdict) for run in runs)
+        return ", ".join(f"{word} at {sum(str(r.verdict) == word for r in runs)}" for word in words)
+
+    @property
+    def wrong(self) -> dict[str, int]:
+        """At how many points the sign of each term contradicts the balance."""
+        terms = [term for fit in self.fits.values() for term in fit.wrong]
+        return {term: terms.count(term) for term in dict.fromkeys(terms)}
+
+    def worst(self, value: Callable[[FreeRun], float]) -> float:
+        """The largest modulus over the points that have a value; NaN if none has."""
+        values = np.array([value(fit.from_sample) for fit in self.fits.values()])
+        known = np.abs(values[np.isfinite(values)])
+        return float(known.max()) if known.size else np.nan
+
+
+OVER_POINTS: Metrics[OverPoints] = [
+    Metric("n_free", lambda each: max(fit.n_free for fit in each.fits.values()), View.SHOWN, "free"),
+    Metric("n_living", lambda each: len(each.living), View.FILES | View.HEADLINE),
+    Metric("lives", lambda each: f"{len(each.living)} of {len(each.fits)}", View.SCREEN),
+    Metric("elsewhere", lambda each: each.elsewhere, View.SHOWN),
+    Metric("f_error", lambda each: each.worst(lambda r: r.f_error), View.SHOWN, "frequency off by",
+           percent(2)),
+    Metric("amplitude_error", lambda each: each.worst(lambda r: _worst_amplitude(r) - 1.0),
+           View.SHOWN, "amplitude off by", percent(0)),
+    Metric("waveform_error", lambda each: each.worst(_worst_waveform), View.SHOWN, "waveform",
+           "{:.3f}"),
+    Metric("wrong_signs", lambda each: "; ".join(f"{t} at {n}" for t, n in each.wrong.items()),
+           View.SHOWN, "signs wrong"),
+    Metric("source", lambda each: each.structure.source),
+]  # fmt: skip

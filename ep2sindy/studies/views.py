@@ -14,10 +14,11 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeRun
+from ep2sindy.model.free_run import FreeCycle, FreeRun
 from ep2sindy.report.document import Block, Result, Text
 from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
+from ep2sindy.report.results import Metric, Metrics, View
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.studies.study import PositiveOrAll
 
@@ -34,6 +35,8 @@ CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",
     "trajectories": "Models integrated from the first sample (colour) over the data (grey). "
     f"{MARKS}",
+    "trajectories_started": "The same from a start fitted to the first one and a half periods.",
+    "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
     "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey); "
     "carets: a curve leaves the panel.",
     "phase": "Phase portraits of the integrated models (colour) over the data (grey), dots where "
@@ -77,11 +80,13 @@ def add_figures(
     *,
     smoother: Smoother | None = None,
     since: str = series.SINCE_START,
+    suffix: str = "",
 ) -> None:
     """Add the named figures of CAPTIONS; phase portraits need two states or more.
 
     smoother: gives the data's derivative; without one there are no derivative figures.
-    since: the origin of the time axis of runs, in words.
+    since: the origin of the time axis of runs, in words. suffix: to the names, for runs of another
+    kind, which CAPTIONS describes by such a name.
     """
     span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
     rollouts = {name: run.rollout for name, run in runs.items()}
@@ -102,7 +107,7 @@ def add_figures(
         drawn["phase"] = partial(series.phase_figure, data, rollouts, duration_s=span, **how)
     for name in names:
         if name in drawn:
-            report.figure(name, drawn[name], CAPTIONS[name])
+            report.figure(f"{name}{suffix}", drawn[name], CAPTIONS[f"{name}{suffix}"])
 
 
 def terms_text(terms: Mapping[str, Sequence[str]]) -> str:
@@ -195,3 +200,39 @@ def run_words(run: FreeRun) -> str:
     if not found and np.isfinite(run.nrmse):
         found.append(f"{run.nrmse:.2g} standard deviations off")
     return "; ".join(found) or run.text
+
+
+COMPARED = View.FILES | View.HEADLINE
+# How a model runs beside a record: of every model, in every study.
+EVALUATION: Metrics[FreeRun] = [
+    Metric("frequency", frequency_words, View.SCREEN),
+    Metric("frequency_Hz", lambda run: run.frequency_Hz),
+    Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.HEADLINE),
+    Metric("f_error", lambda run: run.f_error, COMPARED),
+    Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.ALL, "amplitude {}", "{:.3f}"),
+    Metric("waveform_error", lambda run: run.waveform_error, View.ALL, "waveform {}", "{:.3f}"),
+    Metric("nrmse", lambda run: run.nrmse, View.ALL, format="{:.3f}"),
+    Metric("periods", lambda run: run.periods, View.SHOWN, "periods in phase", "{:.0f}"),
+    Metric("status", lambda run: run.text, View.SHOWN),
+]
+# Its cycle and where it rests, which take many runs: of the models that are to live.
+CYCLE: Metrics[FreeCycle] = [
+    Metric("stability", lambda free: free.cycle and str(free.cycle.stability)),
+    Metric("multiplier", lambda free: free.multiplier, COMPARED),
+    Metric("share_reaching", lambda free: free.share, COMPARED),
+    Metric("rest", lambda free: _rest(free)),
+    Metric("rest_growth_per_s", lambda free: free.rest and free.rest.growth_per_s),
+    Metric("rest_frequency_Hz", lambda free: free.rest and free.rest.frequency_Hz),
+]
+EVALUATED = (
+    "Amplitude: standard deviation over the data's. Waveform: RMS difference of one period, in "
+    "standard deviations. nrmse: RMS error of the trajectory, in standard deviations; 1 is no "
+    "better than a constant. Periods in phase: until it is a quarter of a period off."
+)
+
+
+def _rest(free: FreeCycle) -> dict[str, float] | None:
+    """Where the model rests inside its cycle, by state; None if it does not."""
+    if free.rest is None:
+        return None
+    return dict(zip(free.run.model.states, free.rest.state.tolist(), strict=True))
