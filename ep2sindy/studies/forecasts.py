@@ -1,4 +1,4 @@
-"""Forecasts in studies: the sentence, the table, the figure and the summary of a skill."""
+"""Forecasts in studies: their section with its sentence, table and figure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.series import forecast_figure
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
+from ep2sindy.report.document import Table
+from ep2sindy.report.report import Report
 from ep2sindy.runtime.progress import SILENT, Progress
 
 LEAST_SAMPLES = 20  # of the fitted part and of the rest
@@ -49,21 +50,18 @@ def skill_of(
     return forecast_skill(model, run, n_fitted=n_fitted, starts=starts, progress=progress)
 
 
-def forecast_section(
-    skill: ForecastSkill, name: str = "forecast", *, title: str = "Forecasts"
-) -> Section:
-    """How far ahead the model forecasts, beside baselines."""
-    blocks: list[Block] = [Text(f"forecasts: {skill.text}"), _table(skill)]
-    return Section(title, [*blocks, *pictures([name])])
+def add_forecasts(
+    report: Report, name: str, run: Trajectory, skill: ForecastSkill, *, title: str = "Forecasts"
+) -> None:
+    """Add how far ahead a model forecasts, beside baselines: a part of the section before.
 
-
-def forecast_picture(run: Trajectory, skill: ForecastSkill) -> Captioned:
-    return Captioned(partial(forecast_figure, run, skill), CAPTION)
-
-
-def forecast_errors(skill: ForecastSkill) -> pd.DataFrame:
-    """Every error by horizon, for a CSV."""
-    return pd.DataFrame({"horizon_s": skill.horizons_s, **skill.nrmse})
+    name: of the model, which names the files.
+    """
+    report.section(title, f"forecasts: {skill.text}", _table(skill), level=3)
+    report.figure(f"forecast_{name}", partial(forecast_figure, run, skill), CAPTION)
+    errors = pd.DataFrame({"horizon_s": skill.horizons_s, **skill.nrmse})
+    report.samples(f"forecast_{name}", errors)
+    report.summary.setdefault("forecasts", {})[name] = skill.summary()
 
 
 def _table(skill: ForecastSkill) -> Table:

@@ -62,7 +62,9 @@ class GivenPoints:
     def tell(self, report: Report) -> None:
         """Report the files that are no points."""
         if self.left_out:
-            report.say(f"left out, for their names hold no number there: {', '.join(self.left_out)}")
+            report.say(
+                f"left out, for their names hold no number there: {', '.join(self.left_out)}"
+            )
 
 
 def given_points(

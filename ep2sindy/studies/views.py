@@ -20,6 +20,7 @@ from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, View
 from ep2sindy.signals.smoothers import Smoother
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.study import PositiveOrAll
 
 if TYPE_CHECKING:
@@ -205,12 +206,18 @@ def run_words(run: FreeRun) -> str:
 COMPARED = View.FILES | View.HEADLINE
 # How a model runs beside a record: of every model, in every study.
 EVALUATION: Metrics[FreeRun] = [
+    Metric("from_s", lambda run: float(run.record.t[0])),
+    Metric("to_s", lambda run: float(run.record.t[-1])),
+    Metric("record_frequency_Hz", lambda run: _record_frequency_Hz(run)),
     Metric("frequency", frequency_words, View.SCREEN),
     Metric("frequency_Hz", lambda run: run.frequency_Hz),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.HEADLINE),
     Metric("f_error", lambda run: run.f_error, COMPARED),
-    Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.ALL, "amplitude {}", "{:.3f}"),
-    Metric("waveform_error", lambda run: run.waveform_error, View.ALL, "waveform {}", "{:.3f}"),
+    Metric(
+        "amplitude_ratio", lambda run: run.amplitude_ratio, View.SHOWN, "amplitude {}", "{:.3f}"
+    ),
+    Metric("waveform_error", lambda run: run.waveform_error, View.SHOWN, "waveform {}", "{:.3f}"),
+    Metric("waveform_error", lambda run: largest(run.waveform_error), View.HEADLINE),
     Metric("nrmse", lambda run: run.nrmse, View.ALL, format="{:.3f}"),
     Metric("periods", lambda run: run.periods, View.SHOWN, "periods in phase", "{:.0f}"),
     Metric("status", lambda run: run.text, View.SHOWN),
@@ -229,6 +236,17 @@ EVALUATED = (
     "standard deviations. nrmse: RMS error of the trajectory, in standard deviations; 1 is no "
     "better than a constant. Periods in phase: until it is a quarter of a period off."
 )
+
+
+def largest(values: Mapping[str, float]) -> float:
+    """The largest of the values by state; NaN if one is not known."""
+    return float(np.max(list(values.values())))
+
+
+def _record_frequency_Hz(run: FreeRun) -> dict[str, float]:
+    columns = run.record.columns(run.model.states).T
+    found = [dominant_frequency(run.record.t, column) for column in columns]
+    return dict(zip(run.model.states, found, strict=True))
 
 
 def _rest(free: FreeCycle) -> dict[str, float] | None:
