@@ -1,9 +1,9 @@
 """Equations of one measured signal: preparations into states, tried in turn.
 
-Each preparation is a way to make states of the signal, with a library in these. Hidden states, found
-along with their equations, end the list if they explain the signal to its noise; models of smoothed
-states are compared by forecasts from the past alone, where they were fitted. What else is not known
-of a signal is found here too: its lost offset, and numbers inside functions.
+Each preparation is a way to make states of the signal, with a library in these. Hidden states,
+found along with their equations, end the list if they explain the signal to its noise; models of
+smoothed states are compared by forecasts from the past alone, where they were fitted. What else is
+not known of a signal is found here too: its lost offset, and numbers inside functions.
 """
 
 from __future__ import annotations

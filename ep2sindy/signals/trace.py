@@ -129,11 +129,11 @@ def prepare_signal(
 ) -> Trace:
     """Make a trace of one variable of a run.
 
-    run: as `discover` takes it. signal: None takes the only state. decimate: number of samples that are replaced by their
-    mean; "auto" leaves a hundred per period, None leaves all. detrend: whether to subtract the
-    straight line that the signal follows beside its cycle, and keep the mean; "auto" does so if the
-    line is certain, and large beside the troughs of a positive signal or beside the standard
-    deviation of any other.
+    run: as `discover` takes it. signal: None takes the only state. decimate: number of samples that
+    are replaced by their mean; "auto" leaves a hundred per period, None leaves all. detrend:
+    whether to subtract the straight line that the signal follows beside its cycle, and keep the
+    mean; "auto" does so if the line is certain, and large beside the troughs of a positive signal
+    or beside the standard deviation of any other.
     Raises ValueError for a signal that does not oscillate, under six periods or under six samples a
     period, or a wrong setting.
 

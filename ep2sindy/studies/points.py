@@ -36,7 +36,7 @@ from ep2sindy.report.document import Captioned, Result, Section, Text
 from ep2sindy.report.results import json_rows
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
-from ep2sindy.signals.embedding import Embedded, embed
+from ep2sindy.signals.embedding import Embedded, embed_alike
 from ep2sindy.signals.spectrum import Oscillation
 from ep2sindy.signals.trace import MIN_PERIODS, prepare_signal
 from ep2sindy.studies.fits import Terms, terms_of
@@ -343,7 +343,7 @@ def embed_points(opened: Sequence[OpenedPoint]) -> tuple[list[OpenedPoint], Embe
                 )
     if not traces:
         raise ValueError("no signal oscillates for six periods: record for longer")
-    states = dict(zip(traces, embed(list(traces.values())), strict=True))
+    states = dict(zip(traces, embed_alike(list(traces.values())), strict=True))
     made = [
         replace(point, run=states[k].run) if k in states else quiet.get(k, point)
         for k, point in enumerate(opened)
