@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 import ep2sindy as ep
-from ep2sindy.model.free_run import free_run
+from ep2sindy.forecasting.evaluation import evaluate
 
 POINT = ep.thruster.OPERATING_POINTS[3]  # 300 V, 5 mg/s
 BREATHING_HZ = 19.15e3
@@ -52,7 +52,7 @@ def main() -> None:
             model = ep.discover(fitted, library, seed=0).model
             print(f"{', '.join(variables)}, quarter {quarter + 1} held out:")
             for text, (_, held) in parts.items():
-                found = free_run(model, held)
+                found = evaluate(model, held)
                 print(
                     f"  {text} the breathing frequency: {found.text}, nrmse {found.nrmse:.3f}, "
                     f"frequency {100.0 * found.f_error:+.2f} %, amplitude of n_i "

@@ -301,7 +301,7 @@ def thruster() -> None:
             method = ep.TrajectorySearch(max_terms=4, selection=rule, depth=2)
             found = ep.discover(fitted, ep.polynomial(["n_i", "n_n"], degree=2), method)
             cpu_s = time.process_time() - start
-            run = ep.free_run(found.model, held, initial=start_of(held, found.model))
+            run = ep.evaluate(found.model, held, initial=start_of(held, found.model))
             print(
                 f"{label} {rule.label:9} {np.count_nonzero(found.model.coef)} terms, {run.text}; "
                 f"flow error {found.estimate.flow_error:g}, {cpu_s:.1f} CPU-s",

@@ -28,7 +28,6 @@ import ep2sindy as ep
 from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.roles import shares_of, sum_known
-from ep2sindy.model.free_run import cycle_of
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.studies.balance import ComparedProcess, compared_processes, ends_of
 from ep2sindy.studies.living import start_of
@@ -102,7 +101,7 @@ class Case:
     share: of starts around the cycle that reach it. processes: name -> ratio to the record and R2.
     """
 
-    run: ep.FreeRun
+    run: ep.Evaluation
     n_free: int
     multiplier: float
     share: float
@@ -252,12 +251,12 @@ def case(
     begun = time.process_time()
     found = search(fitted, whole, seed=seed)
     cpu_s, model = time.process_time() - begun, found.model
-    run = ep.free_run(model, judged, initial=start_of(judged, model))
+    run = ep.evaluate(model, judged, initial=start_of(judged, model))
     multiplier = share = float("nan")
-    if run.verdict is ep.Verdict.LIVES and (cycle := cycle_of(run)) is not None:
+    if run.status is ep.Status.SUSTAINED and (cycle := run.cycle) is not None:
         multiplier = float(np.abs(cycle.multipliers[1:]).max())
-        share = ep.share_reaching(model, cycle)
-    confirmed = run.verdict is not ep.Verdict.LIVES or lives_on(model, judged)
+        share = run.share_reaching
+    confirmed = run.status is not ep.Status.SUSTAINED or lives_on(model, judged)
     held = found.constraint
     n_free = int(np.count_nonzero(model.coef)) if held is None else len(held.free)
     processes = {p.name: (p.ratio, p.r2) for p in whole.processes(model, held)}
@@ -290,7 +289,7 @@ def parts(run: ep.Trajectory, split: str) -> tuple[ep.Trajectory, ep.Trajectory]
 
 def line(name: str, cases: Sequence[Case]) -> str:
     """How many live, and the median and the worst of each figure of those that have it."""
-    living = [each for each in cases if each.run.verdict is ep.Verdict.LIVES]
+    living = [each for each in cases if each.run.status is ep.Status.SUSTAINED]
     wrong = sum(not each.confirmed for each in cases)
     if not living:
         return f"{name:24s} 0 of {len(cases)} live: {[c.run.text for c in cases][:3]}"
@@ -303,7 +302,7 @@ def line(name: str, cases: Sequence[Case]) -> str:
     )
     shares = [c.share for c in living]
     cpu_s = np.median([c.cpu_s for c in cases])
-    lost = Counter(each.run.text for each in cases if each.run.verdict is not ep.Verdict.LIVES)
+    lost = Counter(each.run.text for each in cases if each.run.status is not ep.Status.SUSTAINED)
     return (
         f"{name:24s} {len(living)} of {len(cases)} live ({wrong} refuted); f {f} %; "
         f"amplitude {amplitude} %; waveform {waveform}; free coefficients {n_free}; multiplier "
@@ -357,7 +356,7 @@ def print_law(search: Callable) -> None:
             pairs = [(p.coef[term], p.counterpart[term]) for p in compared for term in p.coef]
             ratios.append([model / recorded for model, recorded in pairs])
             run = by_the_record(found, compared, parts(whole.run, split)[1])
-            verdicts.append(f"{run.verdict}, f {run.f_error:+.0%}")
+            verdicts.append(f"{run.status}, f {run.f_error:+.0%}")
         medians = ", ".join(f"{ratio:.2f}" for ratio in np.median(ratios, axis=0))
         print("\n".join([line(label, cases), balances(cases), f"    {medians}"]), flush=True)
         print(f"    with the record's own coefficients: {verdicts[0]}", flush=True)
@@ -365,7 +364,7 @@ def print_law(search: Callable) -> None:
 
 def by_the_record(
     found: ep.Discovery, compared: Sequence[ComparedProcess], judged: ep.Trajectory
-) -> ep.FreeRun:
+) -> ep.Evaluation:
     """The terms of a model with the coefficients of the record, run freely."""
     held, model = found.constraint, found.model
     assert held is not None
@@ -375,7 +374,7 @@ def by_the_record(
     told = [known.get(held.coefficients[k], 0.0) for k in held.free]
     coef = held.coef(shares_of(held) @ np.array(values) + told)
     changed = with_coef(model, held, coef)[0]
-    return ep.free_run(changed, judged, initial=start_of(judged, model))
+    return ep.evaluate(changed, judged, initial=start_of(judged, model))
 
 
 def print_profiles() -> None:

@@ -34,7 +34,7 @@ from ep2sindy.signals.spectrum import crossing_frequency
 FOLDER = Path(os.environ.get("EP2SINDY_DATA", "."))
 N_DRAWS, N_MOVED, N_SIMULATED = 10, 20, 3
 DRIFT_A, GAP, N_LONG, PROCESS = 0.4, 0.05, 1_000_000, 0.05
-SHOWN = ("verdict", "f_error", "amplitude_ratio", "waveform_error", "n_terms_searched")
+SHOWN = ("status", "f_error", "amplitude_ratio", "waveform_error", "n_terms_searched")
 N_CYCLES = 2
 POINTS = ((300.0, 5.0), (300.0, 4.0), (300.0, 6.0), (400.0, 5.0))  # V and mg/s
 NOISE = 0.02  # of the simulator's current, as a share of its mean
@@ -84,7 +84,7 @@ def show(name: str, found: Traced | str, horizons: dict[str, float]) -> None:
         return
     living, forecast = found.summary["living"], found.summary["forecast"]
     number = found.summary["signal"]["n_states"]
-    print(f"  {number} states, {living['n_terms_searched']} terms: {living['verdict']}")
+    print(f"  {number} states, {living['n_terms_searched']} terms: {living['status']}")
     for state, terms in found.summary["model"]["equations"].items():
         print(f"    {state}' = " + " ".join(f"{c:+.3g} {term}" for term, c in terms.items()))
     for words, horizon in horizons.items():
@@ -176,7 +176,7 @@ def current() -> None:
         for seed in range(N_SIMULATED):
             found = trace(*spoil(np.random.default_rng(seed)), "unit=A", f"seed={seed}")
             rows.append(found if isinstance(found, str) else found.summary["living"])
-        lives = sum(isinstance(row, dict) and row["verdict"] == "lives" for row in rows)
+        lives = sum(isinstance(row, dict) and row["status"] == "sustained" for row in rows)
         print(f"\ncurrent, {words}: {lives} of {len(rows)} live")
         for row in rows:
             shown = row if isinstance(row, str) else [row[key] for key in SHOWN]
@@ -360,10 +360,10 @@ def neutrals(voltage: float, flow: float) -> None:
     n = round(0.75 * run.n_samples)
     found = ep.discover(run.window(0, n), hidden=["g"])
     states = ep.estimate_states(found.model, run)
-    free = ep.free_run(found.model, states.window(n, run.n_samples))
+    free = ep.evaluate(found.model, states.window(n, run.n_samples))
     alike = np.corrcoef(states.columns(["g"])[n:, 0], both.columns(["n_n"])[n:, 0])[0, 1]
     print(
-        f"{voltage:g} V, {flow:g} mg/s: {free.verdict}, frequency off by {100 * free.f_error:.2f} "
+        f"{voltage:g} V, {flow:g} mg/s: {free.status}, frequency off by {100 * free.f_error:.2f} "
         f"%, correlation of the hidden state with n_n {alike:.3f}; "
         f"{'a misfit' if found.misfit else 'fits'}: {found.model.text()}",
         flush=True,

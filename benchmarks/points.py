@@ -29,8 +29,8 @@ import yaml
 
 import ep2sindy as ep
 from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
-from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeRun
+from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.model.comparison import Status
 from ep2sindy.operating.given_models import (
     REFINED,
     FittingSettings,
@@ -149,12 +149,12 @@ def all_recorded(points: Sequence[tuple[float, float]], workers: Workers) -> lis
     return [found[k] for k in range(len(points))]
 
 
-def line(name: str, runs: Sequence[FreeRun]) -> str:
+def line(name: str, runs: Sequence[Evaluation]) -> str:
     f = np.array([abs(run.f_error) for run in runs])
     f[np.isnan(f)] = np.inf
     amplitude = [max(abs(v - 1.0) for v in run.amplitude_ratio.values()) for run in runs]
     waveform = [max(run.waveform_error.values()) for run in runs]
-    lives = sum(run.verdict is Verdict.LIVES for run in runs)
+    lives = sum(run.status is Status.SUSTAINED for run in runs)
     return (
         f"{name:<22} {lives} of {len(runs)} live; f {np.median(f):.2%}, 9 in 10 "
         f"{np.quantile(f, 0.9, method='higher'):.2%}, at most {f.max():.2%}; amplitude "
@@ -208,7 +208,7 @@ def grid() -> None:
     between = all_recorded([(round(v, 1), round(m, 2)) for v, m in drawn], workers)
     for end in ("", REFINED):
         law = fits_of(CHOICE + end, given[CHOICE], results).law(QUADRATIC)
-        free = [ep.free_run(law.at(**run.parameters), run) for run in between]
+        free = [ep.evaluate(law.at(**run.parameters), run) for run in between]
         print(line(f"between, {CHOICE}{end}", free))
 
 

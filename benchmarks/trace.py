@@ -21,9 +21,9 @@ import ep2sindy as ep
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
+from ep2sindy.forecasting.evaluation import evaluate
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import cycle_of, free_run
+from ep2sindy.model.comparison import Status
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.free_run import FreeRunScore
@@ -71,21 +71,21 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
     record = np.column_stack([clean.states[:, 0], states.states[:, 1]])
     held = Trajectory(states.t, record, states.state_names).window(n, states.n_samples)
 
-    def run_from(k: int) -> ep.FreeRun:
+    def run_from(k: int) -> ep.Evaluation:
         part = held.window(k, held.n_samples)
-        return free_run(model, part, initial=states.states[n + k], judged=(NAME,))
+        return evaluate(model, part, initial=states.states[n + k], judged=(NAME,))
 
     run = run_from(0)
-    lives = [run_from(STRIDE * k).verdict is Verdict.LIVES for k in range(N_STARTS)]
-    cycle = cycle_of(run)
+    lives = [run_from(STRIDE * k).status is Status.SUSTAINED for k in range(N_STARTS)]
+    cycle = run.cycle
     return {
-        "verdict": run.text,
+        "status": run.text,
         "f error, %": 100.0 * run.f_error,
         "amplitude": run.amplitude_ratio[NAME],
         "waveform": run.waveform_error[NAME],
         "terms": len(model.terms("g")),
         "multiplier": np.nan if cycle is None else abs(cycle.multipliers[1]),
-        "reaching": np.nan if cycle is None else ep.share_reaching(model, cycle),
+        "reaching": run.share_reaching,
         "samples": f"{sum(lives)}/{N_STARTS}",
         "CPU s": seconds,
         "g'": ", ".join(model.terms("g")),

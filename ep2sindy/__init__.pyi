@@ -56,12 +56,9 @@ from ep2sindy.model.comparison import FreeRunBounds as FreeRunBounds  # for conf
 
 # Models
 from ep2sindy.model.model import SparseModel as SparseModel
-from ep2sindy.model.free_run import FreeRun as FreeRun
-from ep2sindy.model.free_run import free_run as free_run
-from ep2sindy.model.comparison import Verdict as Verdict
-from ep2sindy.model.stability import LimitCycle as LimitCycle
-from ep2sindy.model.stability import limit_cycle as limit_cycle
-from ep2sindy.model.stability import share_reaching as share_reaching
+from ep2sindy.forecasting.evaluation import evaluate as evaluate
+from ep2sindy.forecasting.evaluation import Evaluation as Evaluation
+from ep2sindy.model.comparison import Status as Status
 from ep2sindy.model.model import coef_matrix as coef_matrix
 
 # Forecasts

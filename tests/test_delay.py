@@ -60,14 +60,14 @@ def test_a_search_finds_what_is_delayed_and_leaves_the_stages_as_they_are() -> N
     assert found.model.terms("x") == pytest.approx({"x": RATE, "x*x_lag4": -RATE}, rel=1e-3)
     for state, terms in DELAY.equations.items():
         assert found.model.terms(state) == terms  # to the last digit
-    run = ep.free_run(found.model, long)
-    assert run.verdict is ep.Verdict.LIVES
-    assert ep.limit_cycle(found.model, long.states[-1], period_s=1.0 / run.frequency_Hz["x"])
+    run = ep.evaluate(found.model, long)
+    assert run.status is ep.Status.SUSTAINED
+    assert ep.model.limit_cycle(found.model, long.states[-1], period_s=1.0 / run.frequency_Hz["x"])
 
 
 def test_another_delay_does_not_live() -> None:
     found, long = found_with(logistic(np.arange(0.0, 90.0, 0.05)), ep.Delay("x", 1.0, n_stages=4))
-    assert ep.free_run(found.model, long).verdict is not ep.Verdict.LIVES
+    assert ep.evaluate(found.model, long).status is not ep.Status.SUSTAINED
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from ep2sindy.app.arguments import mend
 from ep2sindy.app.runner import study_class
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
-from ep2sindy.model.comparison import Verdict
+from ep2sindy.model.comparison import Status
 from ep2sindy.report.results import View
 from ep2sindy.studies.library_result import RULES, candidate_metrics
 from tests.pages import (
@@ -297,7 +297,7 @@ def test_every_experiment_is_on_the_page_that_leads_to_one() -> None:
 def test_the_glossary_has_the_verdicts_and_the_columns_of_candidates() -> None:
     words = (ROOT / "docs" / "glossary.md").read_text("utf-8").replace("\n  ", " ")
     columns = [m.heading or m.key for m in candidate_metrics("d_pareto") if View.SCREEN in m.view]
-    for name in [*Verdict, *RULES, *columns]:
+    for name in [*Status, *RULES, *columns]:
         assert re.search(rf"\*{re.escape(name)}\*|\*\*[^*]*\b{re.escape(name)}\b", words), name
 
 

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from benchmarks import known_laws
 from ep2sindy.app.runner import run_config
 from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.operating.map import Fate, map_points
+from ep2sindy.operating.map import map_points
 from ep2sindy.report.document import Text
 from ep2sindy.studies.point_sources import expand
 from ep2sindy.studies.points import Outcome
@@ -60,7 +60,7 @@ def test_the_run_leaves_a_law_tables_figures_and_a_summary(folder: Path) -> None
     assert len(tables["left_out"]) == 4
     assert len(tables["map"]) == 4
     assert {p.stem for p in (folder / "figures").glob("*.png")} >= {"left_out", "laws"}
-    assert law["left_out"]["n_lives"] == (tables["left_out"]["verdict"] == "lives").sum()
+    assert law["left_out"]["n_lives"] == (tables["left_out"]["status"] == "sustained").sum()
     assert law["left_out"]["window_error"] == pytest.approx(law["errors"][law["fit"]])
     page = (folder / "report.html").read_text()
     assert "9 coefficients of 3 functions each, 15 numbers, from 4 records" in page
@@ -149,7 +149,7 @@ def test_own_records_make_a_law_of_the_model_that_is_chosen_and_its_line(tmp_pat
 def said_by_the_empty(outcome: Outcome) -> None:
     """A map on which nothing oscillates is no figure; the page says so instead."""
     assert outcome.law is not None
-    still = [replace(point, fate=Fate.RESTS, frequency_Hz=np.nan) for point in outcome.law.map]
+    still = [replace(point, status=Status.DECAYS, frequency_Hz=np.nan) for point in outcome.law.map]
     quiet = replace(outcome, law=replace(outcome.law, map=still))
     assert set(quiet.figures()) == {"laws", "left_out"}
     assert quiet.in_short().picture == "left_out"

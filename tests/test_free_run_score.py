@@ -56,17 +56,17 @@ def test_the_truth_is_found_refined_and_handed_on(found):
         assert front.candidates[int(np.argmin(scores))].terms == chosen.terms
         low, high = found.model.intervals(state)[chosen.terms[0]]
         assert low < chosen.coef[0] < high
-    assert found.note.startswith("lives, ")
+    assert found.note.startswith("sustained, ")
     assert found.note in repr(found)
-    assert ep.free_run(found.model, record()).verdict is ep.Verdict.LIVES
+    assert ep.evaluate(found.model, record()).status is ep.Status.SUSTAINED
 
 
 def test_noise_is_no_obstacle():
     run = record(noise=0.1)
     noisy = ep.discover(run, LIBRARY, recipe(formulation=ep.WeightedWeak()))
-    judged = ep.free_run(noisy.model, record())
+    judged = ep.evaluate(noisy.model, record())
     # On the data's cycle; from one sample its phase may be off by more than a first period allows.
-    assert judged.verdict in (ep.Verdict.LIVES, ep.Verdict.SLIPS)
+    assert judged.status in (ep.Status.SUSTAINED, ep.Status.WRONG_FREQUENCY)
     assert abs(judged.f_error) < 0.01
     # It lives, and yet it is not the truth: it leaves more than noise, and has no intervals.
     assert noisy.misfit
@@ -87,17 +87,17 @@ def test_a_state_that_was_not_measured_need_not_keep_its_waveform(found):
     # What the model cannot follow, in the second state alone: ten times faster.
     wiggle = 0.4 * run.states[:, 1].std() * np.sin(10 * 2 * np.pi * run.t / 71.3e-6)
     spoilt = ep.Trajectory(run.t, run.states + np.outer(wiggle, [0, 1]), run.state_names)
-    assert ep.free_run(found.model, spoilt).verdict is ep.Verdict.WRONG_CYCLE
-    judged = ep.free_run(found.model, spoilt, judged=["n_i"])
-    assert judged.verdict in (ep.Verdict.LIVES, ep.Verdict.SLIPS)
+    assert ep.evaluate(found.model, spoilt).status is ep.Status.WRONG_CYCLE
+    judged = ep.evaluate(found.model, spoilt, judged=["n_i"])
+    assert judged.status in (ep.Status.SUSTAINED, ep.Status.WRONG_FREQUENCY)
     assert judged.waveform_error["n_n"] > 0.2
     with pytest.raises(ValueError, match=r"judged must name some of the states .*: \['T'\] came"):
-        ep.free_run(found.model, run, judged=["T"])
+        ep.evaluate(found.model, run, judged=["T"])
 
 
 def test_starts_at_other_phases_refuse_what_lives_from_one(found):
     several = ep.discover(record(), LIBRARY, recipe(n_starts=4))
-    assert several.note.startswith("lives, ")
+    assert several.note.startswith("sustained, ")
     for state in ("n_i", "n_n"):
         assert list(several.model.terms(state)) == list(found.model.terms(state))
         assert (several.scores[state] >= found.scores[state] - 1e-9).all()
@@ -115,7 +115,7 @@ def test_noise_that_more_terms_follow_does_not_make_a_cycle_attract():
 def test_where_nothing_lives_the_best_comes_back_with_its_verdict():
     dead = ep.discover(record(), LIBRARY, recipe(max_terms=1, n_best=1))
     assert dead.note.endswith("; none of 4 systems live where not fitted")
-    assert not dead.note.startswith("lives")
+    assert not dead.note.startswith("sustained")
     assert dead.scores["n_i"].min() > 1.0
 
 
@@ -239,8 +239,7 @@ def confirmed(
 ):
     """A system as the rule has confirmed it, with these figures."""
     held = SimpleNamespace(n_free=n_free)
-    verdict = ep.Verdict.LIVES if lives else ep.Verdict.DIES_OUT
-    run = SimpleNamespace(verdict=verdict, model=SimpleNamespace(inputs=()))
+    run = SimpleNamespace(rank=(not lives, 0), model=SimpleNamespace(inputs=()))
     return Confirmed(number, Trial(held, 0.3, 0.0, 0.0, waveform, loss), run, share, broken, repels)
 
 

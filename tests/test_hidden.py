@@ -91,11 +91,11 @@ def test_the_experiment_finds_it_too(tmp_path) -> None:
     only("x").to_dataframe().to_csv(path)
     given = ["+exp=discover", "data=recognised", f"data.path={path}", "trajectory.states=[x]"]
     more = ["hidden=[g]", "relations=['g: x*g == 1']", "forecasts=4", f"output={tmp_path}"]
-    summary = computed(composed(*given, *more)).summary["models"]["model"]
-    terms = summary["equations"]["g"]["terms"]
+    summary = computed(composed(*given, *more)).summary
+    terms = summary["models"]["model"]["equations"]["g"]
     assert set(terms) == set(GROWTH)
     assert terms["x*g"] == pytest.approx(1.0, rel=1e-12)
-    assert list(summary["estimate"]["noise_std"]) == ["x"]
+    assert list(summary["samples_model"][0]["noise_std"]) == ["x"]
     with pytest.raises(ValueError, match="one library and without living"):
         computed(composed("+exp=breathing", "+hidden=[g]", f"output={tmp_path}"))
 

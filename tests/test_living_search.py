@@ -33,7 +33,7 @@ def test_in_noise_the_mean_cycle_is_searched_and_said() -> None:
         "found in the mean cycle, without intervals, since the white noise of "
     )
     assert found.model.covariance is None
-    assert ep.free_run(found.model, record(0.0)).verdict is ep.Verdict.LIVES
+    assert ep.evaluate(found.model, record(0.0)).status is ep.Status.SUSTAINED
 
 
 @pytest.mark.parametrize(("noise", "limit"), [(0.5, None), (0.02, 0.3)])

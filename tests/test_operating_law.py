@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.model.comparison import Verdict
+from ep2sindy.model.comparison import Status
 from ep2sindy.operating.law import OperatingLaw, constrain_law, in_hull, make_basis
 from ep2sindy.operating.left_out import (
     LawTrial,
@@ -222,7 +222,7 @@ def test_errors_at_points_left_out_are_those_of_the_laws_of_the_others() -> None
 
 def test_points_left_out_live_by_the_law_of_the_others() -> None:
     found = run_left_out(trial(), records())
-    assert [each.run.verdict for each in found] == [Verdict.LIVES] * 9
+    assert [each.run.status for each in found] == [Status.SUSTAINED] * 9
     # A frequency read off the periods of a record.
     assert max(abs(each.run.f_error) for each in found) < 5e-3
     # Of three by three the corners are outside of what the others enclose.
@@ -235,7 +235,7 @@ def test_points_left_out_live_by_the_law_of_the_others() -> None:
 
 def test_a_point_without_a_frequency_has_an_infinite_error_of_it() -> None:
     found = run_left_out(trial(), records())
-    gone = replace(found[0].run, verdict=Verdict.DIVERGES, f_error=float("nan"))
+    gone = replace(found[0].run, status=Status.DIVERGES, f_error=float("nan"))
     numbers = error_statistics([LeftOutRun(records()[0], gone, inside=True), *found[1:]])
     assert numbers["n_lives"] == 8
     assert numbers["f_90"] == np.inf

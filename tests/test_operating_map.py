@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.model.comparison import Status
 from ep2sindy.model.fixed_point import rest_point
-from ep2sindy.operating.map import Fate, law_map
+from ep2sindy.operating.map import law_map
 from tests.models import model_of
 from tests.test_operating_law import recorded
 from tests.test_stability import HOPF
@@ -36,7 +37,12 @@ def hopf() -> ep.operating.OperatingLaw:
 def test_a_cycle_begins_where_the_fixed_point_turns_unstable() -> None:
     near = at_one()
     found = law_map(hopf(), [near], [{"a": a} for a in (-0.5, -0.1, 0.1, 1.0)])
-    assert [p.fate for p in found] == [Fate.RESTS, Fate.RESTS, Fate.OSCILLATES, Fate.OSCILLATES]
+    assert [p.status for p in found] == [
+        Status.DECAYS,
+        Status.DECAYS,
+        Status.SUSTAINED,
+        Status.SUSTAINED,
+    ]
     np.testing.assert_allclose([p.growth_per_s for p in found], [-0.5, -0.1, 0.1, 1.0], atol=1e-6)
     assert [p.inside for p in found] == [False, False, False, True]
     for point in found[2:]:
@@ -62,14 +68,14 @@ def test_a_start_where_a_state_passes_through_zero_ends_no_run() -> None:
     states[near.slowest] = [1.0, 1e-9]
     near = replace(near, run=replace(near.run, states=states))
     (found,) = law_map(hopf(), [near], [{"a": 1.0}])
-    assert found.fate is Fate.OSCILLATES
+    assert found.status is Status.SUSTAINED
 
 
 def test_a_model_that_runs_away_has_no_cycle() -> None:
     wild = replace(hopf(), coef=np.abs(hopf().coef))
     near = at_one()
     (found,) = law_map(wild, [near], [{"a": 1.0}])
-    assert found.fate is Fate.DIVERGES
+    assert found.status is Status.DIVERGES
     assert np.isnan(found.relative_amplitude)
 
 

@@ -132,7 +132,7 @@ def grid(n: int) -> pd.DataFrame:
     alive = (rows["a"] < 1.9) | (rows["b"] > 0.7)
     return rows.assign(
         inside=rows["a"] - 1.0 + rows["b"] <= 1.0,
-        fate=np.where(alive, "oscillates", "rests"),
+        status=np.where(alive, "sustained", "decays"),
         f_kHz=(10.0 + rows["a"]).where(alive),
         relative_amplitude=(0.9 + 0.1 * rows["b"]).where(alive),
         growth_per_s=np.where(alive, 1.0, -1.0),
@@ -167,7 +167,7 @@ def test_a_map_is_faded_beyond_the_fitted_points_and_white_without_a_cycle() -> 
     opacity = np.asarray(map_.get_alpha()).T.ravel()
     np.testing.assert_array_equal(opacity, np.where(rows["inside"], 1.0, FADED))
     shown = np.ma.masked_invalid(map_.get_array()).T.ravel()
-    np.testing.assert_array_equal(shown.mask, rows["fate"] == "rests")
+    np.testing.assert_array_equal(shown.mask, rows["status"] == "decays")
     assert "faded: beyond the points fitted" not in drawn(
         cycles(rows.assign(inside=True), "a", "b")
     )

@@ -70,7 +70,7 @@ def test_a_discovery_is_drawn_with_its_selected_candidates(
 def test_a_free_run_is_drawn_over_its_record_whatever_their_order() -> None:
     run = record()
     turned = replace(run, states=run.states[:, ::-1], state_names=["y", "x"])
-    figure = ep.plot(ep.free_run(oscillator(3.0, 0.4), turned))
+    figure = ep.plot(ep.evaluate(oscillator(3.0, 0.4), turned))
     assert labels(figure) == ["$x$ (A)", "$y$ (m)"]
     data, model = figure.axes[0].lines
     n = len(data.get_ydata())
@@ -79,7 +79,7 @@ def test_a_free_run_is_drawn_over_its_record_whatever_their_order() -> None:
 
 
 def test_a_cycle_is_drawn_closed_with_runs_that_reach_it() -> None:
-    cycle = ep.limit_cycle(oscillator(3.0, 0.4), np.array([2.0, 0.0]), period_s=2.1)
+    cycle = ep.model.limit_cycle(oscillator(3.0, 0.4), np.array([2.0, 0.0]), period_s=2.1)
     assert cycle is not None
     (ax,) = ep.plot(cycle, record()).axes
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("$x$ (A)", "$y$ (m)")
@@ -130,5 +130,5 @@ def test_a_law_of_two_parameters_is_drawn_as_a_map_and_of_three_not_at_all() -> 
 
 
 def test_what_cannot_be_drawn_says_what_can() -> None:
-    with pytest.raises(TypeError, match=r"plot draws a Discovery, FreeRun, .*: list came"):
+    with pytest.raises(TypeError, match=r"plot draws a Discovery, Evaluation, .*: list came"):
         ep.plot([1.0])

@@ -96,8 +96,8 @@ def test_runs_off_scale_are_marked_and_named_by_what_becomes_of_them(
 ) -> None:
     runs = rollouts(oscillation, 2)
     words = {"model 0": "follows the data", "model 1": "which ended badly"}
-    rows = trajectory_figure(oscillation, runs, duration_s=20.0, verdicts=words)
-    plane = phase_figure(oscillation, runs, duration_s=20.0, verdicts=words)
+    rows = trajectory_figure(oscillation, runs, duration_s=20.0, statuses=words)
+    plane = phase_figure(oscillation, runs, duration_s=20.0, statuses=words)
     names = ["model 0\n(follows the data)", "model 1\n(diverges at 12.5 s)"]
     assert [ax.get_ylabel() for ax in rows.axes[::2]] == names
     assert [ax.get_title() for ax in plane.axes] == names
@@ -126,6 +126,6 @@ def test_times_of_a_run_count_from_its_start(oscillation: ep.Trajectory) -> None
 def test_one_state_has_no_phase_portrait(oscillation: ep.Trajectory) -> None:
     one = ep.Trajectory(oscillation.t, oscillation.states[:, :1], ("x",))
     model = ep.SparseModel(ep.named_terms(("x",), ("x",)), ("x",), np.array([[-1.0]]))
-    integrated = {"model": ep.free_run(model, one)}
+    integrated = {"model": ep.evaluate(model, one)}
     figures = run_figures(("phase", "spectra"), one, integrated, PlotRange(20.0, None))
     assert list(figures) == ["spectra"]

@@ -288,17 +288,16 @@ def test_the_experiment_reports_zones_and_their_processes(tmp_path: Path) -> Non
     record = chain()
     found = computed(composed(*toy(tmp_path)))
     assert found.summary["data"]["variables"] == NAMES
-    result = found.summary["models"]["zones"]
-    living = result["living"]["coefficients"]
-    taken = living["n_i@a"]["n_i@a"]["value"]
-    assert living["n_i@b"]["n_i@a"]["value"] == pytest.approx(-taken / 2, rel=1e-6)
-    assert living["n_n@a"]["1"]["value"] == pytest.approx(1.2e24, rel=0.01)  # free in a file
-    processes = {each["process"]: each for each in result["balance"]["processes"]}
+    living = found.summary["models"]["zones_living"]["equations"]
+    taken = living["n_i@a"]["n_i@a"]
+    assert living["n_i@b"]["n_i@a"] == pytest.approx(-taken / 2, rel=1e-6)
+    assert living["n_n@a"]["1"] == pytest.approx(1.2e24, rel=0.01)  # free in a file
+    processes = {each["process"]: each for each in found.summary["balance_zones"]}
     recorded = [each["recorded"] for each in processes.values()]
     assert np.isnan(recorded).all()  # a file of densities alone
     assert processes["neutrals from a to b"]["modelled"] == pytest.approx(
         G * 1e24 * record.states[:, 1].mean(), rel=0.01
     )
-    terms = [(each["process"], each["term"]) for each in result["balance"]["terms"]]
+    terms = [(each["part"], each["term"]) for each in found.summary["terms_zones"]]
     assert ("ions from a to b", "n_i@a") in terms
     assert "<mi>i</mi><mo>,</mo><mi>a</mi>" in found.page  # n with the index i,a

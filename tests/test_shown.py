@@ -41,12 +41,12 @@ def test_models_take_tables_and_states_by_name() -> None:
     run = ep.lotka_volterra().trajectory()
     model = ep.lotka_volterra().model
     table = run.to_dataframe().reset_index()
-    assert ep.free_run(model, table).verdict == ep.free_run(model, run).verdict
+    assert ep.evaluate(model, table).status == ep.evaluate(model, run).status
     by_name = model.simulate(run.t[:20], {"y": 0.5, "x": 1.0})
     assert np.array_equal(by_name.states, model.simulate(run.t[:20], [1.0, 0.5]).states)
     with pytest.raises(ValueError, match=r"a number for each of \['x', 'y'\]: {'x': 1.0} came"):
         model.simulate(run.t[:20], {"x": 1.0})
     found = ep.discover(run, method=ep.Regression())
-    for call in (ep.free_run, ep.refine):
-        with pytest.raises(ValueError, match=r"such as found\.model: a Discovery came"):
-            call(found, run)  # type: ignore[operator]
+    with pytest.raises(ValueError, match=r"such as found\.model: a Discovery came"):
+        ep.refine(found, run)  # type: ignore[arg-type]
+    assert ep.evaluate(found, run).model is found.model

@@ -339,9 +339,9 @@ def test_one_call_finds_the_law_of_a_signal_and_the_state_that_nobody_measured()
     assert found.model.terms("x") == pytest.approx({"x*g": 1.0}, rel=1e-12)
     exact = {"1": 2 / 9, "x": -2 / 3, "g": -1 / 3, "x*g": 1.0}
     assert found.model.terms("g") == pytest.approx(exact, rel=0.05)
-    assert found.free.run.verdict == "follows"
-    assert found.measured.t[0] == found.signal.t[round(0.75 * len(found.signal.t)) - 1]
-    assert found.skill is not None
+    assert found.evaluation.is_similar
+    assert found.evaluation.record.t[0] == found.signal.t[round(0.75 * len(found.signal.t)) - 1]
+    assert found.evaluation.forecast is not None
     text = repr(found)
     assert "x: the signal and 1 that nobody measured" in text
     assert "its end, which was not fitted: follows" in text
@@ -357,7 +357,7 @@ def test_one_call_makes_states_by_smoothing_where_it_is_asked_to() -> None:
     rate = 2.0 * np.pi * found.signal.frequency_Hz
     assert found.model.terms(x) == {"v": 1.0}
     assert found.model.terms("v") == pytest.approx({x: -(rate**2)}, rel=1e-2)
-    assert found.skill is None
+    assert found.evaluation.forecast is None
     assert "run freely over all of it" in repr(found)
 
 

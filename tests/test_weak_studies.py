@@ -136,7 +136,7 @@ def test_every_form_follows_exact_data() -> None:
         "automatic_weighted": Setting(AUTOMATIC, weighted=True),
     }
     for name, found in fitted(run, settings).items():
-        assert found.integrated.verdict == "alike"  # fewer than three periods: no cycle
+        assert found.integrated.is_similar  # fewer than three periods: no cycle
         assert found.r2 == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-5)
         # 40 s hold less than three periods: a spectral line of that width, and no cycle to compare
         assert found.integrated.frequency_Hz["x"] == pytest.approx(1.0 / 15.0, rel=0.2)

@@ -105,9 +105,9 @@ def _search() -> None:
     found.model.simulate(run.t, run.states[0])
     found.forecast(run, 1.0)
     oscillator = ep.systems.van_der_pol(mu=2.0).model
-    cycle = ep.limit_cycle(oscillator, np.array([2.0, 0.0]), period_s=7.63)
+    cycle = ep.model.limit_cycle(oscillator, np.array([2.0, 0.0]), period_s=7.63)
     assert cycle is not None
-    ep.share_reaching(oscillator, cycle, n_starts=1)
+    ep.model.share_reaching(oscillator, cycle, n_starts=1)
 
 
 def _refinement() -> None:

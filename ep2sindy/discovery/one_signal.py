@@ -22,14 +22,14 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.problem import FIRST_MAX_TERMS
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.forecasting.forecast import calibrate
-from ep2sindy.forecasting.skill import MODEL, ForecastSkill, forecast_skill
+from ep2sindy.forecasting.skill import MODEL, forecast_skill
 from ep2sindy.forecasting.state_estimation import StateEstimator, estimate_states, tune_estimator
 from ep2sindy.library.library import polynomial
 from ep2sindy.library.names import number_text
 from ep2sindy.library.relations import relations_of
-from ep2sindy.model.comparison import REPEATS, SPIRALS, Verdict
-from ep2sindy.model.free_run import FreeCycle, free_run
+from ep2sindy.model.comparison import REPEATS, SPIRALS
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Once, at_once
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -47,8 +47,6 @@ MAX_FITTED = 3000  # samples from the end of the fitted part that a search for h
 
 MIN_FITTED = 4.0  # periods that a fitted part must have
 MIN_JUDGED = 1.5  # periods that a held-out part must have
-
-ENDURING = (Verdict.LIVES, Verdict.FOLLOWS, Verdict.ALIKE)
 
 
 @dataclass(frozen=True)
@@ -220,9 +218,9 @@ def explains(found: Discovery, signal: str) -> bool:
     if found.misfit:
         return False
     (record,), (path,) = found.estimate.runs, found.estimate.paths
-    free = FreeCycle.of(free_run(found.estimate.model, record, initial=path[0], judged=[signal]))
-    if free.run.verdict not in ENDURING or free.cycle is None:
-        return free.run.verdict in ENDURING
+    free = evaluate(found.estimate.model, record, initial=path[0], judged=[signal])
+    if not free.is_similar or free.cycle is None:
+        return free.is_similar
     n_periods = float(record.t[-1] - record.t[0]) / free.cycle.period_s
     return free.multiplier**n_periods < SPIRALS
 
@@ -238,33 +236,29 @@ def fitted_part(signal: Trace, held_out: float) -> Trace:
 
 def run_on_rest(
     signal: Trace, best: Attempt, *, progress: Progress = SILENT
-) -> tuple[Trajectory, FreeCycle, ForecastSkill | None]:
-    """Run a model freely over the samples that were not fitted, and forecast these again and again.
+) -> tuple[Trajectory, Evaluation]:
+    """Run a model freely over the samples that were not fitted, which it also forecasts.
 
-    Returns its states along the whole record, the free run with its cycle, and the skill of the
-    forecasts. The start is fitted to the samples before. If all were fitted, the whole record is
-    compared, from the first of the states, and there are no forecasts.
+    The start is fitted to the samples before. If all were fitted, the whole record is compared,
+    from the first of the states, and there are no forecasts. Returns the states along the whole
+    record, and the evaluation.
     """
-    model, past, estimator, states_of = (
-        best.found.model, best.states.signal, best.estimator, best.states.along,
-    )  # fmt: skip
-    run, n, n_fitted = signal.run, len(signal.t), len(past.t)
+    past, estimator, states_of = best.states.signal, best.estimator, best.states.along
+    run, n, n_fitted, forecasts = signal.run, len(signal.t), len(past.t), None
     known = estimator.smooth(run) if best.states.hidden else states_of(run)
     whole = complete_states(signal, known)
     if n_fitted == n:
         first, start = int(np.searchsorted(signal.t, best.run.t[0])), best.run.states[0]
     else:
-        first = n_fitted - 1
         estimator = calibrate(estimator, past.run, states_of=states_of, progress=progress)
-        start = estimator.filter(states_of(past.run)).mean
-    with progress.stage(None, "", "free run and limit cycle"):
-        measured, names = whole.window(first, n), [signal.name]
-        free = FreeCycle.of(free_run(model, measured, initial=start, judged=names))
-    skill = None if n_fitted == n else forecast_skill(
-        model, run, n_fitted=n_fitted, states_of=states_of, estimator=estimator,
-        progress=progress,
-    )  # fmt: skip
-    return whole, free, skill
+        first, start = n_fitted - 1, estimator.filter(states_of(past.run)).mean
+        forecasts = partial(
+            forecast_skill, best.found.model, run, n_fitted=n_fitted, states_of=states_of,
+            estimator=estimator, progress=progress,
+        )  # fmt: skip
+    rest = whole.window(first, n)
+    evaluation = evaluate(best.found, rest, initial=start, judged=[signal.name])
+    return whole, replace(evaluation, forecasts=forecasts)
 
 
 def complete_states(signal: Trace, known: Trajectory) -> Trajectory:

@@ -243,10 +243,10 @@ def cycle_figure(
 def _sort_points(
     rows: pd.DataFrame, points: pd.DataFrame, own: np.ndarray, names: list[str]
 ) -> list[Kind]:
-    """The kinds of points that there are, each point with the law's fate nearest to it in rows."""
+    """The kinds of points that there are, each with the law's status nearest to it in rows."""
     grid, at = rows[names].to_numpy(float), points[names].to_numpy(float)
     apart = np.linalg.norm((at[:, None] - grid) / zero_to_one(np.ptp(grid, axis=0)), axis=-1)
-    alive = (rows["fate"] == "oscillates").to_numpy()[apart.argmin(axis=1)]
+    alive = (rows["status"] == "sustained").to_numpy()[apart.argmin(axis=1)]
     quiet = (points["branch"] == "").to_numpy()
     kinds = (
         (own & alive, RECORD, "record"),
@@ -263,7 +263,7 @@ def _draw_map(
 ) -> list[Artist]:
     """Draw the map, and lines where its cycle ends; returns their legend entries."""
     x, y = (np.unique(rows[name].to_numpy(float)) for name in names)
-    fate, faded = (rows["fate"] == "oscillates") - 0.5, FADED + (1.0 - FADED) * rows["inside"]
+    fate, faded = (rows["status"] == "sustained") - 0.5, FADED + (1.0 - FADED) * rows["inside"]
     values, opacity, alive, growth = (
         of.to_numpy(float).reshape(len(x), len(y)).T
         for of in (rows[quantity], faded, fate, rows["growth_per_s"])

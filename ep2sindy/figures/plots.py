@@ -18,7 +18,7 @@ from ep2sindy.figures.fronts import front_figure
 from ep2sindy.figures.living import cycle_figure, free_run_figure
 from ep2sindy.figures.operating import cycle_figure as law_cycle_figure
 from ep2sindy.figures.series import data_figure
-from ep2sindy.model.free_run import FreeRun
+from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import law_map, map_points
@@ -57,7 +57,7 @@ def plot(value: object, *rest: object, **settings: object) -> Figure:
     plot(found): the candidates of every equation of a `Discovery`, the selected ones marked: error
     against number of terms after a regression, score after a search of trajectories.
     plot(found.fronts["x"]): the same for one equation.
-    plot(free): the model of a `FreeRun` over its record, the first periods and the last.
+    plot(free): the model of an `Evaluation` over its record, the first periods and the last.
     plot(cycle, run=None): a `LimitCycle` in the plane of the first two states, with runs from other
     starts. run: samples to draw behind it, of at least these two states.
     plot(law, records, n_points=25, labels={}): frequency and amplitude of the cycle of an
@@ -95,7 +95,7 @@ def _(front: ParetoFront) -> Figure:
 
 
 @plot.register
-def _(run: FreeRun) -> Figure:
+def _(run: Evaluation) -> Figure:
     states = run.record.columns(run.model.states)
     record = replace(run.record, states=states, state_names=run.model.states, missing=None)
     slowest_Hz = min(dominant_frequency(record.t, column) for column in record.states.T)

@@ -75,20 +75,20 @@ def trajectory_figure(
     rollouts: Mapping[str, Rollout],
     *,
     duration_s: float,
-    verdicts: Mapping[str, str] = MappingProxyType({}),
+    statuses: Mapping[str, str] = MappingProxyType({}),
     since: str = SINCE_START,
 ) -> Figure:
     """A row per model: its run from the data's first sample (colour) over the data (grey).
 
     Carets mark where a run leaves the panel; a cross marks where a diverged run stops inside it.
-    verdicts: by name, the verdict on the run. since: the origin of the time axis, in words.
+    statuses: by name, how the run goes. since: the origin of the time axis, in words.
     """
     data = first_part(run.t, run.states, duration_s, run.clock)
     models = {n: first_part(r.t, r.states, duration_s, run.clock) for n, r in rollouts.items()}
     titles = [axis_label(name, run.units[name]) for name in run.state_names]
     return _draw_rows(
         data, models, titles=titles, x_label=_time_label(run.clock, duration_s, since),
-        labels=run_labels(rollouts, verdicts), limits=limits_of(data, models),
+        labels=run_labels(rollouts, statuses), limits=limits_of(data, models),
         diverged=find_diverged(rollouts, duration_s),
     )[0]  # fmt: skip
 
@@ -121,12 +121,12 @@ def spectrum_figure(
     rollouts: Mapping[str, Rollout],
     *,
     f_max_Hz: float,
-    verdicts: Mapping[str, str] = MappingProxyType({}),
+    statuses: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
     """A row per model: power spectra of its run (colour) and of the data of equal length (grey).
 
     The dashed line marks the data's dominant frequency; each row states its model's.
-    verdicts: by name, the verdict on the run.
+    statuses: by name, how the run goes.
     """
     n_samples = max(len(rollout.t) for rollout in rollouts.values())
     data = _spectra(run.t[:n_samples], run.states[:n_samples], f_max_Hz, run.clock)
@@ -134,7 +134,7 @@ def spectrum_figure(
     titles = [f"power of {axis_label(name, _power_unit(run, name))}" for name in run.state_names]
     figure, axes = _draw_rows(
         data, models, titles=titles, x_label=_frequency_label(run.clock, f_max_Hz),
-        labels=run_labels(rollouts, verdicts),
+        labels=run_labels(rollouts, statuses),
     )  # fmt: skip
     for k, column in enumerate(axes.T):
         peak = run.clock.frequency_scale(f_max_Hz)[0] * dominant_frequency(run.t, run.states[:, k])
@@ -255,15 +255,15 @@ def find_diverged(rollouts: Mapping[str, Rollout], duration_s: float) -> set[str
     return {name for name, r in rollouts.items() if r.diverged and r.lasted_s <= duration_s}
 
 
-def run_labels(rollouts: Mapping[str, Rollout], verdicts: Mapping[str, str]) -> dict[str, str]:
-    """Row labels: the name, and below it the verdict if it is known.
+def run_labels(rollouts: Mapping[str, Rollout], statuses: Mapping[str, str]) -> dict[str, str]:
+    """Row labels: the name, and below it the status if it is known.
 
-    verdicts: by name; for a diverged run the label gives the time since its start instead.
+    statuses: by name; for a diverged run the label gives the time since its start instead.
     """
     found = {}
     for name, rollout in rollouts.items():
-        verdict = when_it_diverges(rollout) if rollout.diverged else verdicts.get(name)
-        found[name] = f"{name}\n({verdict})" if verdict else name
+        status = when_it_diverges(rollout) if rollout.diverged else statuses.get(name)
+        found[name] = f"{name}\n({status})" if status else name
     return found
 
 
@@ -277,17 +277,17 @@ def phase_figure(
     rollouts: Mapping[str, Rollout],
     *,
     duration_s: float,
-    verdicts: Mapping[str, str] = MappingProxyType({}),
+    statuses: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
     """A panel per model in the plane of the first two states: its run (colour) over data (grey).
 
-    The dot marks the start; other marks and verdicts are as in `trajectory_figure`.
+    The dot marks the start; other marks and statuses are as in `trajectory_figure`.
     """
     data = first_part(run.t, run.states[:, :2], duration_s, run.clock)
     models = {
         n: first_part(r.t, r.states[:, :2], duration_s, run.clock) for n, r in rollouts.items()
     }
-    diverged, labels = find_diverged(rollouts, duration_s), run_labels(rollouts, verdicts)
+    diverged, labels = find_diverged(rollouts, duration_s), run_labels(rollouts, statuses)
     x_label, y_label = (axis_label(name, run.units[name]) for name in run.state_names[:2])
     figure, axes = make_grid(
         len(models), width=2.75, height=2.75, extra=0.7, sharex=True, sharey=True, x_label=x_label

@@ -25,13 +25,13 @@ from ep2sindy.figures.style import (
 def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
     """Loss of refinement, and frequency error and nrmse on held-out data, by window length.
 
-    rows: method, window (samples), loss, f_error, nrmse, f_error_started, nrmse_started.
+    rows: fit, window (samples), loss, f_error, nrmse, f_error_started, nrmse_started.
     period: of the data, in samples.
     """
     figure, (axes,) = make_panels(1, 3, (WIDTH, 3.6), sharex=True)
     lengths = [int(n) for n in rows["window"].unique()]
     titles = ("loss (1: a constant)", "frequency error (%)", "nrmse on held-out data")
-    for (name, each), colour in zip(rows.groupby("method", sort=False), COLOURS, strict=False):
+    for (name, each), colour in zip(rows.groupby("fit", sort=False), COLOURS, strict=False):
         style = {"color": colour, "marker": "o", "ms": 3.5, "lw": 1.2}
         axes[0].plot(each["window"], each["loss"], label=name, **style)
         for ax, key, factor in ((axes[1], "f_error", 100.0), (axes[2], "nrmse", 1.0)):
@@ -58,7 +58,7 @@ def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
 def window_error_figure(cells: pd.DataFrame, *, references: Sequence[str]) -> Figure:
     """Coefficient error against noise: a panel per window length, a line per number of windows.
 
-    cells: from `studies.weak_windows.window_cells`. references: settings without a choice of
+    cells: from `studies.weak_windows.error_cells`. references: forms without a choice of
     windows, drawn in every panel.
     """
     # Errors without noise come from the quadrature and are decades lower; see the table.
@@ -70,7 +70,7 @@ def window_error_figure(cells: pd.DataFrame, *, references: Sequence[str]) -> Fi
     for ax, n_points in zip(axes, lengths, strict=True):
         for style, name in zip(("--", "-", ":"), references, strict=False):
             label = name.replace("_", ", ")
-            _draw_error(ax, shown[shown["setting"] == name], label=label, color=DATA, ls=style)
+            _draw_error(ax, shown[shown["fit"] == name], label=label, color=DATA, ls=style)
         panel = shown[shown["n_points"] == n_points]
         for colour, n_windows in zip(COLOURS, panel["n_windows"].unique(), strict=False):
             one = panel[panel["n_windows"] == n_windows]

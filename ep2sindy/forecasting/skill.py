@@ -196,12 +196,17 @@ def _fitted_part(model: SparseModel, record: Trajectory, n_fitted: int) -> Traje
             f"the skill of forecasts is counted for models without inputs: this one is driven by "
             f"{list(model.inputs)}, whose future nobody knows; compare `model.rollout` along them"
         )
+    check_fitted(record, n_fitted)
+    return record.window(0, n_fitted)
+
+
+def check_fitted(record: Trajectory, n_fitted: int) -> None:
+    """Raise ValueError for a fitted or a held-out part of too few samples."""
     if not 8 <= n_fitted <= record.n_samples - 4:
         raise ValueError(
             "the fitted part must have eight samples or more, and leave four: "
             f"n_fitted={n_fitted} came for {record.n_samples} samples"
         )
-    return record.window(0, n_fitted)
 
 
 def _period_of(run: Trajectory, names: Sequence[str]) -> float:

@@ -43,22 +43,21 @@ SPIRALS = 1.5
 FIRST_PERIOD, TOO_NOISY = 0.3, 0.1
 
 
-class Verdict(StrEnum):
-    """Verdict on a free run, the best first.
+class Status(StrEnum):
+    """How a model's run goes beside a record, the best first.
 
-    lives: it stays on the data's cycle. follows: the data grow or decay, and it does, too, at the
-    same rate. alike: the data do not repeat themselves, and it has their distributions and spectra;
-    how far it forecasts them is not said (`forecast_skill`). slips: it is on the data's cycle, but
-    out of step with it. unlike: the data have no cycle, and it is neither of the above.
+    sustained: it stays on the record's cycle. wrong frequency: amplitudes and waveform are the
+    record's, and the frequency is not, or the run misses the record in the first period already.
+    no cycle to compare: the record grows, decays or does not repeat itself; `is_similar` says
+    whether the run has its envelope or its statistics. How far it forecasts such a record is not
+    said (`Evaluation.forecast`).
     """
 
-    LIVES = "lives"
-    FOLLOWS = "follows"
-    ALIKE = "alike"
-    SLIPS = "slips"
+    SUSTAINED = "sustained"
+    WRONG_FREQUENCY = "wrong frequency"
     WRONG_CYCLE = "wrong cycle"
-    UNLIKE = "unlike"
-    DIES_OUT = "dies out"
+    NO_CYCLE = "no cycle to compare"
+    DECAYS = "decays"
     NEGATIVE = "turns negative"
     LEAVES_DOMAIN = "leaves the domain"
     DIVERGES = "diverges"
@@ -66,7 +65,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class FreeRunBounds:
-    """Largest deviations from the data at which the verdict on a run is still `lives`.
+    """Largest deviations from the data at which a run still counts as sustained.
 
     frequency, amplitude: relative error of the frequency and of each state's standard deviation.
     waveform: RMS difference of the waveforms, in standard deviations.
@@ -91,9 +90,10 @@ class FreeRunBounds:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Comparison of one run with a record; the fields are those of `FreeRun`."""
+    """Comparison of one run with a record; the fields are those of `Evaluation`."""
 
-    verdict: Verdict
+    status: Status
+    is_similar: bool
     f_error: float
     spectrum: float
     by_state: Mapping[str, Float[np.ndarray, " n_states"]]
@@ -155,32 +155,36 @@ class ComparedRecord:
         nothing = np.full(states.shape[1], np.nan)
         by_state = dict.fromkeys(("amplitude_ratio", "waveform_error", "distribution"), nothing)
         if len(states) < len(self.t) or not np.isfinite(states).all():
-            return Comparison(Verdict.DIVERGES, np.nan, np.nan, by_state)
+            return Comparison(Status.DIVERGES, False, np.nan, np.nan, by_state)
         half = len(states) // 2 if self._is_long else 0
         late = states[half:]
         by_state["distribution"] = distribution_distances(self.states[half:], late)
         by_state["amplitude_ratio"] = late.std(axis=0) / self.std
         spectrum = spectrum_distance(self.t[half:], self.states[half:], late)
         if turns_negative(late, self.densities, self.std):
-            return Comparison(Verdict.NEGATIVE, np.nan, spectrum, by_state)
+            return Comparison(Status.NEGATIVE, False, np.nan, spectrum, by_state)
         middle = len(states) // 2
         if has_decayed(states[middle:], self.states[middle:], DIED_OUT).all():
-            return Comparison(Verdict.DIES_OUT, np.nan, spectrum, by_state)
+            return Comparison(Status.DECAYS, False, np.nan, spectrum, by_state)
         if self._spirals:
-            verdict = Verdict.FOLLOWS if self._is_followed(states, bounds) else Verdict.UNLIKE
-            return Comparison(verdict, np.nan, spectrum, by_state)
-        if not self._repeats and self._is_alike(by_state["distribution"], spectrum, bounds):
-            return Comparison(Verdict.ALIKE, np.nan, spectrum, by_state)
-        if self.cycle is None:
-            return Comparison(Verdict.UNLIKE, np.nan, spectrum, by_state)
+            is_similar = self._is_followed(states, bounds)
+            return Comparison(Status.NO_CYCLE, is_similar, np.nan, spectrum, by_state)
+        is_similar = not self._repeats and self._is_alike(
+            by_state["distribution"], spectrum, bounds
+        )
+        if is_similar or self.cycle is None:
+            return Comparison(Status.NO_CYCLE, is_similar, np.nan, spectrum, by_state)
         f_error, amplitude, waveform = compare_cycles(self.cycle, self.t[half:], late)
         if np.isnan(f_error):
-            return Comparison(Verdict.WRONG_CYCLE, f_error, spectrum, by_state)
+            return Comparison(Status.WRONG_CYCLE, False, f_error, spectrum, by_state)
         by_state |= {"amplitude_ratio": amplitude, "waveform_error": waveform}
-        verdict = self._with_period(f_error, amplitude, waveform, bounds)
-        if verdict is Verdict.LIVES and self._begins_apart(states):
-            verdict = Verdict.SLIPS
-        return Comparison(verdict, f_error, spectrum, by_state)
+        if deviation(0.0, amplitude, waveform, bounds) > 1.0:
+            status = Status.WRONG_CYCLE
+        elif abs(f_error) > bounds.frequency or self._begins_apart(states):
+            status = Status.WRONG_FREQUENCY
+        else:
+            status = Status.SUSTAINED
+        return Comparison(status, status is Status.SUSTAINED, f_error, spectrum, by_state)
 
     def _begins_apart(self, states: np.ndarray) -> bool:
         """True if a run begins on the record, and misses it by much in its first period already."""
@@ -221,13 +225,6 @@ class ComparedRecord:
         """True if half of the record holds enough periods to compare."""
         return self._repeats and self.cycle is not None and self.cycle.n_periods >= LONG
 
-    def _with_period(
-        self, f_error: float, amplitude: np.ndarray, waveform: np.ndarray, bounds: FreeRunBounds
-    ) -> Verdict:
-        if deviation(0.0, amplitude, waveform, bounds) > 1.0:
-            return Verdict.WRONG_CYCLE
-        return Verdict.LIVES if abs(f_error) <= bounds.frequency else Verdict.SLIPS
-
     def _is_alike(self, distribution: np.ndarray, spectrum: float, bounds: FreeRunBounds) -> bool:
         """True if the run is about as close to the record as its quarters are to each other."""
         apart, apart_spectrum = quarter_distances(self.t, self.states)
@@ -264,3 +261,24 @@ def turns_negative(
     """True if a density on a path is negative by more than rounding and noise of its start."""
     columns = list(densities)
     return bool((path[:, columns] < -BELOW_ZERO * std[columns]).any())
+
+
+def columns_of(states: Sequence[str], judged: Sequence[str] | None) -> list[int]:
+    """Column indices of the judged states, None meaning all; ValueError for an unknown state."""
+    names = list(states if judged is None else judged)
+    if not names or not set(names) <= set(states):
+        raise ValueError(f"judged must name some of the states {list(states)}: {names} came")
+    return [list(states).index(name) for name in names]
+
+
+def samples_in(run: Trajectory, duration_s: float) -> int:
+    """Number of samples in the first `duration_s`, or of all samples if the data end earlier.
+
+    Raises ValueError for a duration that holds fewer than two samples.
+    """
+    n = int(np.searchsorted(run.t, run.t[0] + duration_s * (1 + 1e-9), side="right"))
+    if n < 2:
+        raise ValueError(
+            f"a window must hold two samples: {duration_s:g} s was asked of steps of {run.dt_s:g} s"
+        )
+    return n

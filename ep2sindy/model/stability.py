@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import partial
 
 import numpy as np
@@ -43,14 +42,6 @@ SHRUNK, LEAST_WAIT, MOST_WAIT = 3.0, 40.0, 400.0
 BLOW_UP, PATIENCE = 30.0, 4.0
 
 
-class CycleStability(StrEnum):
-    """Stability of a cycle: a small departure from it decays, persists, or grows."""
-
-    ATTRACTING = "attracting"
-    NEUTRAL = "neutral"
-    REPELLING = "repelling"
-
-
 @dataclass(frozen=True, eq=False)
 class LimitCycle:
     """A periodic orbit of an autonomous model, with its Floquet multipliers.
@@ -82,12 +73,15 @@ class LimitCycle:
         return float(np.abs(self.multipliers[1:]).max(initial=0.0))
 
     @property
-    def stability(self) -> CycleStability:
-        """By the largest of the other multipliers; neutral if it is within 1e-3 of one."""
+    def stability(self) -> str:
+        """Attracting, neutral or repelling: a small departure decays, persists or grows.
+
+        By the largest of the other multipliers; neutral if it is within 1e-3 of one.
+        """
         largest = self.largest_multiplier
         if abs(largest - 1.0) <= NEUTRAL_WITHIN:
-            return CycleStability.NEUTRAL
-        return CycleStability.ATTRACTING if largest < 1.0 else CycleStability.REPELLING
+            return "neutral"
+        return "attracting" if largest < 1.0 else "repelling"
 
 
 def limit_cycle(
@@ -120,7 +114,7 @@ def limit_cycle(
     cycle = find(model, start) or find(model, start, n_settling=N_SETTLING)
     if cycle is None:
         return _backwards(model, start, period_s=period_s, n_samples=n_samples)
-    if cycle.stability is not CycleStability.REPELLING:
+    if cycle.stability != "repelling":
         return cycle
     # Near a repelling orbit the solver's errors grow forwards in time and decay backwards.
     start, period_s = cycle.states[0], cycle.period_s

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
-from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeRun, cycle_of, free_run
+from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.law import read_law
 from ep2sindy.operating.point_fits import PointFits
@@ -35,14 +35,13 @@ class LeftOutRun:
     """
 
     record: OperatingRecord
-    run: FreeRun
+    run: Evaluation
     inside: bool
 
     @property
     def attracts(self) -> bool:
         """True if the run ends on a cycle that attracts, and so sets the amplitude by itself."""
-        cycle = cycle_of(self.run)
-        return cycle is not None and cycle.largest_multiplier < PULL
+        return self.run.multiplier < PULL
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +93,7 @@ def run_left_out(trial: LawTrial, records: Sequence[OperatingRecord]) -> list[Le
     runs = []
     for k, record in enumerate(records):
         law = trial.fits.law_without(k, trial.functions)
-        run = free_run(read_law(law, record.parameters), record.from_slowest)
+        run = evaluate(read_law(law, record.parameters), record.from_slowest)
         runs.append(LeftOutRun(record, run, law.is_inside(record.parameters)))
     return runs
 
@@ -112,7 +111,7 @@ def error_statistics(left_out: Sequence[LeftOutRun]) -> dict[str, float | int]:
     waveform = np.array([max(each.run.waveform_error.values()) for each in left_out])
     return {
         "n": len(left_out),
-        "n_lives": sum(each.run.verdict is Verdict.LIVES for each in left_out),
+        "n_lives": sum(each.run.status is Status.SUSTAINED for each in left_out),
         "diverging": sum(each.run.rollout.diverged for each in left_out),
         "f_median": float(np.median(f)),
         "f_90": float(np.quantile(f, 0.9, method="higher")),

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from itertools import product
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.model.comparison import Status
 from ep2sindy.model.fixed_point import rest_point
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import simulate
-from ep2sindy.model.stability import CycleStability, limit_cycle
+from ep2sindy.model.stability import limit_cycle
 from ep2sindy.operating.law import OperatingLaw, read_law
 from ep2sindy.operating.records import OperatingRecord, Point, read_points
 from ep2sindy.signals.spectrum import SIMULATED, relative_amplitude
@@ -31,19 +31,12 @@ N_PERIODS = 40  # length of a run, in which it may settle
 MAX_PARAMETERS = 2  # most parameters of a map that can be drawn
 
 
-class Fate(StrEnum):
-    """Behaviour of a model at an operating point, started near the cycle of the nearest record."""
-
-    OSCILLATES = "oscillates"
-    RESTS = "rests"
-    DIVERGES = "diverges"
-
-
 @dataclass(frozen=True, eq=False)
 class MapPoint:
     """A law's model at one operating point.
 
-    inside: True in the hull of the records.
+    inside: True in the hull of the records. status: of a run that starts near the cycle of the
+    nearest record: sustained, decays to a fixed point, or diverges.
     frequency_Hz, relative_amplitude: of its cycle (standard deviation over mean, root mean square
     over the states); NaN without a cycle.
     growth_per_s: largest real part of the fixed point's eigenvalues, in 1/s, positive if it is
@@ -53,7 +46,7 @@ class MapPoint:
 
     parameters: Point
     inside: bool
-    fate: Fate
+    status: Status
     frequency_Hz: float
     relative_amplitude: float
     growth_per_s: float
@@ -65,7 +58,7 @@ class MapPoint:
         return {
             **self.parameters,
             "inside": self.inside,
-            "fate": str(self.fate),
+            "status": str(self.status),
             "f_kHz": 1e-3 * self.frequency_Hz,
             "relative_amplitude": self.relative_amplitude,
             "growth_per_s": self.growth_per_s,
@@ -105,28 +98,28 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Point) -> MapP
     period_s = 1.0 / record.cycle.frequency_Hz
     start = record.run.states[record.slowest]
     mean, frequency_Hz, amplitude, second = record.cycle.mean, np.nan, np.nan, np.nan
-    fate, late = _run(model, start, period_s, np.abs(record.run.states).max(axis=0))
-    if fate is Fate.OSCILLATES:
+    status, late = _run(model, start, period_s, np.abs(record.run.states).max(axis=0))
+    if status is Status.SUSTAINED:
         cycle = limit_cycle(model, late, period_s=period_s)
-        if cycle is None or cycle.stability is CycleStability.REPELLING:
-            fate = Fate.RESTS if cycle is None else Fate.DIVERGES
+        if cycle is None or cycle.stability == "repelling":
+            status = Status.DECAYS if cycle is None else Status.DIVERGES
         else:
             mean = cycle.states.mean(axis=0)
             frequency_Hz = 1.0 / cycle.period_s
             amplitude = relative_amplitude(mean, cycle.states.std(axis=0))
             second = cycle.largest_multiplier
-            fate = Fate.OSCILLATES if amplitude >= STILL else Fate.RESTS
-    elif fate is Fate.RESTS:
+            status = Status.SUSTAINED if amplitude >= STILL else Status.DECAYS
+    elif status is Status.DECAYS:
         mean = late
     rest = rest_point(model, mean, record.cycle.std, record.run.states.min(axis=0) > 0.0)
     growth = np.nan if rest is None else rest.growth_per_s
-    if fate is Fate.DIVERGES and growth * period_s < -NEUTRAL:
+    if status is Status.DIVERGES and growth * period_s < -NEUTRAL:
         # The fixed point is stable, but the record's cycle lies outside its basin: the model rests.
-        fate = Fate.RESTS
+        status = Status.DECAYS
     return MapPoint(
         parameters=dict(point),
         inside=law.is_inside(point),
-        fate=fate,
+        status=status,
         frequency_Hz=float(frequency_Hz),
         relative_amplitude=float(amplitude),
         growth_per_s=growth,
@@ -139,13 +132,13 @@ def _run(
     start: Float[np.ndarray, " n_states"],
     period_s: float,
     reach: Float[np.ndarray, " n_states"],
-) -> tuple[Fate, Float[np.ndarray, " n_states"]]:
-    """Fate of a run from a start, and its final state. reach: largest states of the record."""
+) -> tuple[Status, Float[np.ndarray, " n_states"]]:
+    """Status of a run from a start, and its final state. reach: largest states of the record."""
     n = 50
     t = np.linspace(0.0, N_PERIODS * period_s, N_PERIODS * n + 1)
     run = simulate(model, t, start, None, blow_up=1e3, rtol=1e-7, reach=reach)
     if run.diverged or not np.isfinite(run.states).all():
-        return Fate.DIVERGES, start
+        return Status.DIVERGES, start
     late = run.states[-5 * n :]
     amplitude = relative_amplitude(late.mean(axis=0), late.std(axis=0))
-    return (Fate.OSCILLATES if amplitude >= STILL else Fate.RESTS), run.states[-1]
+    return (Status.SUSTAINED if amplitude >= STILL else Status.DECAYS), run.states[-1]

@@ -107,12 +107,13 @@ class Report:
         title: str = "",
         note: str = "",
         bold: Sequence[int] = (),
+        page_only: bool = False,
     ) -> None:
         """Add a table: tables/NAME.csv, an entry of the summary, and its place on the page.
 
         rows: records with their metrics, of which some are in the headline; or the table itself.
         heading, by_state: see `ResultTable.csv`. shown: False leaves it out of screen and page; or
-        another form of it for these. title, note, bold: of the table on the page.
+        another form of it for these. title, note, bold, page_only: of the table as it is shown.
         """
         if isinstance(rows, ResultTable):
             frame, self.summary[name] = rows.csv(heading, by_state=by_state), rows.json()
@@ -124,7 +125,7 @@ class Report:
         if isinstance(shown, Table):
             self.add(shown)
         elif shown and len(seen):
-            self.add(Table(seen, title=title, note=note, bold=bold))
+            self.add(Table(seen, title=title, note=note, bold=bold, page_only=page_only))
 
     def samples(self, name: str, frame: pd.DataFrame) -> None:
         """Add samples, such as those that a figure draws: tables/NAME.csv alone."""

@@ -12,15 +12,16 @@ from jaxtyping import Float
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.model.comparison import (
     FreeRunBounds,
-    Verdict,
+    Status,
+    columns_of,
     compare_cycles,
     densities_of,
     deviation,
     turns_negative,
 )
-from ep2sindy.model.free_run import FreeRun, columns_of, free_run
 from ep2sindy.model.inputs import curve_through
 from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.model import SparseModel
@@ -105,7 +106,7 @@ class Confirmed:
 
     number: int
     trial: Trial
-    run: FreeRun
+    run: Evaluation
     share: float
     broken: Sequence[str]
     repels: bool = False
@@ -125,13 +126,12 @@ class Confirmed:
         is_close = ours.waveform <= ALIKE * theirs.waveform
         return ours.loss < GAIN * theirs.loss or (is_equal and is_close)
 
-    def rank(self) -> tuple[bool, int, bool, bool, bool, int, float]:
+    def rank(self) -> tuple[bool, bool, int, bool, bool, bool, int, float]:
         """Sorts the best first; the first of equals wins."""
-        verdict = list(Verdict).index(self.run.verdict)
         size = self.trial.system.n_free
         return (
             bool(self.broken),
-            verdict,
+            *self.run.rank,
             self.repels,
             not self.share,
             not self.is_global,
@@ -141,8 +141,8 @@ class Confirmed:
 
     def text(self, n_living: int, n_systems: int) -> str:
         """How the system was confirmed, in words."""
-        how = self.run.words(seen=not n_living)
-        if self.run.verdict is Verdict.LIVES and not self.share:
+        how = self.run.text if n_living else f"{self.run.text} where fitted"
+        if self.run.status is Status.SUSTAINED and not self.share:
             how = f"{how}, on a cycle that {'repels' if self.repels else 'does not attract'}"
         elif self.share and not self.run.model.inputs:
             how = f"{how}, {100.0 * self.share:.0f} % of starts reach it"
@@ -348,7 +348,7 @@ class FreeRunScore:
                 seed=self.seed,
             )
             own = self._confirm(k, trials[k], model, records)
-            living_on = [each for each in found if each.run.verdict is Verdict.LIVES]
+            living_on = [each for each in found if each.run.status is Status.SUSTAINED]
             resting = [each for each in living_on if not each.share and not each.repels]
             if own.share and resting and not own.outdoes(resting[0]):
                 own = replace(own, share=0.0)  # it attracts by chance
@@ -365,13 +365,13 @@ class FreeRunScore:
         pairs = zip(records.runs, records.cycles, strict=True)
         longest, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
         start = cycle.waveform(cycle.phase[:1])[0]
-        run = free_run(model, longest, initial=start, bounds=self.bounds, judged=self.judged)
-        lives, period_s = run.verdict is Verdict.LIVES, 1.0 / records.cycles[0].frequency_Hz
+        run = evaluate(model, longest, initial=start, bounds=self.bounds, judged=self.judged)
+        lives, period_s = run.status is Status.SUSTAINED, 1.0 / records.cycles[0].frequency_Hz
         share, repels = _attraction(run, period_s) if lives else (0.0, False)
         return Confirmed(number, trial, run, share, trial.system.broken(model), repels)
 
 
-def _attraction(run: FreeRun, period_s: float) -> tuple[float, bool]:
+def _attraction(run: Evaluation, period_s: float) -> tuple[float, bool]:
     """Share of starts that reach the model's cycle, and whether departures from it grow.
 
     The share is zero if departures do not die out. A model with inputs is followed from its start

@@ -12,11 +12,12 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.living import balance_figure
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.relations import Constraint, Process, constraint
 from ep2sindy.library.roles import constraint_of, process_amounts
 from ep2sindy.model.comparison import FreeRunBounds
-from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
@@ -203,7 +204,7 @@ class TermRole:
     term: str
     coef: float
     is_known: bool
-    without: FreeRun | None
+    without: Evaluation | None
     counterpart: float = float("nan")
     fit_r2: float = float("nan")
 
@@ -249,12 +250,12 @@ class ModelBalance:
 
 
 def add_balance(
-    report: Report, name: str, found: ModelBalance, data: Trajectory, *, period_s: float | None
+    report: Report, name: str, found: ModelBalance, data: Trajectory, cycle: LimitCycle | None
 ) -> None:
     """Add the processes, then one row per term, and the model without it.
 
-    name: of the library. data: samples of the processes. period_s: of the model's cycle; without
-    one there is no figure.
+    name: of the library. data: samples of the processes. cycle: of the model; without one there is
+    no figure.
     """
     report.section(f"{name}: what the terms mean", level=3)
     if found.processes:
@@ -262,8 +263,8 @@ def add_balance(
         rows = ResultTable(found.processes, PROCESSES)
         report.table(f"balance_{name}", rows, title=title, note=NOTE)
     known = [each for each in found.processes if each.recorded is not None]
-    if known and period_s is not None:
-        shown = data.t - data.t[0] <= 2.0 * period_s
+    if known and cycle is not None:
+        shown = data.t - data.t[0] <= 2.0 * cycle.period_s
         parts = {each.name: (each.recorded[shown], each.modelled[shown]) for each in known}  # type: ignore[index]
         draw = partial(balance_figure, data.t[shown], parts, clock=data.clock)
         report.figure(f"balance_{name}", draw, CAPTION)
@@ -307,7 +308,7 @@ def _roles(
     model: SparseModel,
     held_to: Constraint,
     processes: Sequence[ComparedProcess],
-    left_out: Sequence[FreeRun | None],
+    left_out: Sequence[Evaluation | None],
 ) -> list[TermRole]:
     """The terms of all processes, or of all equations if there are none."""
     if not processes:
@@ -336,7 +337,7 @@ def _without(
     progress: Progress,
     *,
     window: int | None,
-) -> FreeRun | None:
+) -> Evaluation | None:
     """The model refined under a constraint with fewer terms, and run; None if it is not finite."""
     from ep2sindy.refinement.refine import refine, with_coef  # loads torch, only for a refinement
 
@@ -349,7 +350,7 @@ def _without(
     )
     if found.status == "non_finite":
         return None
-    return free_run(found.model, held, initial=start_of(held, found.model), bounds=bounds)
+    return evaluate(found.model, held, initial=start_of(held, found.model), bounds=bounds)
 
 
 def _each_left_out(

@@ -18,12 +18,12 @@ import pandas as pd
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from ep2sindy.data.trajectory import Trajectory, point_label
+from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
 from ep2sindy.figures.windows import loss_against_window_figure
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
-from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeRun, free_run, samples_in
+from ep2sindy.model.comparison import Status, samples_in
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 from ep2sindy.refinement.windows import MIN_SAMPLES, dominant_window
@@ -31,16 +31,16 @@ from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.formulations import Weak
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.windows import Boxes
-from ep2sindy.report.document import Text
+from ep2sindy.report.document import Result, Text
 from ep2sindy.report.models import equations, interval_table
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
-from ep2sindy.runtime.progress import Progress, count_pieces
+from ep2sindy.runtime.progress import count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.balance import compared_processes
 from ep2sindy.studies.point_sources import Points, given_points
-from ep2sindy.studies.source import NO_ZONES, Source, Zones, zones_of
-from ep2sindy.studies.structures import Structure, Structures, balance_model, split_in_time
+from ep2sindy.studies.processes import compared_processes
+from ep2sindy.studies.source import NO_ZONES, DivergedError, Source, Zones, split_in_time, zones_of
+from ep2sindy.studies.structures import Structure, Structures, balance_model
 from ep2sindy.studies.study import (
     Check,
     Count,
@@ -49,7 +49,14 @@ from ep2sindy.studies.study import (
     PositiveOrAll,
     ShareOrNone,
 )
-from ep2sindy.studies.views import PlotRange, add_figures, add_samples, best_run, found_model
+from ep2sindy.studies.views import (
+    EVALUATION,
+    PlotRange,
+    add_figures,
+    add_samples,
+    best_run,
+    found_model,
+)
 
 if TYPE_CHECKING:
     from ep2sindy.refinement.problem import Iteration, RefinementSettings
@@ -57,15 +64,15 @@ if TYPE_CHECKING:
 
 BALANCE = "balance"  # the form of a fit of every process to the recorded balance
 DIVERGED = 10.0  # residual, in std, at samples that a run diverges before
-STARTED = "started"
+STARTED = "_started"
 INTERVALS = (
     "The intervals say how far noise, or the residuals of windows, move the coefficients if these "
     "terms are the whole law; what the terms lack, they do not count."
 )
 NOTE = (
-    "Amplitude: standard deviation against the data's. Start fitted: frequency error and nrmse from "
-    "a start fitted to the first one and a half periods, since a single sample may lie off every "
-    "orbit of the model. R2: of the derivative, on a fit's own rows, which windows average."
+    "Amplitude: standard deviation against the data's. In files, started: from a start fitted to the "
+    "first one and a half periods, since a single sample may lie off every orbit of the model; r2: "
+    "of the derivative, on the rows of the fit, which windows average."
 )
 CAPTION = (
     "Refinement with windows of several lengths: loss on the fitted part, where each window has a "
@@ -84,7 +91,7 @@ class Fit:
     form: of the regression, one of those that the config names; None means the formulation;
     "balance" fits every process to the rate that a simulation records. relations: whether those of
     a structure hold. refine: whether trajectories are followed then. n_points, n_windows: of random
-    windows, for a form that has them; every combination is a fit of its own.
+    windows, for a form that has them; every combination is a fit of its own, `n_points_70`.
     """
 
     form: str | None = None
@@ -118,8 +125,9 @@ def expand(
         own = form.test_functions
         for n_windows, n_points in product(fit.n_windows or [own.n_windows], fit.n_points):
             boxes = replace(own, n_points=n_points, n_windows=n_windows)
-            several = f"_{n_windows}" if len(fit.n_windows) > 1 else ""
-            found[f"{name}{several}_{n_points}"] = fit, replace(form, test_functions=boxes)
+            varying = {"n_windows": n_windows} if len(fit.n_windows) > 1 else {}
+            words = (f"{key}_{value}" for key, value in (varying | {"n_points": n_points}).items())
+            found["_".join(words)] = fit, replace(form, test_functions=boxes)
     return found
 
 
@@ -150,8 +158,8 @@ class Fitted:
 
     model: SparseModel
     held_to: Constraint | None
-    from_sample: FreeRun
-    from_fit: FreeRun
+    from_sample: Evaluation
+    from_fit: Evaluation
     cpu_s: float
     r2: Mapping[str, float]
     refinement: Refinement | None = None
@@ -169,9 +177,9 @@ class Study:
     models: structures by name. fits: the ways of fitting, by name. forms: forms of the regression
     besides the formulation, by name. held_out: share at the end of the record over which models
     run; None fits and runs over all of it. rollout_s: longest run; None means to the end.
-    n_windows, periods: number and length of the windows of refinements; window: the same in
-    samples, in place of periods. windows: lengths for loss against window length. n_draws: number
-    of draws of windows, for the spread of the refinements.
+    n_windows, periods, window, n_reweights: of refinements, see `ep.RefinementSettings`. windows:
+    lengths for loss against window length. n_draws: number of draws of windows, for the spread of
+    the refinements.
     points: operating points, at each of which all is fitted; None for one record. parameters: their
     places in the data group. thesis: published coefficients, shown beside ours.
     """
@@ -187,6 +195,7 @@ class Study:
     n_windows: Count = 30
     periods: Positive = 2.0
     window: CountOrNone = None
+    n_reweights: Whole = 1
     windows: Sequence[int] = ()
     n_draws: Whole = 0
     points: Points | None = None
@@ -225,11 +234,16 @@ class Study:
         given = given_points(self.points, self.parameters, self.source)
         inputs = self.source.inputs(libraries.values())
         for point in count_pieces(report.watch, given.sources(self.source), "operating point"):
-            field = point.source.field()
-            label = point_label(point.parameters)
-            data = point.source.trajectory.trajectory(field, inputs=inputs, label=label)
-            data = replace(data, parameters=point.parameters)
-            yield self._parted(label, data, zones_of(point.source, field, report))
+            label, sampling = point_label(point.parameters), point.source.trajectory
+            try:
+                field = point.source.field()
+                data = sampling.trajectory(field, inputs=inputs, label=label)
+                data = replace(data, parameters=point.parameters)
+                record = self._parted(label, data, zones_of(point.source, field, report))
+            except (ConstantStateError, DivergedError) as error:
+                report.warn(f"{label} is left out: {error}")
+                continue
+            yield record
 
     def _parted(self, label: str, data: Trajectory, zones: Zones) -> Record:
         parts = (data, data) if self.held_out is None else split_in_time(data, self.held_out)
@@ -271,13 +285,16 @@ class Study:
         from ep2sindy.refinement.problem import RefinementSettings  # PyTorch takes seconds to load
 
         periods = self.periods if self.window is None else None
-        return RefinementSettings(self.n_windows, self.window, periods, constraint=constraint)
+        return RefinementSettings(
+            self.n_windows, self.window, periods, constraint=constraint,
+            n_reweights=self.n_reweights,
+        )  # fmt: skip
 
-    def evaluate(self, model: SparseModel, record: Record) -> tuple[FreeRun, FreeRun]:
+    def evaluate(self, model: SparseModel, record: Record) -> tuple[Evaluation, Evaluation]:
         """Free runs over the held-out part, from its first sample and from a fitted start."""
         held = record.held
         n = held.n_samples if self.rollout_s is None else samples_in(held, self.rollout_s)
-        run = partial(free_run, model, held, n_samples=n)
+        run = partial(evaluate, model, held, n_samples=n)
         return run(), run(initial=fitted_start(model, held))
 
     def _add_one(
@@ -305,7 +322,8 @@ class Study:
         add_samples(report, held, runs)
         started = {name: each.from_fit for name, each in fits.items()}
         add_figures(report, ["trajectories"], held, started, self.figures, suffix=STARTED)
-        report.section("Equations", *(f"relation: {text}" for text in self._relations))
+        relations = dict.fromkeys(t for each in self.models.values() for t in each.relations)
+        report.section("Equations", *(f"relation: {text}" for text in relations))
         if any(each.model.covariance is not None for each in fits.values()):
             report.add(Text(INTERVALS, page_only=True))
         for name, each in fits.items():
@@ -320,10 +338,6 @@ class Study:
                 more=[Text(f"the best of {len(fits)} fits")], where=where, seen=not self.held_out,
             )
         )  # fmt: skip
-
-    @property
-    def _relations(self) -> list[str]:
-        return list(dict.fromkeys(t for each in self.models.values() for t in each.relations))
 
     def _add_windows(
         self, record: Record, libraries: Mapping[str, Library], report: Report
@@ -433,7 +447,7 @@ class OneFit:
             row |= {f"f_error{suffix}": run.f_error, f"nrmse{suffix}": run.nrmse}
         return row
 
-    def with_seed(self, record: Record, seed: int, report: Report) -> FreeRun:
+    def with_seed(self, record: Record, seed: int, report: Report) -> Evaluation:
         """The run of the model of another draw of windows."""
         model, held_to, _ = self._start(record)
         assert held_to is not None
@@ -481,37 +495,37 @@ def wrong_signs(model: SparseModel, held_to: Constraint | None, record: Record) 
     if held_to is None or not held_to.processes or not record.zones.balances:
         return []
     return [
-        f"{process.name}: {term}"
+        f"{_arrow(*process.ends)} by {term}"
         for process in compared_processes(model, held_to, record.data, record.zones)
         for term, coef in process.coef.items()
         if coef * process.counterpart.get(term, coef) < 0.0
     ]
 
 
-def _started_text(run: FreeRun) -> str:
-    """Frequency error and nrmse; the verdict of a run without a frequency."""
-    has_none = np.isnan(run.f_error)
-    return run.text if has_none else f"{100 * run.f_error:+.1f} %, {run.nrmse:.2f}"
+def _arrow(giver: str, taker: str) -> str:
+    """`n_n to n_i`, `n_i out`, `n_n in`."""
+    if giver and taker:
+        return f"{giver} to {taker}"
+    return f"{giver} out" if giver else f"{taker} in"
 
 
 METHOD: Metrics[Fitted] = [
     Metric("n_free", lambda fitted: fitted.n_free, View.SHOWN, "free"),
-    *(metric.of(lambda fitted: fitted.from_sample) for metric in RUN),
-    *(metric.of(lambda fitted: fitted.from_fit, "{}_started", View.FILES) for metric in RUN),
-    Metric("start fitted", lambda fitted: _started_text(fitted.from_fit), View.SCREEN),
+    *(metric.of(lambda fitted: fitted.from_sample) for metric in EVALUATION),
+    *(metric.of(lambda fitted: fitted.from_fit, "{}_started", View.FILES) for metric in EVALUATION),
     Metric("wrong_signs", lambda fitted: "; ".join(fitted.wrong), View.SHOWN, "signs wrong"),
-    Metric("r2", lambda fitted: fitted.r2, View.ALL, "R2 {}", "{:.3f}"),
+    Metric("r2", lambda fitted: fitted.r2, View.FILES | View.HEADLINE),
     Metric("loss", lambda fitted: fitted.refinement and fitted.refinement.loss),
     Metric(
         "refinement",
         lambda fitted: fitted.refinement and str(fitted.refinement.status),
         View.SHOWN,
     ),
-    Metric("cpu_s", lambda fitted: fitted.cpu_s, View.ALL, "CPU s"),
+    Metric("cpu_s", lambda fitted: fitted.cpu_s, View.FILES | View.HEADLINE),
 ]
 
 
-def _ends(value: Callable[[FreeRun], float], runs: Sequence[FreeRun]) -> list[float]:
+def _ends(value: Callable[[Evaluation], float], runs: Sequence[Evaluation]) -> list[float]:
     """Lowest and highest value over the runs that have it; NaN if none has it."""
     values = np.array([value(run) for run in runs])
     known = values[np.isfinite(values)]
@@ -523,23 +537,23 @@ def _range(ends: Sequence[float], form: str = "{:.3f} to {:.3f}", factor: float 
     return "-" if np.isnan(low) else form.format(low, high)
 
 
-def _worst_amplitude(run: FreeRun) -> float:
+def _worst_amplitude(run: Evaluation) -> float:
     ratios = np.array(list(run.amplitude_ratio.values()))
     return float(ratios[np.argmax(np.abs(ratios - 1.0))])
 
 
-def _worst_waveform(run: FreeRun) -> float:
+def _worst_waveform(run: Evaluation) -> float:
     return max(run.waveform_error.values())
 
 
-def _n_living(runs: Sequence[FreeRun]) -> int:
-    return sum(run.verdict is Verdict.LIVES for run in runs)
+def _n_sustained(runs: Sequence[Evaluation]) -> int:
+    return sum(run.status is Status.SUSTAINED for run in runs)
 
 
 _PERCENT = partial(_range, form="{:+.2f} to {:+.2f} %", factor=100.0)
-SPREAD: Metrics[Sequence[FreeRun]] = [
+SPREAD: Metrics[Sequence[Evaluation]] = [
     Metric("n_draws", len),
-    Metric("n_living", _n_living, View.SHOWN, "live"),
+    Metric("n_sustained", _n_sustained, View.SHOWN, "sustained"),
     Metric("f_error", partial(_ends, lambda run: run.f_error), View.SHOWN, format=_PERCENT),
     Metric("nrmse", partial(_ends, lambda run: run.nrmse), View.SHOWN, format=_range),
     Metric("amplitude", partial(_ends, _worst_amplitude), View.SHOWN, format=_range),
@@ -583,15 +597,15 @@ class OverPoints:
     fits: Mapping[str, Fitted]
 
     @property
-    def living(self) -> list[str]:
-        return [p for p, fit in self.fits.items() if fit.from_sample.verdict is Verdict.LIVES]
+    def sustained(self) -> list[str]:
+        return [p for p, fit in self.fits.items() if fit.from_sample.status is Status.SUSTAINED]
 
     @property
     def elsewhere(self) -> str:
-        """What becomes of the model where it does not live, in words."""
-        runs = [fit.from_sample for p, fit in self.fits.items() if p not in self.living]
-        words = dict.fromkeys(str(run.verdict) for run in runs)
-        return ", ".join(f"{word} at {sum(str(r.verdict) == word for r in runs)}" for word in words)
+        """What becomes of the model at the others, in words."""
+        runs = [fit.from_sample for p, fit in self.fits.items() if p not in self.sustained]
+        words = dict.fromkeys(str(run.status) for run in runs)
+        return ", ".join(f"{word} at {sum(str(r.status) == word for r in runs)}" for word in words)
 
     @property
     def wrong(self) -> dict[str, int]:
@@ -599,7 +613,7 @@ class OverPoints:
         terms = [term for fit in self.fits.values() for term in fit.wrong]
         return {term: terms.count(term) for term in dict.fromkeys(terms)}
 
-    def worst(self, value: Callable[[FreeRun], float]) -> float:
+    def worst(self, value: Callable[[Evaluation], float]) -> float:
         """The largest modulus over the points that have a value; NaN if none has."""
         values = np.array([value(fit.from_sample) for fit in self.fits.values()])
         known = np.abs(values[np.isfinite(values)])
@@ -608,8 +622,8 @@ class OverPoints:
 
 OVER_POINTS: Metrics[OverPoints] = [
     Metric("n_free", lambda each: max(fit.n_free for fit in each.fits.values()), View.SHOWN, "free"),
-    Metric("n_living", lambda each: len(each.living), View.FILES | View.HEADLINE),
-    Metric("lives", lambda each: f"{len(each.living)} of {len(each.fits)}", View.SCREEN),
+    Metric("n_sustained", lambda each: len(each.sustained), View.FILES | View.HEADLINE),
+    Metric("sustained", lambda each: f"{len(each.sustained)} of {len(each.fits)}", View.SCREEN),
     Metric("elsewhere", lambda each: each.elsewhere, View.SHOWN),
     Metric("f_error", lambda each: each.worst(lambda r: r.f_error), View.SHOWN, "frequency off by",
            percent(2)),
@@ -621,3 +635,49 @@ OVER_POINTS: Metrics[OverPoints] = [
            View.SHOWN, "signs wrong"),
     Metric("source", lambda each: each.structure.source),
 ]  # fmt: skip
+
+
+def add_points(
+    found: Mapping[str, Mapping[str, Fitted]], models: Mapping[str, Structure], report: Report
+) -> None:
+    """Every fit over all points, and the models of each point. found: by point, then by fit."""
+    names = list(next(iter(found.values())))
+    structures = {
+        name: next(each for key, each in models.items() if name.startswith(key)) for name in names
+    }
+    over = {
+        name: OverPoints(structures[name], {point: fits[name] for point, fits in found.items()})
+        for name in names
+    }
+    report.section(
+        f"{len(names)} fits at {len(found)} operating points",
+        *(f"{key}: {each.source}" for key, each in models.items() if each.source),
+    )
+    report.table(
+        "over_points",
+        ResultTable(over, OVER_POINTS),
+        heading="fit",
+        note="Frequency, amplitude and waveform: the largest errors over the points that have a "
+        "cycle. Signs wrong: terms whose sign contradicts the recorded balance of the same process.",
+    )
+    rows = {f"{name}, {p}": fit for name, each in over.items() for p, fit in each.fits.items()}
+    report.section("Every point")
+    report.table("fits", ResultTable(rows, METHOD), heading="fit", page_only=True)
+    for number, (point, fits) in enumerate(found.items()):
+        report.section(point, level=3)
+        for name, fit in fits.items():
+            report.add(*equations(fit.model, lead=name, on_screen=False))
+            report.model(f"{name}_{number}", fit.model, shown=False)
+    n_all = sum(len(each.sustained) == len(found) for each in over.values())
+    lines = [
+        Text(f"sustained at {n} of {len(found)}: {', '.join(names)}")
+        for n in range(len(found), 0, -1)
+        if (names := [name for name, each in over.items() if len(each.sustained) == n])
+    ]
+    report.found(
+        Result(
+            f"Found: {n_all} of {len(over)} fits are sustained at all of {len(found)} operating points",
+            lines or [Text("none is sustained at any point")],
+            load='pandas.read_csv("{}/tables/over_points.csv")',
+        )
+    )

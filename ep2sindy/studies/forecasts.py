@@ -14,8 +14,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Table
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.progress import SILENT, Progress
-
-LEAST_SAMPLES = 20  # of the fitted part and of the rest
+from ep2sindy.studies.source import LEAST_SAMPLES, is_short
 
 SHOWN_PERIODS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 CAPTION = (
@@ -24,11 +23,6 @@ CAPTION = (
     "held-out part, by horizon (1: no better than the mean); persistence: the last sample "
     "stays; harmonics: the mean cycle goes on; autoregression: linear, its order by AIC."
 )
-
-
-def is_short(run: Trajectory, n_fitted: int) -> bool:
-    """Whether the fitted part of a record or the rest has fewer than LEAST_SAMPLES samples."""
-    return min(n_fitted, run.n_samples - n_fitted) < LEAST_SAMPLES
 
 
 def why_none(run: Trajectory, n_fitted: int) -> str:

@@ -12,6 +12,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from ep2sindy.figures.operating import cycle_figure, frequency_scale, laws_figure, left_out_figure
+from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.given_models import REFINED
 from ep2sindy.operating.law import LawFunctions, OperatingLaw, read_law
@@ -22,7 +23,7 @@ from ep2sindy.operating.left_out import (
     run_left_out,
     window_errors,
 )
-from ep2sindy.operating.map import Fate, MapPoint, law_map, map_points
+from ep2sindy.operating.map import MapPoint, law_map, map_points
 from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.operating.records import OperatingRecord, Point, most_central, read_points
 from ep2sindy.regression.pooled import fewest_of_least
@@ -159,7 +160,7 @@ class FoundLaw:
 
     def agreement(self, statuses: Mapping[str, bool]) -> tuple[int, int]:
         """At how many points the law says rightly whether they oscillate: all, and quiet ones."""
-        says = np.array([point.fate is Fate.OSCILLATES for point in self.at_points])
+        says = np.array([point.status is Status.SUSTAINED for point in self.at_points])
         does = np.array(list(statuses.values()))
         return int((says == does).sum()), int((~says & ~does).sum())
 
@@ -201,7 +202,7 @@ class FoundLaw:
             laws_figure, self.coefficients, self.law, parameters=self.parameters, labels=labels
         )
         found["laws"] = Captioned(draw, CAPTIONS["laws"])
-        if any(point.fate is Fate.OSCILLATES for point in self.map):
+        if any(point.status is Status.SUSTAINED for point in self.map):
             caption = CAPTIONS["map" if len(self.parameters) == 2 else "line"]
             draw = partial(
                 cycle_figure, pd.DataFrame([point.row for point in self.map]), points,
@@ -480,5 +481,5 @@ def _left_out_metrics(runs: Sequence[LeftOutRun]) -> list[Metric[LeftOutRun]]:
             lambda ratio: relative(ratio - 1.0),
         ),
         Metric("waveform", lambda p: p.run.waveform_error, View.SHOWN, "waveform {}", "{:.3f}"),
-        Metric("verdict", lambda p: str(p.run.verdict), View.SHOWN),
+        Metric("status", lambda p: str(p.run.status), View.SHOWN),
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -14,37 +14,44 @@ from ep2sindy.data.quantities import KNOWN_UNITS
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression
-from ep2sindy.discovery.result import Discovery
-from ep2sindy.forecasting.skill import ForecastSkill
+from ep2sindy.forecasting.evaluation import evaluate
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
-from ep2sindy.model.free_run import FreeRun, free_run, samples_in
-from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.model.comparison import samples_in
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.front import Candidate, fit_support
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Result, Table, Text
+from ep2sindy.report.document import Table, Text
 from ep2sindy.report.report import Report
-from ep2sindy.report.results import Metric, Metrics, ResultTable, View
+from ep2sindy.report.results import ResultTable
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
-from ep2sindy.studies.balance import ModelBalance, add_balance, model_balance
+from ep2sindy.studies.balance import add_balance, model_balance
 from ep2sindy.studies.candidates import (
-    CandidateRow,
     add_candidates,
     add_estimate,
-    left_over_of_all,
-    selected_metrics,
-    selected_rows,
 )
 from ep2sindy.studies.forecasts import add_forecasts, skill_of, why_none
-from ep2sindy.studies.living import LIVING, Living, LivingSearch, add_living, living_model
-from ep2sindy.studies.source import NO_ZONES, Sampling, Source, Zones, zones_of
-from ep2sindy.studies.structures import Terms, n_before, split_in_time
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts
+from ep2sindy.studies.library_result import (
+    LibraryResult,
+    add_records,
+    add_tables,
+    find_best,
+    refit,
+    refitted_model,
+)
+from ep2sindy.studies.living import LivingSearch, add_living, living_model
+from ep2sindy.studies.source import (
+    NO_ZONES,
+    Sampling,
+    Source,
+    Zones,
+    n_before,
+    split_in_time,
+    zones_of,
+)
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts, Terms
 from ep2sindy.studies.views import (
     EVALUATED,
     EVALUATION,
@@ -53,16 +60,11 @@ from ep2sindy.studies.views import (
     PlotRange,
     add_figures,
     add_samples,
-    best_run,
-    found_model,
-    worst_run,
 )
 from ep2sindy.trust.user_code import load_user_module
 
 FIGURES = ("data", "trajectories", "derivatives", "phase")
-THESIS = "The same with the thesis's terms, fitted to these data."
 HELD_OUT = 0.25  # share of a record on which a model that lives is tested, unless a config says
-EVERY_RECORD = "the selected models, integrated from the first sample of every record"
 _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
 
@@ -229,7 +231,8 @@ class Study:
         s, rows = self.rollout_s, Regression(self.formulation, bootstraps=self.bootstraps)
         n_samples = [run.n_samples if s is None else samples_in(run, s) for run in runs]
         refitted = refit(found, thesis, rows, runs, rng)
-        published, lives, beside = refitted_model(found, refitted), None, None
+        published = refitted_model(found, refitted)
+        lives = beside = None
         if self.living is not None and not found.model.inputs:
             parts = split_in_time(runs[0], self.held_out or HELD_OUT)
             lives = living_model(
@@ -245,12 +248,13 @@ class Study:
         )  # fmt: skip
         with progress.stage(None, "", "free runs"):
             pairs = zip(runs, n_samples, strict=True)
+            over = [partial(evaluate, run=run, n_samples=n) for run, n in pairs]
             return LibraryResult(
                 discovery=found,
-                runs=[free_run(found.model, run, n_samples=n) for run, n in pairs],
+                runs=[run_over(found.model) for run_over in over],
                 thesis=thesis,
                 refitted=refitted,
-                published=published and free_run(published, runs[0], n_samples=n_samples[0]),
+                published=None if published is None else over[0](published),
                 living=lives,
                 balance=beside,
                 skill=skill,
@@ -264,22 +268,19 @@ class Study:
         files: Sequence[str],
     ) -> None:
         """Models that live with what tells of them, then the selected models, then candidates."""
-        report.found(find_best(results, files))
+        report.found(find_best(results, len(files)))
         for name, result in results.items():
             if result.living is not None and result.balance is not None:
                 add_living(report, name, result.living)
-                cycle = result.living.free.cycle
-                period_s = cycle and cycle.period_s
-                add_balance(report, name, result.balance, data, period_s=period_s)
+                add_balance(report, name, result.balance, data, result.living.run.cycle)
                 self._add_forecasts(report, name, data, result)
         self._add_selected(report, data, results)
         if len(files) > 1:
             add_records(report, results, files)
         for name, result in results.items():
+            found = result.discovery
             if result.living is None:
                 self._add_forecasts(report, name, data, result)
-        for name, result in results.items():
-            found = result.discovery
             add_candidates(report, name, found, note=result.note, beside=result.beside)
             if found.estimate is not None:
                 add_estimate(report, name, found, data)
@@ -297,210 +298,25 @@ class Study:
         self, report: Report, data: Trajectory, results: Mapping[str, LibraryResult]
     ) -> None:
         """The selected models of all libraries, and those of published terms, from the start."""
+        clock, figures = data.clock, partial(add_figures, report, data=data, shown=self.figures)
         report.section("The selected model of every library")
         for name, result in results.items():
             text = f"{name}: equations {result.how}; run freely: {result.runs[0].text}"
             report.add(Text(text, page_only=True))
-            report.model(name, result.discovery.model, clock=data.clock)
+            held = result.discovery.constraint
+            report.model(name, result.discovery.model, clock=clock, held=held)
         selected = {name: result.runs[0] for name, result in results.items()}
-        published = {n: r.published for n, r in results.items() if r.published is not None}
-        runs = selected | {f"{name}, thesis's terms": run for name, run in published.items()}
+        published = {f"{n}_thesis_terms": r.published for n, r in results.items() if r.published}
         is_living = any(result.living is not None for result in results.values())
         note = f"{FROM_DERIVATIVES} {EVALUATED}" if is_living else EVALUATED
-        rows = ResultTable(runs, EVALUATION).screen("model", by_state=True)
+        rows = ResultTable(selected | published, EVALUATION).screen("model", by_state=True)
         report.section("Run freely from the first sample", Table(rows, INTEGRATED, note=note))
-        smoother = self.formulation.smoother
-        add_figures(report, FIGURES, data, selected, self.figures, smoother=smoother)
-        add_samples(report, data, selected)
-        if not published:
-            return
+        figures(FIGURES, runs=selected, smoother=self.formulation.smoother)
+        add_samples(report, data, selected | published)
         for name, run in published.items():
-            report.model(f"{name}_thesis_terms", run.model, shown=False)
-        add_samples(report, data, {f"{n}_thesis_terms": run for n, run in published.items()})
-        add_figures(
-            report,
-            ["trajectories"],
-            data,
-            published,
-            self.figures,
-            suffix="_thesis",
-            caption=THESIS,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class LibraryResult:
-    """One library's discovery with its selected model, and the published terms fitted to our data.
-
-    runs: free runs of the selected model over every record. thesis: the published coefficients as
-    printed, by state. refitted: their terms fitted to our rows, and published: the run of that
-    model over the first record; None if a state has none. living: a model that oscillates on its
-    own; None if none was asked for, or if the library has inputs. balance: of its zone, beside the
-    living model. skill: of forecasts by the living model over its held-out part, or else by the
-    selected one over the last quarter of the record, which it was fitted to; None if there are
-    none.
-    """
-
-    discovery: Discovery
-    runs: Sequence[FreeRun]
-    thesis: Coefficients
-    refitted: Mapping[str, Candidate]
-    published: FreeRun | None
-    living: Living | None
-    balance: ModelBalance | None
-    skill: ForecastSkill | None
-
-    @property
-    def by_runs(self) -> bool:
-        """Whether the selection runs or refines whole models, rather than scoring candidates."""
-        return self.discovery.method.selection.basis == "runs"
-
-    @property
-    def how(self) -> str:
-        """How the selected equations were found."""
-        if self.by_runs:
-            return "selected by free runs or refinements"
-        if self.discovery.estimate is not None:
-            return "estimated together with the states"
-        return "selected by their derivatives"
-
-    @property
-    def note(self) -> str:
-        """How a rule for whole models decided; other notes are shown as warnings or estimates."""
-        return self.discovery.note if self.by_runs else ""
-
-    @property
-    def beside(self) -> dict[str, list[CandidateRow]]:
-        """The published equations as printed, and with their terms fitted to our rows, by state."""
-        return {
-            state: [
-                CandidateRow(Candidate.of(state, self.thesis[state]), lead="thesis"),
-                CandidateRow(fit, lead="its terms here"),
-            ]
-            for state, fit in self.refitted.items()
-        }
-
-
-LIBRARIES: Metrics[LibraryResult] = [
-    Metric("how", lambda result: result.how),
-    Metric("note", lambda result: result.note),
-    Metric("misfit", lambda result: result.discovery.misfit),
-]
-THESIS_TERMS: Metrics[Candidate] = [
-    Metric("r2_test", lambda fit: fit.r2_test),
-    Metric("r2_train", lambda fit: fit.r2_train),
-    Metric("terms", lambda fit: fit.coef_by_term),
-]
-RECORDS: Metrics[tuple[str, str, FreeRun]] = [
-    Metric("model", lambda row: row[0], View.SHOWN),
-    Metric("record", lambda row: row[1], View.SHOWN),
-    *(metric.of(lambda row: row[2], view=View.SHOWN) for metric in EVALUATION),
-]
-
-
-def add_records(report: Report, results: Mapping[str, LibraryResult], files: Sequence[str]) -> None:
-    """Add how the selected models run over every record."""
-    rows = [
-        (name, file, run)
-        for name, result in results.items()
-        for file, run in zip(files, result.runs, strict=True)
-    ]
-    report.section("Every record")
-    report.table("records", ResultTable(rows, RECORDS), title=EVERY_RECORD, note=EVALUATED)
-
-
-def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
-    """Add tables of all libraries whose facts stand in the sections: for files and headline."""
-    runs, selected, thesis = {}, {}, {}
-    for name, result in results.items():
-        if result.living is not None:
-            runs |= {f"{name}_living": result.living.run, f"{name}_refined": result.living.refined}
-        runs[name] = result.runs[0]
-        if result.published is not None:
-            runs[f"{name}_thesis_terms"] = result.published
-        rows = selected_rows(result.discovery)
-        selected |= {f"{name}/{state}": row for state, row in rows.items()}
-        thesis |= {f"{name}/{state}": fit for state, fit in result.refitted.items()}
-    label = next(iter(results.values())).discovery.method.selection.label
-    living = {name: each.living for name, each in results.items() if each.living is not None}
-    report.table("evaluations", ResultTable(runs, EVALUATION), heading="model", shown=False)
-    report.table("libraries", ResultTable(results, LIBRARIES), heading="library", shown=False)
-    metrics = selected_metrics(label)
-    report.table("selected", ResultTable(selected, metrics), heading="of", shown=False)
-    if thesis:
-        report.table("thesis_terms", ResultTable(thesis, THESIS_TERMS), heading="of", shown=False)
-    if living:
-        report.table("living", ResultTable(living, LIVING), heading="library", shown=False)
-
-
-def find_best(results: Mapping[str, LibraryResult], files: Sequence[str]) -> Result:
-    """The living model, or the best of those that were run; and what its rows leave over."""
-    living = {name: each.living for name, each in results.items() if each.living is not None}
-    if not living:
-        runs = {name: worst_run(each.runs) for name, each in results.items()}
-        best = best_run(runs)
-        return found_model(
-            f"Found with the library {best}",
-            runs[best],
-            file=best,
-            picture="trajectories",
-            where=f"the worst of {len(files)} records" if len(files) > 1 else "the record",
-            seen=True,
-            misfit=results[best].discovery.misfit,
-        )
-    best = best_run({name: each.run for name, each in living.items()})
-    free = living[best].free
-    caution = [Text(free.caution, warning=True)] if free.caution else []
-    tests = [result.discovery.noise_test for result in results.values()]
-    return found_model(
-        f"Found with the library {best}",
-        free.run,
-        file=f"{best}_living",
-        picture="trajectories" if free.cycle is None else f"free_run_{best}",
-        more=[*caution, *left_over_of_all(tests)],
-        where="held-out time",
-        held=living[best].discovery.constraint,
-    )
-
-
-def refit(
-    found: Discovery,
-    published: Coefficients,
-    rows: Regression,
-    runs: Sequence[Trajectory],
-    rng: np.random.Generator,
-) -> dict[str, Candidate]:
-    """Published terms fitted to our rows, where the data can tell the terms from others.
-
-    They are the searched rows; after a search of trajectories, rows assembled for the fit.
-    """
-    if not published:
-        return {}
-    fronts = found.fronts.values()
-    problems = {front.equation: front.problem for front in fronts if front.problem is not None}
-    if not problems:
-        assembled = rows.formulation.assemble(runs, found.model.library, rng=rng)
-        problems = {state: problem for problem in assembled for state in problem.equations}
-    fits = {}
-    for state, terms in published.items():
-        if state in found.fronts:
-            problem = problems[state]
-            if set(terms) <= set(compress(problem.library.names, usable_terms(problem))):
-                fits[state] = fit_support(problem, state, list(terms))
-    return fits
-
-
-def refitted_model(found: Discovery, refitted: Mapping[str, Candidate]) -> SparseModel | None:
-    """The model of the published terms with their coefficients here; None if a state has none."""
-    model = found.model
-    if set(refitted) != set(model.states):
-        return None
-    return replace(
-        model,
-        coef=coef_matrix(model.library, [refitted[state].coef_by_term for state in model.states]),
-        covariance=None,
-        provenance={**model.provenance, "search": "published terms, refitted"},
-    )
+            report.model(name, run.model, clock=clock, shown=False)
+        if published:
+            figures(["trajectories"], runs=published, suffix="_thesis")
 
 
 def alone(data: Trajectory) -> str | None:

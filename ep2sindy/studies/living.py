@@ -18,10 +18,10 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.figures import living as figures
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
-from ep2sindy.model.comparison import FreeRunBounds, Verdict
-from ep2sindy.model.free_run import FreeCycle, FreeRun, free_run
+from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.mass_action import consequences
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.searches import Search
@@ -151,19 +151,15 @@ class LivingSearch:
 class Living:
     """A closed model that was searched for by free runs, and its run over the held-out part.
 
-    free: the run, which starts at the first held-out sample, smoothed by a Kalman smoother so that
-    the sample's noise is not attributed to the model, and its cycle. refined: the run of the
-    equations that derivatives select, refined with the same terms. refinement: status of that.
+    run: starts at the first held-out sample, smoothed by a Kalman smoother so that the sample's
+    noise is not attributed to the model. refined: the run of the equations that derivatives select,
+    refined with the same terms. refinement: status of that.
     """
 
     discovery: Discovery
-    free: FreeCycle
-    refined: FreeRun
+    run: Evaluation
+    refined: Evaluation
     refinement: str
-
-    @property
-    def run(self) -> FreeRun:
-        return self.free.run
 
     @property
     def model(self) -> SparseModel:
@@ -172,7 +168,7 @@ class Living:
 
 LIVING: Metrics[Living] = [
     Metric("n_terms", lambda found: int(np.count_nonzero(found.model.coef))),
-    *(metric.of(lambda found: found.free) for metric in CYCLE),
+    *(metric.of(lambda found: found.run) for metric in CYCLE),
     Metric("proved", lambda found: "; ".join(consequences(found.model))),
     Metric("selection", lambda found: found.discovery.note),
     Metric("misfit", lambda found: found.discovery.misfit),
@@ -190,14 +186,12 @@ OTHERS: Metrics[OtherSystem] = [
 def add_living(report: Report, name: str, found: Living) -> None:
     """Add the model, how it runs, and how the choice of derivatives does; name: of the library."""
     model, clock, run = found.model, found.run.rollout.clock, found.run
-    lives = run.verdict is Verdict.LIVES
-    ending = "lives" if lives else f"does not live ({run.text})"
     held_to = found.discovery.constraint
-    report.section(f"{name}: a model that {ending}")
+    report.section(f"{name}: a model selected by free runs ({run.text})")
     report.model(f"{name}_living", model, clock=clock, held=held_to, shown=False)
     report.add(*model_blocks(model, clock, held=held_to, words=SPREAD, note=SPREAD_NOTE))
-    if found.free.cycle is not None:
-        period_s = found.free.cycle.period_s
+    if run.cycle is not None:
+        period_s = run.cycle.period_s
         draw = partial(figures.free_run_figure, run.record, run.rollout, period_s=period_s)
         report.figure(f"free_run_{name}", draw, CAPTIONS["free_run"])
     report.model(f"{name}_refined", found.refined.model, shown=False)
@@ -205,18 +199,17 @@ def add_living(report: Report, name: str, found: Living) -> None:
     rows = ResultTable(runs, EVALUATION).screen("model", by_state=True)
     title = "run freely from one sample over held-out time"
     report.add(Table(rows, title=title, note=EVALUATED), *_notes(found))
-    add_cycle(report, name, found.free)
+    add_cycle(report, name, run)
     add_samples(report, run.record, {f"{name}_living": run})
     _add_others(report, name, found.discovery.others)
 
 
-def add_cycle(report: Report, name: str, free: FreeCycle) -> None:
+def add_cycle(report: Report, name: str, run: Evaluation) -> None:
     """Add figures of the cycle of a model, if it has one. name: of the model, which names them."""
-    if free.cycle is None:
+    if run.cycle is None:
         return
-    run = free.run
     if len(run.model.states) > 1:
-        draw = partial(figures.cycle_figure, run.record, free.cycle)
+        draw = partial(figures.cycle_figure, run.record, run.cycle)
         report.figure(f"cycle_{name}", draw, CAPTIONS["cycle"])
     if figures.find_waveforms(run.record, run.rollout):
         draw = partial(figures.waveform_figure, run.record, run.rollout)
@@ -239,7 +232,7 @@ def _notes(found: Living) -> list[str]:
     proved = consequences(found.model)
     notes = [f"By its terms {'; '.join(proved)}."] if proved else []
     notes.append(f"Selection: {found.discovery.note}.")
-    notes += [found.free.text] if found.free.text else []
+    notes += [found.run.cycle_text] if found.run.cycle_text else []
     notes += [f"Misfit: {found.discovery.misfit}."] if found.discovery.misfit else []
     text = "; ".join(found.refined.model.text().splitlines())
     refined = f"refined as they are ({found.refinement})"
@@ -268,12 +261,12 @@ def living_model(
     from ep2sindy.refinement.refine import refine  # loads torch, only for a refinement
 
     found = settings.found(train, library, rows, zones, rng=rng, progress=progress)
-    with progress.stage(None, "", "free run and limit cycle"):
+    with progress.stage(None, "", "free run"):
         start = start_of(held, found.model)
-        free = FreeCycle.of(free_run(found.model, held, initial=start, bounds=settings.bounds))
+        run = evaluate(found.model, held, initial=start, bounds=settings.bounds)
     refined = refine(selected, [train], window=two_periods(train), seed=0, progress=progress)
-    run = free_run(refined.model, held, initial=start_of(held, selected))
-    return Living(found, free, run, refined.status)
+    own = evaluate(refined.model, held, initial=start_of(held, selected))
+    return Living(found, run, own, refined.status)
 
 
 def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:

@@ -402,7 +402,7 @@ class Outcome:
             }
             row["relative_amplitude"] = record.relative_amplitude if record else np.nan
             if self.law is not None and self.law.at_points:
-                row["law"] = str(self.law.at_points[k].fate)
+                row["law"] = str(self.law.at_points[k].status)
             rows.append(row)
         return pd.DataFrame(rows)
 

@@ -247,6 +247,33 @@ def in_unit(field: xr.Dataset, *, signal: str, unit: str) -> xr.Dataset:
     return field.assign({signal: to_si(field[signal], signal, unit, is_variable=True)})
 
 
+LEAST_SAMPLES = 20  # of the fitted part of a record and of the rest
+
+
+def n_before(run: Trajectory, held_out: float) -> int:
+    """Number of samples before the last `held_out` share of a record."""
+    return round(run.n_samples * (1.0 - held_out))
+
+
+def is_short(run: Trajectory, n_fitted: int) -> bool:
+    """Whether the fitted part of a record or the rest has fewer than LEAST_SAMPLES samples."""
+    return min(n_fitted, run.n_samples - n_fitted) < LEAST_SAMPLES
+
+
+def split_in_time(run: Trajectory, held_out: float) -> tuple[Trajectory, Trajectory]:
+    """The first part of a record, and the last `held_out` share of its samples.
+
+    Raises ValueError if either part would have fewer than LEAST_SAMPLES samples.
+    """
+    n_train = n_before(run, held_out)
+    if is_short(run, n_train):
+        raise ValueError(
+            f"held_out={held_out} must leave {LEAST_SAMPLES} samples on either side: the data have "
+            f"{run.n_samples}"
+        )
+    return run.window(0, n_train), run.window(n_train, run.n_samples)
+
+
 # Checks and messages for simulations used as data, and compilation of their kernels.
 
 MIN_SAMPLES = 200  # some breathing periods at the usual step; fewer cannot be judged

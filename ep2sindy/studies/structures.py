@@ -16,12 +16,10 @@ from ep2sindy.library.relations import Constraint, constraint
 from ep2sindy.library.roles import Roles, constraint_of, shares_of, sum_known
 from ep2sindy.library.terms import variables_of
 from ep2sindy.model.model import SparseModel, model_of
-from ep2sindy.studies.balance import compared_processes, ends_of
-from ep2sindy.studies.forecasts import LEAST_SAMPLES, is_short
+from ep2sindy.studies.processes import compared_processes, ends_of
 from ep2sindy.studies.source import Zones, told_roles
-from ep2sindy.studies.study import Check, Coefficients
+from ep2sindy.studies.study import Check, Coefficients, Terms
 
-Terms = Mapping[str, Sequence[int | str]]  # by state; the constant term 1 may be a number
 ROLES_DEGREE = 3  # of the products that roles are played by
 
 
@@ -118,7 +116,7 @@ def balance_model(
 
     Raises ValueError for a constraint without processes, or a process that is not recorded.
     """
-    empty = model_of(library, dict.fromkeys(held.states, {}), units=run.units)
+    empty = model_of(library, {state: {} for state in held.states}, units=run.units)
     processes = compared_processes(empty, held, run, zones) if held.processes else []
     found = {(p.ends, term): v for p in processes for term, v in p.counterpart.items()}
     try:
@@ -132,22 +130,3 @@ def balance_model(
     z = shares_of(held) @ np.array(values) + [known.get(place, 0.0) for place in places]
     model = model_of(library, held.equations(z), units=run.units)
     return model, {each.name: each.fit_r2 for each in processes}
-
-
-def n_before(run: Trajectory, held_out: float) -> int:
-    """Number of samples before the last `held_out` share of a record."""
-    return round(run.n_samples * (1.0 - held_out))
-
-
-def split_in_time(run: Trajectory, held_out: float) -> tuple[Trajectory, Trajectory]:
-    """The first part of a record, and the last `held_out` share of its samples.
-
-    Raises ValueError if either part would have fewer than LEAST_SAMPLES samples.
-    """
-    n_train = n_before(run, held_out)
-    if is_short(run, n_train):
-        raise ValueError(
-            f"held_out={held_out} must leave {LEAST_SAMPLES} samples on either side: the data have "
-            f"{run.n_samples}"
-        )
-    return run.window(0, n_train), run.window(n_train, run.n_samples)

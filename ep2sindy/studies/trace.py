@@ -28,8 +28,8 @@ from ep2sindy.discovery.one_signal import (
     try_in_turn,
 )
 from ep2sindy.figures.living import free_run_figure
-from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeCycle
+from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
@@ -97,12 +97,13 @@ class Study:
             report.say(NOT_EXPLAINED)
         if how in ("derivative", "delays") and (hint := lost_mean(signal)):
             report.warn(hint)
-        states, free, skill = run_on_rest(signal, best, progress=report.watch)
+        states, free = run_on_rest(signal, best, progress=report.watch)
+        skill = free.forecast
         where = "its end, which was not fitted" if skill else "all of it, too short to hold out"
         report.found(
             found_model(
                 f"Found from {signal.name}",
-                free.run,
+                free,
                 file=NAME,
                 picture=f"free_run_{NAME}",
                 more=[Text(free.caution, warning=True)] if free.caution else [],
@@ -165,22 +166,22 @@ def lost_mean(signal: Trace) -> str | None:
     )
 
 
-def _add_model(report: Report, signal: Trace, best: Attempt, free: FreeCycle, where: str) -> None:
+def _add_model(report: Report, signal: Trace, best: Attempt, free: Evaluation, where: str) -> None:
     """Add the model, and how it runs over the samples that were not fitted."""
-    model, run = best.found.model, free.run
+    model = best.found.model
     report.section("The model", *([best.found.note] if best.found.note else []))
     report.model(NAME, model, clock=signal.clock)
-    draw = partial(free_run_figure, run.record, run.rollout, period_s=signal.period_s)
+    draw = partial(free_run_figure, free.record, free.rollout, period_s=signal.period_s)
     report.figure(f"free_run_{NAME}", draw, CAPTIONS["free_run"])
     title = f"run freely from one sample over {where}"
-    rows = ResultTable({NAME: free}, TESTED)
+    rows = ResultTable({NAME: free}, [*EVALUATION, *CYCLE])
     report.table("evaluations", rows, by_state=True, title=title, note=EVALUATED)
-    if free.text:
-        report.add(Text(free.text, warning=run.verdict is not Verdict.LIVES))
+    if free.cycle_text:
+        report.add(Text(free.cycle_text, warning=free.status is not Status.SUSTAINED))
     elif signal.cycle is not None:
         report.add(Text("the model has no cycle near its run", warning=True))
     add_cycle(report, NAME, free)
-    add_samples(report, run.record, {NAME: run})
+    add_samples(report, free.record, {NAME: free})
     report.headline["n_terms"] = sum(len(model.terms(state)) for state in best.searched)
 
 
@@ -225,7 +226,6 @@ def _add_signal(
     }
 
 
-TESTED: Metrics[FreeCycle] = [*(metric.of(lambda free: free.run) for metric in EVALUATION), *CYCLE]
 TRIED: Metrics[Attempt] = [
     Metric("how", lambda tried: tried.states.embedding.how),
     Metric("states", lambda tried: tried.states.embedding.says, View.SCREEN),

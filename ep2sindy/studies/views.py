@@ -12,9 +12,9 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
+from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.library.relations import Constraint
-from ep2sindy.model.comparison import Verdict
-from ep2sindy.model.free_run import FreeCycle, FreeRun
+from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Block, Result, Text
 from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
 FROM_DERIVATIVES = (
-    "These are the equations that fits of the derivatives select; the models that live, which are "
-    "selected by free runs, stand above."
+    "These are the equations that fits of the derivatives select; those that free runs select, "
+    "which are sustained if any is, stand above."
 )
 MARKS = "Carets: the model leaves the panel; cross: a run that diverged stops."
 CAPTIONS = {
@@ -61,7 +61,7 @@ class PlotRange:
         return self.f_max_Hz or 0.5 / data.dt_s
 
 
-def add_samples(report: Report, data: Trajectory, runs: Mapping[str, FreeRun]) -> None:
+def add_samples(report: Report, data: Trajectory, runs: Mapping[str, Evaluation]) -> None:
     """Model and data, sample by sample, so that the figures can be redrawn."""
     for name, run in runs.items():
         rollout, states = run.rollout, run.model.states
@@ -76,7 +76,7 @@ def add_figures(
     report: Report,
     names: Sequence[str],
     data: Trajectory,
-    runs: Mapping[str, FreeRun],
+    runs: Mapping[str, Evaluation],
     shown: PlotRange,
     *,
     smoother: Smoother | None = None,
@@ -91,7 +91,7 @@ def add_figures(
     """
     span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
     rollouts = {name: run.rollout for name, run in runs.items()}
-    how = {"verdicts": {name: run.verdict for name, run in runs.items()}}
+    how = {"statuses": {name: run.status for name, run in runs.items()}}
     drawn: dict[str, Callable[[], Figure]] = {
         "data": partial(series.data_figure, data, duration_s=span, f_max_Hz=f_max_Hz),
         "trajectories": partial(
@@ -116,25 +116,24 @@ def terms_text(terms: Mapping[str, Sequence[str]]) -> str:
     return "; ".join(f"{part}: {', '.join(names)}" for part, names in terms.items())
 
 
-def best_run(runs: Mapping[str, FreeRun]) -> str:
-    """Name of the run of the best verdict, and of these the nearest to the data."""
-    order = list(Verdict)
+def best_run(runs: Mapping[str, Evaluation]) -> str:
+    """Name of the run of the best status, and of these the nearest to the data."""
 
-    def rank(name: str) -> tuple[int, float]:
+    def rank(name: str) -> tuple[tuple[bool, int], float]:
         nrmse = runs[name].nrmse
-        return order.index(runs[name].verdict), nrmse if np.isfinite(nrmse) else np.inf
+        return runs[name].rank, nrmse if np.isfinite(nrmse) else np.inf
 
     return min(runs, key=rank)
 
 
-def worst_run(runs: Sequence[FreeRun]) -> FreeRun:
-    """The first run of the worst verdict."""
-    return max(runs, key=lambda run: list(Verdict).index(run.verdict))
+def worst_run(runs: Sequence[Evaluation]) -> Evaluation:
+    """The first run of the worst status."""
+    return max(runs, key=lambda run: run.rank)
 
 
 def found_model(
     found: str,
-    run: FreeRun,
+    run: Evaluation,
     *,
     file: str,
     picture: str,
@@ -165,14 +164,18 @@ def found_model(
     )
 
 
-def _fate(run: FreeRun, *, seen: bool, misfit: str) -> str:
-    """`lives`, `has the wrong cycle`, `diverges after 12 us`."""
-    words = {Verdict.WRONG_CYCLE: "has the wrong cycle", Verdict.UNLIKE: "is unlike the data"}
-    words |= {} if seen or misfit else {Verdict.ALIKE: "is like the data"}
-    return words.get(run.verdict, run.words(seen=seen, misfit=misfit))
+def _fate(run: Evaluation, *, seen: bool, misfit: str) -> str:
+    """`is sustained`, `has the wrong cycle`, `diverges after 12 us`."""
+    if run.status is Status.NO_CYCLE:
+        does = "has the statistics of the data" if run.is_similar else "is unlike the data"
+        return "does not explain the data" if misfit else does
+    words = {Status.SUSTAINED: "is sustained", Status.WRONG_CYCLE: "has the wrong cycle"}
+    words |= {Status.WRONG_FREQUENCY: "has the wrong frequency"}
+    where = " where it was fitted" if seen and run.is_similar else ""
+    return f"{words.get(run.status, run.text)}{where}"
 
 
-def frequency_words(run: FreeRun, form: str = "+.1f") -> str:
+def frequency_words(run: Evaluation, form: str = "+.1f") -> str:
     """`20 kHz (+1.2 %)`: the first state's frequency and its error; a dash if it has none.
 
     form: of the error in percent.
@@ -184,7 +187,7 @@ def frequency_words(run: FreeRun, form: str = "+.1f") -> str:
     return f"{run.rollout.clock.frequency_text(frequency_Hz)}{error}"
 
 
-def run_words(run: FreeRun) -> str:
+def run_words(run: Evaluation) -> str:
     """Frequency, amplitude and waveform of a run beside the data's, as far as they are known."""
     found = []
     if (frequency := frequency_words(run, "+.2g")) != "-":
@@ -205,7 +208,7 @@ def run_words(run: FreeRun) -> str:
 
 COMPARED = View.FILES | View.HEADLINE
 # How a model runs beside a record: of every model, in every study.
-EVALUATION: Metrics[FreeRun] = [
+EVALUATION: Metrics[Evaluation] = [
     Metric("from_s", lambda run: float(run.record.t[0])),
     Metric("to_s", lambda run: float(run.record.t[-1])),
     Metric("record_frequency_Hz", lambda run: _record_frequency_Hz(run)),
@@ -213,23 +216,20 @@ EVALUATION: Metrics[FreeRun] = [
     Metric("frequency_Hz", lambda run: run.frequency_Hz),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.HEADLINE),
     Metric("f_error", lambda run: run.f_error, COMPARED),
-    Metric(
-        "amplitude_ratio", lambda run: run.amplitude_ratio, View.SHOWN, "amplitude {}", "{:.3f}"
-    ),
-    Metric("waveform_error", lambda run: run.waveform_error, View.SHOWN, "waveform {}", "{:.3f}"),
-    Metric("waveform_error", lambda run: largest(run.waveform_error), View.HEADLINE),
+    Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.ALL, "amplitude {}", "{:.3f}"),
+    Metric("waveform_error", lambda run: run.waveform_error, View.ALL, "waveform {}", "{:.3f}"),
     Metric("nrmse", lambda run: run.nrmse, View.ALL, format="{:.3f}"),
     Metric("periods", lambda run: run.periods, View.SHOWN, "periods in phase", "{:.0f}"),
     Metric("status", lambda run: run.text, View.SHOWN),
 ]
 # Its cycle and where it rests, which take many runs: of the models that are to live.
-CYCLE: Metrics[FreeCycle] = [
-    Metric("stability", lambda free: free.cycle and str(free.cycle.stability)),
-    Metric("multiplier", lambda free: free.multiplier, COMPARED),
-    Metric("share_reaching", lambda free: free.share, COMPARED),
-    Metric("rest", lambda free: _rest(free)),
-    Metric("rest_growth_per_s", lambda free: free.rest and free.rest.growth_per_s),
-    Metric("rest_frequency_Hz", lambda free: free.rest and free.rest.frequency_Hz),
+CYCLE: Metrics[Evaluation] = [
+    Metric("stability", lambda run: run.cycle and run.cycle.stability),
+    Metric("multiplier", lambda run: run.multiplier, COMPARED),
+    Metric("share_reaching", lambda run: run.share_reaching, COMPARED),
+    Metric("rest", lambda run: _rest(run)),
+    Metric("rest_growth_per_s", lambda run: run.rest and run.rest.growth_per_s),
+    Metric("rest_frequency_Hz", lambda run: run.rest and run.rest.frequency_Hz),
 ]
 EVALUATED = (
     "Amplitude: standard deviation over the data's. Waveform: RMS difference of one period, in "
@@ -243,14 +243,14 @@ def largest(values: Mapping[str, float]) -> float:
     return float(np.max(list(values.values())))
 
 
-def _record_frequency_Hz(run: FreeRun) -> dict[str, float]:
+def _record_frequency_Hz(run: Evaluation) -> dict[str, float]:
     columns = run.record.columns(run.model.states).T
     found = [dominant_frequency(run.record.t, column) for column in columns]
     return dict(zip(run.model.states, found, strict=True))
 
 
-def _rest(free: FreeCycle) -> dict[str, float] | None:
+def _rest(run: Evaluation) -> dict[str, float] | None:
     """Where the model rests inside its cycle, by state; None if it does not."""
-    if free.rest is None:
+    if run.rest is None:
         return None
-    return dict(zip(free.run.model.states, free.rest.state.tolist(), strict=True))
+    return dict(zip(run.model.states, run.rest.state.tolist(), strict=True))

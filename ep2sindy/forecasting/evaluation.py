@@ -1,0 +1,349 @@
+"""How a model does on a record: its free run, cycle, rest points, forecasts and lack of fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from html import escape
+from types import MappingProxyType
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.runs import Run, trajectory_of
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.skill import ForecastSkill, check_fitted, forecast_skill
+from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Status, columns_of, record_of
+from ep2sindy.model.fixed_point import RestPoint, rest_point
+from ep2sindy.model.model import SparseModel
+from ep2sindy.model.rollout import Rollout
+from ep2sindy.model.stability import (
+    LEAST_WAIT,
+    LimitCycle,
+    limit_cycle,
+    periods_to_reach,
+    share_reaching,
+)
+from ep2sindy.runtime.screen import html_table, one_screen, text_table
+from ep2sindy.runtime.values import check_kind
+from ep2sindy.signals.attractor import follow_phase
+from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency
+
+N_REST = 16  # samples of a record from which rest points are looked for
+APART = 1e-6  # distance of two rest points, in standard deviations
+N_SHOWN = 4  # most states, and most rest points, that the table shows one by one
+
+
+@runtime_checkable
+class HoldsModel(Protocol):
+    """A result that holds a model and why it does not explain its data, such as a Discovery."""
+
+    @property
+    def model(self) -> SparseModel: ...
+    @property
+    def misfit(self) -> str: ...
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Evaluation:
+    """How a model does on a record: run from one sample, driven by its inputs if it has any.
+
+    Only the second halves are compared, after transients. If the record does not repeat one
+    waveform, or has fewer than eight periods, all of it is compared. Cycle, rest points and
+    forecasts are computed when they are first asked for.
+
+    record: the samples that it was run over. status: how the run goes. is_similar: whether it is
+    like the record: sustained, or, without a cycle to compare, with its envelope or statistics.
+    f_error: relative error of the frequency. amplitude_ratio, waveform_error, distribution: by
+    state, the last two in standard deviations. They are NaN for a run that diverged; frequency and
+    waveform errors are also NaN if the record or the run has no period. spectrum: share of the
+    power in other bands. lack_of_fit: why the model does not explain the data it was found from;
+    empty if it does, or if that is not known. forecasts: makes `forecast`; None without held-out
+    samples.
+    """
+
+    model: SparseModel
+    record: Trajectory
+    rollout: Rollout
+    compared: ComparedRecord
+    status: Status
+    is_similar: bool
+    f_error: float
+    amplitude_ratio: Mapping[str, float]
+    waveform_error: Mapping[str, float]
+    distribution: Mapping[str, float]
+    spectrum: float
+    lack_of_fit: str = ""
+    forecasts: Callable[[], ForecastSkill] | None = field(default=None, repr=False)
+
+    @property
+    def text(self) -> str:
+        """The status, and after which time a run diverged or left a domain."""
+        if self.status is Status.NO_CYCLE:
+            are = "are" if self.is_similar else "are not"
+            return f"{self.status}; its statistics {are} the record's"
+        of = f" of {self.rollout.outside}" if self.rollout.outside else ""
+        lasted = self.rollout.lasted_text if self.rollout.diverged else ""
+        return f"{self.status}{of} after {lasted}" if lasted else str(self.status)
+
+    @property
+    def rank(self) -> tuple[bool, int]:
+        """Sorts the best first: by whether the run is like the record, then by the status."""
+        return not self.is_similar, list(Status).index(self.status)
+
+    @cached_property
+    def excursion(self) -> float:
+        """Largest distance from the data's mean, in standard deviations."""
+        return self.compared.excursion(self.rollout.states)
+
+    @cached_property
+    def frequency_Hz(self) -> Mapping[str, float]:
+        """By state; NaN if the run diverged or the state died out."""
+        found = {}
+        for k, column in enumerate(self.rollout.states.T):
+            alive = column[len(column) // 2 :].std() > DIED_OUT * self.compared.std[k]
+            steady = alive and not self.rollout.diverged
+            frequency_Hz = dominant_frequency(self.rollout.t, column) if steady else float("nan")
+            found[self.model.states[k]] = frequency_Hz
+        return MappingProxyType(found)
+
+    @cached_property
+    def nrmse(self) -> float:
+        """Root mean square error over all samples, in standard deviations; NaN if it diverged."""
+        if self.rollout.diverged:
+            return float("nan")
+        samples = self.compared.states
+        off = (self.rollout.states - samples) / zero_to_one(samples.std(axis=0))
+        return float(np.sqrt(np.mean(np.square(off))))
+
+    @cached_property
+    def _slip(self) -> Float[np.ndarray, " samples"] | None:
+        """Phase of the run before the record's, in periods; None without a period or a phase."""
+        record, states = self.compared, self.rollout.states
+        n = len(states)
+        if record.cycle is None or n < 4 or not (states.std(axis=0) > 0.0).all():
+            return None
+        straight = 2.0 * np.pi * record.cycle.frequency_Hz * (record.t[:n] - record.t[0])
+        leader = int(np.argmax(np.abs(record.cycle.harmonics[0]) / record.std))
+        theirs, ours = (
+            follow_phase(record.t[:n], values[:n, leader], straight)
+            for values in (record.states, states)
+        )
+        slip: np.ndarray = (ours - theirs) / (2.0 * np.pi)
+        return slip - np.round(slip[0])
+
+    @property
+    def periods(self) -> float:
+        """Periods of the data until the model's phase is a quarter off, or those of the record.
+
+        NaN for data without a period.
+        """
+        record = self.compared
+        if record.cycle is None:
+            return float("nan")
+        if self._slip is None:
+            return 0.0
+        off = np.flatnonzero(np.abs(self._slip) > 0.25)
+        last = off[0] if off.size else len(self._slip) - 1
+        return float((record.t[last] - record.t[0]) * record.cycle.frequency_Hz)
+
+    @property
+    def phase_end(self) -> float:
+        """How far the run is ahead of the record at its end, in periods; NaN if it diverged.
+
+        Also NaN for data without a period.
+        """
+        if self._slip is None or self.rollout.diverged:
+            return float("nan")
+        return float(self._slip[-1])
+
+    @cached_property
+    def cycle(self) -> LimitCycle | None:
+        """The closed orbit on which the run ends; None if it ends on none, or is driven."""
+        if self.model.inputs or self.rollout.diverged or self.status is Status.DECAYS:
+            return None
+        frequency_Hz = np.nanmax(list(self.frequency_Hz.values()), initial=0.0)
+        if not frequency_Hz > 0.0:
+            return None
+        return limit_cycle(self.model, self.rollout.states[-1], period_s=1.0 / frequency_Hz)
+
+    @property
+    def multiplier(self) -> float:
+        """Largest modulus of the nontrivial Floquet multipliers; NaN without a cycle."""
+        return float("nan") if self.cycle is None else self.cycle.largest_multiplier
+
+    @cached_property
+    def share_reaching(self) -> float:
+        """Share of the starts around the cycle that reach it; NaN without a cycle."""
+        return float("nan") if self.cycle is None else share_reaching(self.model, self.cycle)
+
+    @cached_property
+    def rest(self) -> RestPoint | None:
+        """Where the model rests inside its cycle; None without a cycle, or if it does not."""
+        if self.cycle is None:
+            return None
+        states = self.cycle.states
+        scale, positive = states.std(axis=0), states.min(axis=0) > 0.0
+        return rest_point(self.model, states.mean(axis=0), scale, positive)
+
+    @cached_property
+    def rest_points(self) -> tuple[RestPoint, ...]:
+        """Rest points that Newton's method reaches from samples of the record and their mean.
+
+        Empty for a model with inputs. A state that is positive in the record is positive there.
+        """
+        if self.model.inputs:
+            return ()
+        states = self.compared.states
+        every = max(1, len(states) // N_REST)
+        found: list[RestPoint] = [] if self.rest is None else [self.rest]
+        for near in (states.mean(axis=0), *states[::every]):
+            point = rest_point(self.model, near, self.compared.std, states.min(axis=0) > 0.0)
+            known = [np.abs(p.state - point.state) / self.compared.std for p in found if point]
+            if point is not None and all(distance.max() > APART for distance in known):
+                found.append(point)
+        return tuple(found)
+
+    @cached_property
+    def forecast(self) -> ForecastSkill | None:
+        """Skill of forecasts of the held-out part; None without it, or for a driven model."""
+        return None if self.forecasts is None or self.model.inputs else self.forecasts()
+
+    @property
+    def caution(self) -> str:
+        """A sentence if the cycle is neutral; else empty."""
+        if self.cycle is None or self.cycle.stability != "neutral":
+            return ""
+        return (
+            "the cycle is neutral: it neither attracts nor repels, and every start has a cycle of "
+            "its own, so the model says nothing of what sets the amplitude"
+        )
+
+    @property
+    def cycle_text(self) -> str:
+        """The stability of the cycle, in a sentence; empty without a cycle."""
+        if self.cycle is None:
+            return ""
+        wait = periods_to_reach(self.cycle)
+        slowly = f", slowly, over {wait:.0f} periods" if wait > LEAST_WAIT else ""
+        text = (
+            f"The cycle is {self.cycle.stability}: of a departure {self.multiplier:.3g} is left "
+            f"after a period (Floquet multiplier); {100.0 * self.share_reaching:.0f} % of starts "
+            f"from 0.3 to 3 times the cycle's mean reach it{slowly}."
+        )
+        return text if self.rest is None else f"{text} It rests at {self._rest_text(self.rest)}."
+
+    def _rest_text(self, rest: RestPoint) -> str:
+        """Where the model rests, and what becomes of a small departure."""
+        units, clock = self.model.units, self.rollout.clock
+        place = ", ".join(
+            f"{state} = {value:.3g}{'' if units[state] == '1' else f' {units[state]}'}"
+            for state, value in zip(self.model.states, rest.state.tolist(), strict=True)
+        )
+        change = "grows" if rest.growth_per_s > 0.0 else "decays"
+        rate = f"{clock.seconds * abs(rest.growth_per_s):.3g} {clock.rate_unit('1')}"
+        turns = (
+            f" and turns at {clock.frequency_text(rest.frequency_Hz)}" if rest.frequency_Hz else ""
+        )
+        return f"{place}, where a departure {change} by {rate}{turns}"
+
+    @property
+    def rows(self) -> list[tuple[str, str]]:
+        """Quantities and their values, as text; computes what has not been asked for."""
+        clock = self.rollout.clock
+        frequencies = {s: clock.frequency_text(f) for s, f in self.frequency_Hz.items() if f == f}
+        error = f" ({100.0 * self.f_error:+.2g} %)" if np.isfinite(self.f_error) else ""
+        cycle = self.cycle and (
+            f"{self.cycle.stability}, multiplier {self.multiplier:.3g}; "
+            f"{100.0 * self.share_reaching:.0f} % of starts reach it"
+        )
+        phase = f"{self.phase_end:+.2g} periods at the end, a quarter after {self.periods:.3g}"
+        found = [
+            ("status", self.text),
+            ("frequency", _listed(frequencies) + error),
+            ("amplitude / record's", _listed(_texts(self.amplitude_ratio))),
+            ("waveform error (std)", _listed(_texts(self.waveform_error))),
+            ("distribution error (std)", _listed(_texts(self.distribution))),
+            ("phase", phase if np.isfinite(self.phase_end) else ""),
+            ("cycle", cycle or ""),
+            *(("rests at", self._rest_text(rest)) for rest in self.rest_points[:N_SHOWN]),
+            ("forecasts", "" if self.forecast is None else self.forecast.text),
+            ("lack of fit", self.lack_of_fit),
+        ]
+        return [(name, value) for name, value in found if value]
+
+    def __repr__(self) -> str:
+        return one_screen(text_table(["quantity", "value"], self.rows))
+
+    def _repr_html_(self) -> str:
+        return html_table(["quantity", "value"], [(n, escape(value)) for n, value in self.rows])
+
+
+def evaluate(
+    model: SparseModel | HoldsModel,
+    run: Run,
+    *,
+    initial: Float[np.ndarray, " n_states"] | None = None,
+    n_samples: int | None = None,
+    bounds: FreeRunBounds | None = None,
+    judged: Sequence[str] | None = None,
+    n_fitted: int | None = None,
+) -> Evaluation:
+    """Run a model over a record, or its first samples, and compare the attractors.
+
+    model: a SparseModel, or a Discovery, whose misfit is then told. run: a Trajectory, or what
+    `discover` takes as one run. initial: the state to start from, in SI; None takes the data's.
+    n_samples: of the run that are compared; None takes all. judged: states that determine the
+    status and f_error, such as the measured one; None takes all. n_fitted: samples at the start
+    that the model was fitted to; it is then run over the rest, from the last of these, and
+    forecasts of the rest are counted.
+    Raises ValueError for a judged state that the model does not have, or too few samples.
+    """
+    misfit, forecasts = "", None
+    if isinstance(model, HoldsModel):
+        misfit, model = model.misfit, model.model
+    check_kind("model", model, SparseModel, "found.model")
+    whole = part = trajectory_of(run)
+    if n_fitted is not None:
+        check_fitted(whole, n_fitted)
+        part = whole.window(n_fitted - 1, whole.n_samples)
+        forecasts = partial(forecast_skill, model, whole, n_fitted=n_fitted)
+    n_samples = part.n_samples if n_samples is None else min(n_samples, part.n_samples)
+    rollout = model.rollout(part, n_samples=n_samples, initial=initial)
+    part, bounds = part.window(0, n_samples), bounds or FreeRunBounds()
+    compared = record_of(part, model.states)
+    likeness = ours = compared.likeness(rollout.states, bounds)
+    if judged is not None:
+        columns = columns_of(model.states, judged)
+        ours = record_of(part, judged).likeness(rollout.states[:, columns], bounds)
+    by_state = {
+        name: MappingProxyType(dict(zip(model.states, values.tolist(), strict=True)))
+        for name, values in likeness.by_state.items()
+    }
+    return Evaluation(
+        model=model,
+        record=part,
+        rollout=rollout,
+        compared=compared,
+        status=Status.LEAVES_DOMAIN if rollout.outside else ours.status,
+        is_similar=ours.is_similar,
+        f_error=ours.f_error,
+        spectrum=likeness.spectrum,
+        lack_of_fit=misfit,
+        forecasts=forecasts,
+        **by_state,
+    )
+
+
+def _texts(values: Mapping[str, float]) -> dict[str, str]:
+    return {state: f"{value:.3g}" for state, value in values.items() if np.isfinite(value)}
+
+
+def _listed(texts: Mapping[str, str]) -> str:
+    """`x 1.01, y 0.99`, of the first states if there are many."""
+    shown = [f"{state} {text}" for state, text in texts.items()]
+    left = len(shown) - N_SHOWN
+    return ", ".join(shown[:N_SHOWN]) + (f" and {left} more" if left > 0 else "")

@@ -1,0 +1,215 @@
+"""One library's result in the study of libraries, and the tables of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import compress
+
+import numpy as np
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.method import Regression
+from ep2sindy.discovery.result import Discovery
+from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.forecasting.skill import ForecastSkill
+from ep2sindy.model.model import SparseModel, model_of
+from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.regression.front import Candidate, fit_support
+from ep2sindy.report.document import Result, Text
+from ep2sindy.report.report import Report
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View
+from ep2sindy.studies.balance import ModelBalance
+from ep2sindy.studies.candidates import (
+    CandidateRow,
+    left_over_of_all,
+    selected_metrics,
+    selected_rows,
+)
+from ep2sindy.studies.living import LIVING, Living
+from ep2sindy.studies.study import Coefficients
+from ep2sindy.studies.views import EVALUATED, EVALUATION, best_run, found_model, worst_run
+
+EVERY_RECORD = "the selected models, integrated from the first sample of every record"
+
+
+@dataclass(frozen=True, eq=False)
+class LibraryResult:
+    """One library's discovery with its selected model, and the published terms fitted to our data.
+
+    runs: free runs of the selected model over every record. thesis: the published coefficients as
+    printed, by state. refitted: their terms fitted to our rows, and published: the run of that
+    model over the first record; None if a state has none. living: a model that oscillates on its
+    own; None if none was asked for, or if the library has inputs. balance: of its zone, beside the
+    living model. skill: of forecasts by the living model over its held-out part, or else by the
+    selected one over the last quarter of the record, which it was fitted to; None if there are
+    none.
+    """
+
+    discovery: Discovery
+    runs: Sequence[Evaluation]
+    thesis: Coefficients
+    refitted: Mapping[str, Candidate]
+    published: Evaluation | None
+    living: Living | None
+    balance: ModelBalance | None
+    skill: ForecastSkill | None
+
+    @property
+    def by_runs(self) -> bool:
+        """Whether the selection runs or refines whole models, rather than scoring candidates."""
+        return self.discovery.method.selection.basis == "runs"
+
+    @property
+    def how(self) -> str:
+        """How the selected equations were found."""
+        if self.by_runs:
+            return "selected by free runs or refinements"
+        if self.discovery.estimate is not None:
+            return "estimated together with the states"
+        return "selected by their derivatives"
+
+    @property
+    def note(self) -> str:
+        """How a rule for whole models decided; other notes are shown as warnings or estimates."""
+        return self.discovery.note if self.by_runs else ""
+
+    @property
+    def beside(self) -> dict[str, list[CandidateRow]]:
+        """The published equations as printed, and with their terms fitted to our rows, by state."""
+        return {
+            state: [
+                CandidateRow(Candidate.of(state, self.thesis[state]), lead="thesis"),
+                CandidateRow(fit, lead="its terms here"),
+            ]
+            for state, fit in self.refitted.items()
+        }
+
+
+LIBRARIES: Metrics[LibraryResult] = [
+    Metric("how", lambda result: result.how),
+    Metric("note", lambda result: result.note),
+    Metric("misfit", lambda result: result.discovery.misfit),
+]
+THESIS_TERMS: Metrics[Candidate] = [
+    Metric("r2_test", lambda fit: fit.r2_test),
+    Metric("r2_train", lambda fit: fit.r2_train),
+    Metric("terms", lambda fit: fit.coef_by_term),
+]
+RECORDS: Metrics[tuple[str, str, Evaluation]] = [
+    Metric("model", lambda row: row[0], View.SHOWN),
+    Metric("record", lambda row: row[1], View.SHOWN),
+    *(metric.of(lambda row: row[2], view=View.SHOWN) for metric in EVALUATION),
+]
+
+
+def add_records(report: Report, results: Mapping[str, LibraryResult], files: Sequence[str]) -> None:
+    """Add how the selected models run over every record."""
+    rows = [
+        (name, file, run)
+        for name, result in results.items()
+        for file, run in zip(files, result.runs, strict=True)
+    ]
+    report.section("Every record")
+    report.table("records", ResultTable(rows, RECORDS), title=EVERY_RECORD, note=EVALUATED)
+
+
+def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
+    """Add tables of all libraries whose facts stand in the sections: for files and headline."""
+    add = partial(report.table, shown=False)
+    label = next(iter(results.values())).discovery.method.selection.label
+    living = {name: each.living for name, each in results.items() if each.living is not None}
+    runs: dict[str, Evaluation] = {}
+    for name, result in results.items():
+        if result.living is not None:
+            runs |= {f"{name}_living": result.living.run, f"{name}_refined": result.living.refined}
+        runs |= {name: result.runs[0]}
+        runs |= {f"{name}_thesis_terms": result.published} if result.published else {}
+    selected = {
+        f"{name}/{state}": row
+        for name, result in results.items()
+        for state, row in selected_rows(result.discovery).items()
+    }
+    thesis = {
+        f"{name}/{state}": fit
+        for name, result in results.items()
+        for state, fit in result.refitted.items()
+    }
+    add("evaluations", ResultTable(runs, EVALUATION), heading="model")
+    add("libraries", ResultTable(results, LIBRARIES), heading="library")
+    add("selected", ResultTable(selected, selected_metrics(label)), heading="of")
+    add("thesis_terms", ResultTable(thesis, THESIS_TERMS), heading="of")
+    add("living", ResultTable(living, LIVING), heading="library")
+
+
+def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
+    """The living model, or the best of those that were run; and what its rows leave over."""
+    living = {name: each.living for name, each in results.items() if each.living is not None}
+    if not living:
+        runs = {name: worst_run(each.runs) for name, each in results.items()}
+        best = best_run(runs)
+        return found_model(
+            f"Found with the library {best}",
+            runs[best],
+            file=best,
+            picture="trajectories",
+            where=f"the worst of {n_records} records" if n_records > 1 else "the record",
+            seen=True,
+            misfit=results[best].discovery.misfit,
+            held=results[best].discovery.constraint,
+        )
+    best = best_run({name: each.run for name, each in living.items()})
+    run = living[best].run
+    caution = [Text(run.caution, warning=True)] if run.caution else []
+    tests = [result.discovery.noise_test for result in results.values()]
+    return found_model(
+        f"Found with the library {best}",
+        run,
+        file=f"{best}_living",
+        picture="trajectories" if run.cycle is None else f"free_run_{best}",
+        more=[*caution, *left_over_of_all(tests)],
+        where="held-out time",
+        held=living[best].discovery.constraint,
+    )
+
+
+def refit(
+    found: Discovery,
+    published: Coefficients,
+    rows: Regression,
+    runs: Sequence[Trajectory],
+    rng: np.random.Generator,
+) -> dict[str, Candidate]:
+    """Published terms fitted to our rows, where the data can tell the terms from others.
+
+    They are the searched rows; after a search of trajectories, rows assembled for the fit.
+    """
+    if not published:
+        return {}
+    fronts = found.fronts.values()
+    problems = {front.equation: front.problem for front in fronts if front.problem is not None}
+    if not problems:
+        assembled = rows.formulation.assemble(runs, found.model.library, rng=rng)
+        problems = {state: problem for problem in assembled for state in problem.equations}
+    fits = {}
+    for state, terms in published.items():
+        if state in found.fronts:
+            problem = problems[state]
+            if set(terms) <= set(compress(problem.library.names, usable_terms(problem))):
+                fits[state] = fit_support(problem, state, list(terms))
+    return fits
+
+
+def refitted_model(found: Discovery, refitted: Mapping[str, Candidate]) -> SparseModel | None:
+    """The model of the published terms with their coefficients here; None if a state has none."""
+    model = found.model
+    if set(refitted) != set(model.states):
+        return None
+    return model_of(
+        model.library,
+        {state: refitted[state].coef_by_term for state in model.states},
+        units=model.units,
+        provenance={**model.provenance, "search": "published terms, refitted"},
+        clock=model.clock,
+    )
