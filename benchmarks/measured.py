@@ -150,8 +150,9 @@ def populations() -> None:
         first, second = run.state_names
         both = f"{first}*{second}"
         named = {first: (first, both), second: (second, both)}
-        for words, terms in {"the whole library": None, "terms named": named}.items():
-            found = ep.discover(run.window(0, n_fitted), terms=terms)
+        for words, terms in {"the whole library": {}, "terms named": named}.items():
+            library = ep.polynomial(run.names).only(terms)
+            found = ep.discover(run.window(0, n_fitted), library)
             print(f"\n{run.label}, {words}\n{found.model.text()}\n  {found.note}")
             if found.model.coef.any():
                 skill = ep.forecast_skill(found.model, run, n_fitted=n_fitted)

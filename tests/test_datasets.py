@@ -24,7 +24,7 @@ def test_predator_and_prey_forecast_the_pelts_better_than_persistence() -> None:
     run = ep.datasets.hare_lynx()
     named = ep.named_terms(["hare", "lynx"], ["hare", "lynx", "hare*lynx"])
     terms = {"hare": ("hare", "hare*lynx"), "lynx": ("lynx", "hare*lynx")}
-    model = ep.discover(run.window(0, 14), named, terms=terms).model
+    model = ep.discover(run.window(0, 14), named.only(terms)).model
     skill = ep.forecast_skill(model, run, n_fitted=14)
     a_year = skill.at(run.dt_s)
     assert a_year["model"] < 0.4 < a_year["persistence"]

@@ -28,7 +28,6 @@ from ep2sindy.forecasting.skill import MODEL, forecast_skill
 from ep2sindy.forecasting.state_estimation import StateEstimator, estimate_states, tune_estimator
 from ep2sindy.library.library import polynomial
 from ep2sindy.library.names import number_text
-from ep2sindy.library.relations import relations_of
 from ep2sindy.model.comparison import REPEATS, SPIRALS
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Once, at_once
@@ -91,8 +90,6 @@ class Preparation:
             run,
             states.library(self.degree, functions, self.function_degree),
             method,
-            relations=states.relations,
-            terms=states.terms,
             hidden=states.hidden,
             seed=seed,
             progress=progress,
@@ -108,8 +105,7 @@ class Preparation:
             method = Regression(search=BestSubset(max_terms=method.max_terms or FIRST_MAX_TERMS))
         try:
             library = states.library(self.degree, functions, self.function_degree)
-            task = Task([states.run], library, relations_of(states.relations), states.terms)
-            equations = method.search_equations(task, rng=0)
+            equations = method.search_equations(Task([states.run], library), rng=0)
         except ValueError:
             return float("inf")
         fronts = [each.front for each in equations if each.front.equation not in states.known]
@@ -305,13 +301,11 @@ def fit_offset(
     """
     run, names = end_of(past.run), Embedding("rate").names(past)
     mean, spread = run.states.mean(), run.states.std()
-    x, g = names
+    library, (x, g) = polynomial(names, degree=degree), names
     search = partial(
         discover,
-        library=polynomial(names, degree=degree),
+        library=library.relate(f"{x}: {x}*{g} == 1").only({x: [g, f"{x}*{g}"]}),
         method=by_trajectories(method),
-        relations=[f"{x}: {x}*{g} == 1"],
-        terms={x: [g, f"{x}*{g}"]},
         hidden=[g],
         progress=progress,
     )

@@ -171,16 +171,20 @@ class Embedded:
         return [f"{state}: {term} == 1" for state, term in self.known.items()]
 
     @property
-    def terms(self) -> dict[str, tuple[str]]:
-        return {state: (term,) for state, term in self.known.items()}
+    def terms(self) -> dict[str, list[str]]:
+        return {state: [term] for state, term in self.known.items()}
 
     def library(
         self, degree: int = 3, functions: Sequence[str] = (), function_degree: int = 1
     ) -> Library:
-        """Products of the states up to a degree, and functions; see `polynomial`."""
-        return polynomial(
+        """Products of the states up to a degree, and functions, with what is known.
+
+        degree, functions, function_degree: see `polynomial`.
+        """
+        library = polynomial(
             self.names, degree=degree, functions=functions, function_degree=function_degree
         )
+        return library.relate(*self.relations).only(self.terms)
 
     def along(self, run: Trajectory) -> Trajectory:
         """The states along other samples of the signal, which are the first column of a run."""
@@ -212,10 +216,8 @@ def embed(
     >>> states = ep.embed((t, np.sin(t)))
     >>> states.run.state_names, states.known
     (('x', 'v'), {'x': 'v'})
-    >>> method = ep.Regression()
-    >>> known = {"relations": states.relations, "terms": states.terms}
-    >>> model = ep.discover(states.run, states.library(degree=1), method, **known).model
-    >>> round(model.terms("v")["x"], 2)
+    >>> found = ep.discover(states.run, states.library(degree=1), ep.Regression())
+    >>> round(found.model.terms("v")["x"], 2)
     -1.0
     """
     if not isinstance(run, Trace):

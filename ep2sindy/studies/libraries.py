@@ -223,10 +223,8 @@ class Study:
         """
         measured = runs[0]
         barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
-        found = discover(
-            list(runs), library, method, hidden=self.hidden, relations=self.relations,
-            exclude=barred, roles=self.roles, seed=rng, progress=progress,
-        )  # fmt: skip
+        known = library.exclude(barred).relate(*self.relations).with_roles(self.roles)
+        found = discover(list(runs), known, method, hidden=self.hidden, seed=rng, progress=progress)
         runs = runs if found.estimate is None else found.estimate.runs
         s, rows = self.rollout_s, Regression(self.formulation, bootstraps=self.bootstraps)
         n_samples = [run.n_samples if s is None else samples_in(run, s) for run in runs]

@@ -103,7 +103,7 @@ class LivingSearch:
         library = polynomial(train.state_names, degree=self.degree) if self.degree else library
         roles, told = self._told(train, zones)
         seen, words = self._quiet(train)
-        found = discover(seen, library, own, roles=roles, seed=rng, progress=progress)
+        found = discover(seen, library.with_roles(roles), own, seed=rng, progress=progress)
         found = replace(found, note=f"{found.note}{told}")
         if not words:
             return found

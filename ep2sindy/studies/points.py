@@ -16,6 +16,7 @@ import pandas as pd
 from ep2sindy.data.trajectory import point_label
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
+from ep2sindy.library.facts import Known
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.given_models import (
@@ -26,7 +27,7 @@ from ep2sindy.operating.given_models import (
     fit_models,
     fits_of,
 )
-from ep2sindy.operating.law import Known, LawFunctions, constrain_law, make_basis
+from ep2sindy.operating.law import LawFunctions, constrain_law, make_basis
 from ep2sindy.operating.quantities import Quantity
 from ep2sindy.operating.records import OperatingRecord, branches_of, read_points
 from ep2sindy.regression.formulations import Differential, RandomSplit, WeightedWeak
@@ -244,13 +245,13 @@ class Study:
             raise ValueError(nothing_moves([point.status for point in opened]))
         sizes, n_best = (SIGNAL_SIZES, 2) if signal else (SIZES, 1)
         known = signal.terms if signal else {}
-        library = polynomial(runs[0].state_names, degree=self.degree or (3 if signal else 2))
+        degree = self.degree or (3 if signal else 2)
+        names = runs[0].state_names
+        library = signal.library(degree) if signal else polynomial(names, degree=degree)
         search = BestSubset(max_terms=sizes[-1], n_best=n_best)
         rows = Differential(split=RandomSplit(test_fraction=0.0)) if signal else WeightedWeak()
         found = discover(
-            runs, library, Regression(rows, search, depth=n_best), shared=True, seed=run.seed,
-            terms=known, relations=signal.relations if signal else (),
-            progress=run.watch,
+            runs, library, Regression(rows, search, depth=n_best), shared=True, seed=run.seed, progress=run.watch,
         )  # fmt: skip
         supports = {
             state: [known[state]]
@@ -298,8 +299,9 @@ class Study:
         for name, own in models.items():
             try:
                 relations = constrain_law(
-                    library, terms[name], own.relations, own.known, parameters=parameters
-                )
+                    library.relate(*own.relations).known(own.known),
+                    terms[name], parameters=parameters,
+                )  # fmt: skip
                 for quantity in own.quantities.values():
                     quantity.place(relations.common, library)
             except ValueError as error:
