@@ -251,7 +251,8 @@ class Study:
         search = BestSubset(max_terms=sizes[-1], n_best=n_best)
         rows = Differential(split=RandomSplit(test_fraction=0.0)) if signal else WeightedWeak()
         found = discover(
-            runs, library, Regression(rows, search, depth=n_best), shared=True, seed=run.seed, progress=run.watch,
+            runs, library, Regression(rows, search, depth=n_best), shared=True, seed=run.seed,
+            progress=run.watch,
         )  # fmt: skip
         supports = {
             state: [known[state]]
