@@ -51,7 +51,7 @@ from ep2sindy.studies.source import (
     split_in_time,
     zones_of,
 )
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts, Terms
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Terms, ZeroOrMore
 from ep2sindy.studies.views import (
     EVALUATED,
     EVALUATION,
