@@ -22,7 +22,6 @@ ODD = (
     "ok\u202eabc",
     "I [arb]",
     "it's",
-    "c\x85d",
 )
 
 
