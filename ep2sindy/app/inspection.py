@@ -85,7 +85,8 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         path = own_config(name, conf)
         write_text(path, config_text(found, paths))
         lines, end = commands(found, name, pattern), f"written: {path}"
-    say("\n".join(["next, for example:" * bool(lines), *(f"  {line}" for line in lines), end]))
+    header = ["next, for example:"] if lines else []
+    say("\n".join([*header, *(f"  {line}" for line in lines), end]))
 
 
 def point_lines(pattern: FilePattern) -> list[str]:

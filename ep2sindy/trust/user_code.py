@@ -81,36 +81,31 @@ def load_user_module(name: str) -> ModuleType:
     Raises ModuleNotFoundError, before anything is run, if there is no such file, or if the name
     belongs to an installed package or the standard library.
     """
-    here, parts = Path.cwd(), name.split(".")
-    if not all(part.isidentifier() for part in parts) or _file(here.joinpath(*parts)) is None:
-        raise ModuleNotFoundError(f"{here} has no {'/'.join(parts)}.py", name=name)
+    here, own = Path.cwd(), own_source(name)
+    if own is None:
+        raise ModuleNotFoundError(f"{here} has no {name.replace('.', '/')}.py", name=name)
     if str(here) not in sys.path:
         sys.path.append(str(here))
         invalidate_caches()
-    known = find_spec(parts[0])
-    places = [known.origin, *(known.submodule_search_locations or ())] if known else []
-    if not {str(here / parts[0]), str(here / f"{parts[0]}.py")} & {*places}:
+    known = find_spec(own.stem)
+    if known is None or str(own) not in (known.origin, *(known.submodule_search_locations or ())):
         raise ModuleNotFoundError(
-            f"a module of yours must have a name of its own: {parts[0]!r} is another's; rename it",
+            f"a module of yours must have a name of its own: {own.stem!r} is another's; rename it",
             name=name,
         )
     module = import_module(name)
-    _OWN[parts[0]] = sys.modules[parts[0]]
+    _OWN[own.stem] = sys.modules[own.stem]
     return module
 
 
 def own_source(name: str) -> Path | None:
     """File or folder below the current folder that holds the code of a dotted name, or None."""
+    if not all(part.isidentifier() for part in name.split(".")):
+        return None
     root = Path.cwd() / name.partition(".")[0]
-    return root if root.is_dir() else _file(root)
+    return next((path for path in (root, root.with_suffix(".py")) if path.exists()), None)
 
 
 def own_packages() -> list[ModuleType]:
     """User modules that configs have named; other processes cannot import them by name."""
     return [module for name, module in _OWN.items() if sys.modules.get(name) is module]
-
-
-def _file(place: Path) -> Path | None:
-    """Source file of the module or package at a place, or None."""
-    files = (place.with_suffix(".py"), place / "__init__.py")
-    return next((file for file in files if file.is_file()), None)
