@@ -109,4 +109,5 @@ NamesOrOne = Annotated[
 Counts = Annotated[Sequence[_Counts], A_LIST]
 Levels = Annotated[Sequence[_Levels], A_LIST]
 Positives = Annotated[Sequence[_Positives], A_LIST]
+Terms = Mapping[str, Sequence[int | str]]  # by state; the constant term 1 may be a number
 Coefficients = Mapping[str, Mapping[str, float]]  # state -> term -> SI coefficient
