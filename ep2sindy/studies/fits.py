@@ -45,7 +45,6 @@ from ep2sindy.studies.fitted import (
     fitted_start,
     n_sustained,
     worst_amplitude,
-    worst_waveform,
     wrong_signs,
 )
 from ep2sindy.studies.over_points import add_points
@@ -60,7 +59,14 @@ from ep2sindy.studies.study import (
     ShareOrNone,
     ZeroOrMore,
 )
-from ep2sindy.studies.views import PlotRange, add_figures, add_samples, best_run, found_model
+from ep2sindy.studies.views import (
+    PlotRange,
+    add_figures,
+    add_samples,
+    best_run,
+    found_model,
+    largest,
+)
 
 if TYPE_CHECKING:
     from ep2sindy.refinement.problem import Iteration
@@ -330,7 +336,12 @@ SPREAD: Metrics[Sequence[Evaluation]] = [
     Metric("f_error", partial(ends, lambda run: run.f_error), View.SHOWN, format=_PERCENT),
     Metric("nrmse", partial(ends, lambda run: run.nrmse), View.SHOWN, format=_range),
     Metric("amplitude", partial(ends, worst_amplitude), View.SHOWN, format=_range),
-    Metric("waveform", partial(ends, worst_waveform), View.SHOWN, format=_range),
+    Metric(
+        "waveform",
+        partial(ends, lambda run: largest(run.waveform_error)),
+        View.SHOWN,
+        format=_range,
+    ),
 ]
 
 
