@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from benchmarks import known_laws
 from ep2sindy.app.runner import run_config
+from ep2sindy.model.comparison import Status
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import map_points
 from ep2sindy.report.document import Text
