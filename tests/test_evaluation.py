@@ -176,8 +176,10 @@ def test_the_title_of_a_result_says_where_a_model_was_fitted_and_what_it_does_no
     def title(run: Evaluation, **how: Any) -> str:
         return found_model("Found", run, file="a", picture="", where="it", **how).title
 
-    assert title(run) == "Found: a model that is sustained"
-    assert title(run, seen=True) == "Found: a model that is sustained where it was fitted"
+    assert title(run) == "Found: a model that sustains the oscillation"
+    assert (
+        title(run, seen=True) == "Found: a model that sustains the oscillation where it was fitted"
+    )
     similar = replace(run, status=Status.NO_CYCLE)
     assert title(similar) == "Found: a model that has the statistics of the data"
     assert title(similar, misfit="no law") == "Found: a model that does not explain the data"
