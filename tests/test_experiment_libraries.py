@@ -113,9 +113,9 @@ def test_the_page_says_the_model_that_lives_before_candidates(breathing_run: Pat
     assert "the cycle is neutral: it neither attracts nor repels" in found
     assert 'id="figure-free_run_simple"' in found
     order = [
-        "simple: a model selected by free runs (sustained)", "simple: what the terms mean",
-        "simple: forecasts over time held out", "The selected models",
-        "Run freely from the first sample", "simple: candidates", "ionization: candidates",
+        "How the models run", "simple: a model selected by free runs (sustained)",
+        "simple: what the terms mean", "simple: forecasts over time held out",
+        "The selected models", "simple: candidates", "ionization: candidates",
     ]  # fmt: skip
     titles = re.findall(r"<h[23][^>]*>(.*?)</h", rest)
     assert [title for title in titles if title in order] == order
