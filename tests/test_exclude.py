@@ -89,10 +89,8 @@ def test_a_config_excludes_terms(tmp_path) -> None:
     )  # fmt: skip
     found = programs.computed(programs.composed(*given, 'exclude={x: [1, "x^2"]}'))
     front = found.report.tables["front_model"]
-    sums = front.loc[front["equation"] == "x", "text"].str.removeprefix("x' = ").tolist()
-    terms = {
-        part.lstrip("-0123456789.e ") for text in sums[1:] for part in re.split(" [+-] ", text)
-    }
+    texts = front.loc[front["equation"] == "x", "text"].str.removeprefix("x' = ")[1:]
+    terms = {part.lstrip("-0123456789.e ") for text in texts for part in re.split(" [+-] ", text)}
     assert terms == {"x", "y", "x y", "y^2"}
     with pytest.raises(ValueError, match="exclude.x must be a list: 'x' came"):
         programs.computed(programs.composed(*given, "exclude={x: x}"))
