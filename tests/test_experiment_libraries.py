@@ -9,8 +9,8 @@ from hydra import compose, initialize_config_dir
 import ep2sindy as ep
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
-from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.result import NoiseTest
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Text

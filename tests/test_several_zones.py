@@ -175,7 +175,7 @@ def refined(depth: int) -> ep.Regression:
 
 def test_a_search_in_zones_finds_the_truth_and_conserves() -> None:
     library = ep.polynomial(NAMES, degree=3)
-    found = ep.discover(chain(), library, refined(depth=4), roles=ROLES.in_zones(SIZES))
+    found = ep.discover(chain(), library.with_roles(ROLES.in_zones(SIZES)), refined(depth=4))
     for state, terms in CHAIN.items():
         assert found.model.terms(state) == pytest.approx(terms, rel=2e-3)
     ours, theirs = (found.model.terms(s)["n_i@a"] for s in ("n_i@a", "n_i@b"))
@@ -187,7 +187,7 @@ def test_a_search_in_zones_finds_the_truth_and_conserves() -> None:
 
 def test_every_role_of_zones_goes_forward() -> None:
     back = ep.Roles(exchange=[("n_i", "n_n")], outflow=STATES, inflow={"n_n": 0.4}).in_zones(SIZES)
-    found = ep.discover(chain(), ep.polynomial(NAMES, degree=3), refined(depth=2), roles=back)
+    found = ep.discover(chain(), ep.polynomial(NAMES, degree=3).with_roles(back), refined(depth=2))
     assert "n_i@a to n_n@a > 0 in the mean" in found.note  # no model gives ions to neutrals
 
 

@@ -50,7 +50,7 @@ from ep2sindy.studies.source import (
     split_in_time,
     zones_of,
 )
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts, Terms
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Terms, ZeroOrMore
 from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module
 
@@ -123,7 +123,7 @@ class Study:
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: ShareOrNone = None
-    forecasts: Starts = 0
+    forecasts: ZeroOrMore = 0
     hidden: Sequence[str] = ()
     relations: Sequence[str] = ()
     exclude: Terms | None = None
@@ -214,10 +214,8 @@ class Study:
         """
         measured = runs[0]
         barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
-        found = discover(
-            list(runs), library, method, hidden=self.hidden, relations=self.relations,
-            exclude=barred, roles=self.roles, seed=rng, progress=progress,
-        )  # fmt: skip
+        known = library.exclude(barred).relate(*self.relations).with_roles(self.roles)
+        found = discover(list(runs), known, method, hidden=self.hidden, seed=rng, progress=progress)
         runs = runs if found.estimate is None else found.estimate.runs
         s = self.rollout_s
         n_samples = [run.n_samples if s is None else samples_in(run, s) for run in runs]

@@ -103,7 +103,7 @@ class LivingSearch:
         library = polynomial(train.state_names, degree=self.degree) if self.degree else library
         roles, told = self._told(train, zones)
         seen, words = self._quiet(train)
-        found = discover(seen, library, own, roles=roles, seed=rng, progress=progress)
+        found = discover(seen, library.with_roles(roles), own, seed=rng, progress=progress)
         found = replace(found, note=f"{found.note}{told}")
         if not words:
             return found
@@ -196,15 +196,21 @@ def add_living(report: Report, name: str, found: Living) -> None:
         report.figure(f"free_run_{name}", draw, CAPTIONS["free_run"])
     report.model(f"{name}_refined", found.refined.model, shown=False)
     report.add(*_notes(found))
-    if run.cycle is not None:
-        if len(model.states) > 1:
-            draw = partial(figures.cycle_figure, run.record, run.cycle)
-            report.figure(f"cycle_{name}", draw, CAPTIONS["cycle"])
-        if figures.find_waveforms(run.record, run.rollout):
-            draw = partial(figures.waveform_figure, run.record, run.rollout)
-            report.figure(f"waveform_{name}", draw, CAPTIONS["waveform"])
+    add_cycle(report, name, run)
     add_samples(report, run.record, {f"{name}_living": run})
     _add_others(report, name, found.discovery.others)
+
+
+def add_cycle(report: Report, name: str, run: Evaluation) -> None:
+    """Add figures of the cycle of a model, if it has one. name: of the model, which names them."""
+    if run.cycle is None:
+        return
+    if len(run.model.states) > 1:
+        draw = partial(figures.cycle_figure, run.record, run.cycle)
+        report.figure(f"cycle_{name}", draw, CAPTIONS["cycle"])
+    if figures.find_waveforms(run.record, run.rollout):
+        draw = partial(figures.waveform_figure, run.record, run.rollout)
+        report.figure(f"waveform_{name}", draw, CAPTIONS["waveform"])
 
 
 def _add_others(report: Report, name: str, others: Sequence[OtherSystem]) -> None:
