@@ -264,24 +264,17 @@ class Study:
             if result.living is not None and result.balance is not None:
                 add_living(report, name, result.living)
                 add_balance(report, name, result.balance, data, result.living.run.cycle)
-                self._add_forecasts(report, name, data, result)
+            if result.skill is not None:
+                where = "that it has seen" if result.living is None else "held out"
+                title = f"{name}: forecasts over time {where}"
+                add_forecasts(report, name, data, result.skill, title=title)
         self._add_selected(report, data, results)
         for name, result in results.items():
             found = result.discovery
-            if result.living is None:
-                self._add_forecasts(report, name, data, result)
             add_candidates(report, name, found, note=result.note, beside=result.beside)
             if found.estimate is not None:
                 add_estimate(report, name, found)
         add_tables(report, results)
-
-    def _add_forecasts(
-        self, report: Report, name: str, data: Trajectory, result: LibraryResult
-    ) -> None:
-        if result.skill is not None:
-            where = "that it has seen" if result.living is None else "held out"
-            title = f"{name}: forecasts over time {where}"
-            add_forecasts(report, name, data, result.skill, title=title)
 
     def _add_selected(
         self, report: Report, data: Trajectory, results: Mapping[str, LibraryResult]
