@@ -118,9 +118,9 @@ def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
         rows |= {f"{name}_thesis_terms/{s}": CandidateRow(each) for s, each in refitted}
     label = next(iter(results.values())).discovery.method.selection.label
     report.table("equations", ResultTable(rows, selected_metrics(label)), heading="of", shown=False)
-    living = {name: each.living for name, each in results.items() if each.living is not None}
+    living = {f"{name}_living": each.living for name, each in results.items() if each.living}
     if living:
-        report.table("living", ResultTable(living, LIVING), heading="library", shown=False)
+        report.table("living", ResultTable(living, LIVING), heading="model", shown=False)
 
 
 def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
