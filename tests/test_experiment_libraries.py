@@ -87,8 +87,8 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert run["f_error"] == pytest.approx(0.0, abs=1e-4)
     assert run["waveform_error"] == pytest.approx({"n_i": 0.0, "n_n": 0.0}, abs=1e-2)
     assert run["amplitude_ratio"] == pytest.approx({"n_i": 1.0, "n_n": 1.0}, abs=1e-2)
-    assert set(found["living"]) == {"simple"}  # the others have inputs
-    living = found["living"]["simple"]
+    assert set(found["living"]) == {"simple_living"}  # the others have inputs
+    living = found["living"]["simple_living"]
     assert living["n_terms"] == 4
     assert living["stability"] == "neutral"  # predator and prey
     assert living["multiplier"] == pytest.approx(1.0, abs=1e-3)
