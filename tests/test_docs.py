@@ -27,7 +27,7 @@ from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.model.comparison import Status
 from ep2sindy.report.results import View
-from ep2sindy.studies.library_result import RULES, candidate_metrics
+from ep2sindy.studies.candidates import RULES, candidate_metrics
 from tests.pages import (
     FENCE,
     PAGES,

@@ -26,10 +26,6 @@ from ep2sindy.studies.study import PositiveOrAll
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FROM_DERIVATIVES = (
-    "These are the equations that fits of the derivatives select; those that free runs select, "
-    "which are sustained if any is, stand above."
-)
 MARKS = "Carets: the model leaves the panel; cross: a run that diverged stops."
 CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",
