@@ -27,8 +27,7 @@ import numpy as np
 import pandas as pd
 
 import ep2sindy as ep
-from ep2sindy.discovery.signal_unknowns import fit_offset
-from ep2sindy.runtime.progress import SILENT
+from ep2sindy.discovery.one_signal import fit_offset
 from ep2sindy.signals.spectrum import crossing_frequency
 
 FOLDER = Path(os.environ.get("EP2SINDY_DATA", "."))
@@ -337,9 +336,8 @@ def offset() -> None:
             run = system.trajectory(noise=noise, rng=seed)
             x = run.columns([name])
             signal = ep.signals.prepare_signal(ep.Trajectory(run.t, x - x.mean(), [name]))
-            library = ep.polynomial([name, "g"], degree=2)
             try:
-                value, low, high = fit_offset(signal, library, ep.TrajectorySearch(), SILENT)
+                value, low, high = fit_offset(signal, 2, ep.TrajectorySearch())
             except ValueError:
                 continue
             errors.append(abs(value / x.mean() - 1.0))

@@ -199,15 +199,21 @@ def add_living(report: Report, name: str, found: Living) -> None:
     rows = ResultTable(runs, EVALUATION).screen("model", by_state=True)
     title = "run freely from one sample over held-out time"
     report.add(Table(rows, title=title, note=EVALUATED), *_notes(found))
-    if run.cycle is not None:
-        if len(model.states) > 1:
-            draw = partial(figures.cycle_figure, run.record, run.cycle)
-            report.figure(f"cycle_{name}", draw, CAPTIONS["cycle"])
-        if figures.find_waveforms(run.record, run.rollout):
-            draw = partial(figures.waveform_figure, run.record, run.rollout)
-            report.figure(f"waveform_{name}", draw, CAPTIONS["waveform"])
+    add_cycle(report, name, run)
     add_samples(report, run.record, {f"{name}_living": run})
     _add_others(report, name, found.discovery.others)
+
+
+def add_cycle(report: Report, name: str, run: Evaluation) -> None:
+    """Add figures of the cycle of a model, if it has one. name: of the model, which names them."""
+    if run.cycle is None:
+        return
+    if len(run.model.states) > 1:
+        draw = partial(figures.cycle_figure, run.record, run.cycle)
+        report.figure(f"cycle_{name}", draw, CAPTIONS["cycle"])
+    if figures.find_waveforms(run.record, run.rollout):
+        draw = partial(figures.waveform_figure, run.record, run.rollout)
+        report.figure(f"waveform_{name}", draw, CAPTIONS["waveform"])
 
 
 def _add_others(report: Report, name: str, others: Sequence[OtherSystem]) -> None:

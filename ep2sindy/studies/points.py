@@ -34,7 +34,7 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers
-from ep2sindy.signals.embedding import Embedded, embed
+from ep2sindy.signals.embedding import Embedded, embed_alike
 from ep2sindy.signals.spectrum import Oscillation
 from ep2sindy.signals.trace import MIN_PERIODS, prepare_signal
 from ep2sindy.studies.law_tables import FoundLaw, add_law, find_law
@@ -270,12 +270,13 @@ class Study:
             raise ValueError(nothing_moves([point.status for point in opened]))
         sizes, n_best = (SIGNAL_SIZES, 2) if signal else (SIZES, 1)
         known = signal.terms if signal else {}
-        library = polynomial(runs[0].state_names, degree=self.degree or (3 if signal else 2))
+        degree = self.degree or (3 if signal else 2)
+        names = runs[0].state_names
+        library = signal.library(degree) if signal else polynomial(names, degree=degree)
         search = BestSubset(max_terms=sizes[-1], n_best=n_best)
         rows = Differential(split=RandomSplit(test_fraction=0.0)) if signal else WeightedWeak()
         found = discover(
-            runs, signal.known_in(library) if signal else library,
-            Regression(rows, search, depth=n_best), shared=True, seed=report.seed,
+            runs, library, Regression(rows, search, depth=n_best), shared=True, seed=report.seed,
             progress=report.watch,
         )  # fmt: skip
         supports = {
@@ -365,7 +366,7 @@ def embed_points(opened: Sequence[OpenedPoint]) -> tuple[list[OpenedPoint], Embe
                 traces[k] = prepare_signal(point.run)
     if not traces:
         raise ValueError("no signal oscillates for six periods: record for longer")
-    states = embed(list(traces.values()))
+    states = embed_alike(list(traces.values()))
     for k, own in zip(traces, states, strict=True):
         made[k] = replace(opened[k], run=own.run)
     return made, states[0]
