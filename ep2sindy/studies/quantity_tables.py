@@ -245,7 +245,8 @@ def _add_values(
 
 def _equation(name: str, law: ControlLaw, unit: str = "", error: str = "") -> Equation:
     mark = f" ({error} off where left out)" if error else ""
-    return Equation(name, law.coef_by_term, rate=False, unit=unit, mark=mark, on_screen=True)
+    shown = "" if unit == "1" else unit
+    return Equation(name, law.coef_by_term, rate=False, unit=shown, mark=mark, on_screen=True)
 
 
 def _heading(name: str, unit: str) -> str:
