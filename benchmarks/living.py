@@ -29,8 +29,8 @@ from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.roles import shares_of, sum_known
 from ep2sindy.refinement.refine import with_coef
-from ep2sindy.studies.balance import ComparedProcess, compared_processes, ends_of
 from ep2sindy.studies.living import start_of
+from ep2sindy.studies.processes import ComparedProcess, compared_processes, ends_of
 from ep2sindy.studies.source import Zones, fitted_rate, recorded_rates, told_roles
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
@@ -201,7 +201,8 @@ def under(
         depth=16,
     )
     roles = roles.with_known(known_of(fitted, whole))
-    return ep.discover([fitted], ep.polynomial(STATES, degree=3), method, roles=roles, seed=seed)
+    library = ep.polynomial(STATES, degree=3).with_roles(roles)
+    return ep.discover([fitted], library, method, seed=seed)
 
 
 def known_of(fitted: ep.Trajectory, whole: Record) -> dict[str, dict[str, float]]:
@@ -215,14 +216,14 @@ def by_neighbourhood(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.D
     two = len(whole.sizes) == 2
     roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "known"})
     roles = roles.in_zones(whole.sizes).with_known(known_of(fitted, whole))
-    library = ep.polynomial(fitted.state_names, degree=3)
+    library = ep.polynomial(fitted.state_names, degree=3).with_roles(roles)
     method = ep.Regression(
         ep.Differential(),
         ep.BestSubset(max_terms=14 if two else 20, n_best=200 if two else 1000),
         ep.FreeRunScore(seed=seed, window_periods=8.0),
         depth=6 if two else 4,
     )
-    return ep.discover([fitted], library, method, roles=roles, seed=seed)
+    return ep.discover([fitted], library, method, seed=seed)
 
 
 def free(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:

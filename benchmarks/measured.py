@@ -27,8 +27,7 @@ import numpy as np
 import pandas as pd
 
 import ep2sindy as ep
-from ep2sindy.discovery.signal_unknowns import fit_offset
-from ep2sindy.runtime.progress import SILENT
+from ep2sindy.discovery.one_signal import fit_offset
 from ep2sindy.signals.spectrum import crossing_frequency
 
 FOLDER = Path(os.environ.get("EP2SINDY_DATA", "."))
@@ -150,8 +149,9 @@ def populations() -> None:
         first, second = run.state_names
         both = f"{first}*{second}"
         named = {first: (first, both), second: (second, both)}
-        for words, terms in {"the whole library": None, "terms named": named}.items():
-            found = ep.discover(run.window(0, n_fitted), terms=terms)
+        for words, terms in {"the whole library": {}, "terms named": named}.items():
+            library = ep.polynomial(run.names).only(terms)
+            found = ep.discover(run.window(0, n_fitted), library)
             print(f"\n{run.label}, {words}\n{found.model.text()}\n  {found.note}")
             if found.model.coef.any():
                 skill = ep.forecast_skill(found.model, run, n_fitted=n_fitted)
@@ -336,9 +336,8 @@ def offset() -> None:
             run = system.trajectory(noise=noise, rng=seed)
             x = run.columns([name])
             signal = ep.signals.prepare_signal(ep.Trajectory(run.t, x - x.mean(), [name]))
-            library = ep.polynomial([name, "g"], degree=2)
             try:
-                value, low, high = fit_offset(signal, library, ep.TrajectorySearch(), SILENT)
+                value, low, high = fit_offset(signal, 2, ep.TrajectorySearch())
             except ValueError:
                 continue
             errors.append(abs(value / x.mean() - 1.0))

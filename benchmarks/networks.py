@@ -138,7 +138,7 @@ def counts(name: str, network: Network, noise: float, n: int) -> None:
     begun = time.process_time()
     for seed in range(n):
         run = record(network, noise, seed)
-        found = ep.discover(run, library, roles=network.roles)
+        found = ep.discover(run, library.with_roles(network.roles))
         right[0] += is_right(found, network)
         negative += n_negative(found.model, network)
         right[1] += is_right(ep.discover(run, library), network)

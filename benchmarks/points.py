@@ -193,8 +193,8 @@ def grid() -> None:
     given = {
         name: GivenModel(
             constrain_law(
-                CUBIC, model["terms"], model.get("relations", ()), model.get("known", {}),
-                parameters=NAMES,
+                CUBIC.relate(*model.get("relations", ())).known(model.get("known", {})),
+                model["terms"], parameters=NAMES,
             )
         )
         for name, model in MODELS.items()

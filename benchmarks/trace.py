@@ -22,12 +22,10 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.forecasting.evaluation import evaluate
-from ep2sindy.library.library import polynomial
 from ep2sindy.model.comparison import Status
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.free_run import FreeRunScore
-from ep2sindy.signals.embedding import embed
 from ep2sindy.signals.trace import prepare_signal
 
 POINTS = ("300/4", "300/5", "300/6", "400/5")
@@ -58,15 +56,13 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
     begin = time.process_time()
     signal = prepare_signal(measured)
     n = round(0.75 * measured.n_samples)
-    chosen = embed(signal.window(0, n))
-    states = chosen.embedding.embed(signal).run  # starts of other runs, and figures
+    chosen = ep.embed(signal.window(0, n))
+    states = chosen.along(signal.run)  # starts of other runs, and figures
     bounds = ep.FreeRunBounds(frequency=0.005, amplitude=0.05)
     rule = FreeRunScore(bounds=bounds, n_windows=40, judged=(NAME,), n_starts=8, seed=seed)
     search = BestSubset(max_terms=5, n_best=8)
     method = Regression(search=search, selection=rule, bootstraps=Bootstraps(n=0), depth=8)
-    library = polynomial(states.state_names, degree=3)
-    known = {"relations": chosen.relations, "terms": chosen.terms}
-    model = discover(chosen.run, library, method, **known).model
+    model = discover(chosen.run, chosen.library(degree=3), method).model
     seconds = time.process_time() - begin
     record = np.column_stack([clean.states[:, 0], states.states[:, 1]])
     held = Trajectory(states.t, record, states.state_names).window(n, states.n_samples)

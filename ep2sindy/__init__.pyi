@@ -27,7 +27,7 @@ from ep2sindy.discovery.discover import discover as discover
 from ep2sindy.discovery.result import Discovery as Discovery
 from ep2sindy.discovery.pointwise import pointwise as pointwise
 from ep2sindy.estimation.estimate import estimate as estimate
-from ep2sindy.discovery.one_signal import from_one_signal as from_one_signal
+from ep2sindy.signals.embedding import embed as embed
 
 # Searches
 from ep2sindy.discovery.method import TrajectorySearch as TrajectorySearch  # for configs

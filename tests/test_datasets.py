@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.discovery.signal_unknowns import fit_functions
+from ep2sindy.discovery.one_signal import fit_functions
 
 
 def test_the_records_are_as_published() -> None:
@@ -24,7 +24,7 @@ def test_predator_and_prey_forecast_the_pelts_better_than_persistence() -> None:
     run = ep.datasets.hare_lynx()
     named = ep.named_terms(["hare", "lynx"], ["hare", "lynx", "hare*lynx"])
     terms = {"hare": ("hare", "hare*lynx"), "lynx": ("lynx", "hare*lynx")}
-    model = ep.discover(run.window(0, 14), named, terms=terms).model
+    model = ep.discover(run.window(0, 14), named.only(terms)).model
     skill = ep.forecast_skill(model, run, n_fitted=14)
     a_year = skill.at(run.dt_s)
     assert a_year["model"] < 0.4 < a_year["persistence"]
@@ -38,25 +38,23 @@ def test_dry_friction_is_found_with_its_width() -> None:
     run = truth.simulate(np.linspace(0.0, 8.0, 1601), [0.5, 0.0]).trajectory()
     seen = []
 
-    def misfit(tried: ep.Library) -> float:
+    def misfit(functions: list[str]) -> float:
+        tried = ep.polynomial(["x", "v"], degree=1, functions=functions)
         theta, rate = tried.evaluate(run.states), truth.predict(run)[:, 1]
         left = rate - theta @ np.linalg.lstsq(theta, rate, rcond=None)[0]
         seen.append(tried)
         return float(left @ left)
 
-    def library_of(functions: list[str]) -> ep.Library:
-        return ep.polynomial(["x", "v"], degree=1, functions=functions)
-
-    (found,) = fit_functions(["sign(?*v)"], run, library_of, misfit)
+    (found,) = fit_functions(["sign(?*v)"], run, misfit)
     factor = float(found.removeprefix("sign(").removesuffix("*v)"))
     assert factor == pytest.approx(10.0, rel=0.02)
     assert len(seen) < 40
-    (summand,) = fit_functions(["1/(?+x)"], run, library_of, lambda tried: 1.0)
+    (summand,) = fit_functions(["1/(?+x)"], run, lambda tried: 1.0)
     assert summand.startswith("1/(")
     with pytest.raises(ValueError, match=r"must have one \? and one variable of \['x', 'v'\]"):
-        fit_functions(["sign(?*v+?)"], run, library_of, misfit)
+        fit_functions(["sign(?*v+?)"], run, misfit)
     with pytest.raises(ValueError, match=r"no number in the place of \?"):
-        fit_functions(["sign(?*v)"], run, library_of, lambda tried: np.inf)
+        fit_functions(["sign(?*v)"], run, lambda tried: np.inf)
 
 
 def test_a_smooth_sign_is_integrated_written_and_stored() -> None:

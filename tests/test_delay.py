@@ -51,7 +51,7 @@ def found_with(run: ep.Trajectory, delay: ep.Delay) -> tuple[ep.Discovery, ep.Tr
         ep.Differential(ep.signals.NoSmoothing()), ep.BestSubset(max_terms=2), ep.FreeRunScore()
     )
     library = ep.polynomial(["x", delay.last], degree=2)
-    return ep.discover(long, library, method, roles=ep.Roles(equations=delay.equations)), long
+    return ep.discover(long, library.with_roles(ep.Roles(equations=delay.equations)), method), long
 
 
 def test_a_search_finds_what_is_delayed_and_leaves_the_stages_as_they_are() -> None:

@@ -103,7 +103,7 @@ def test_hare_and_lynx_are_predator_and_prey_in_21_counts(
 def test_an_equation_that_is_given_is_not_held_down() -> None:
     given = ["1", "hare", "lynx"]
     known = {"hare": given, "lynx": ["lynx", "hare*lynx"]}
-    found = discover(PELTS, None, Regression(WeightedWeak()), terms=known)
+    found = discover(PELTS, polynomial(PELTS.names).only(known), Regression(WeightedWeak()))
     assert set(found.model.terms("hare")) == set(given)
     assert not any("rows are few" in a.message for a in found.ambiguities)
 
@@ -146,11 +146,11 @@ FORMS = [Differential(), Weak(), WeightedWeak()]
 @pytest.mark.parametrize("formulation", FORMS, ids=["differential", "weak", "weighted"])
 def test_relations_that_the_data_contradict_are_a_misfit(formulation: Formulation) -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
-    recipe = Regression(formulation)
-    right = discover(run, None, recipe, relations=["x: x*y == -1"])
+    recipe, library = Regression(formulation), polynomial(["x", "y"])
+    right = discover(run, library.relate("x: x*y == -1"), recipe)
     assert right.misfit == ""
     assert right.model.covariance is not None
-    wrong = discover(run, None, recipe, relations=["x: x == 5"])
+    wrong = discover(run, library.relate("x: x == 5"), recipe)
     assert wrong.model.terms("x")["x"] == 5.0
     assert not wrong.noise_test.left["x"].leaves_noise
     assert wrong.noise_test.left["y"].leaves_noise
@@ -173,9 +173,9 @@ def test_the_free_coefficients_of_related_equations_are_counted(
 ) -> None:
     run, library = lotka_volterra().trajectory(), named_terms(["x", "y"], ["x", "y", "x*y"])
     terms = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
-    task = Task([run], library, relations_of(relations), terms)
+    task = Task([run], library.relate(*relations).only(terms))
     found = Regression().identify(task, rng=np.random.default_rng(0))
-    assert found.n_free == n_free
+    assert found.noise_test.n_free == n_free
 
 
 def random_front(state: str, names: list[str], rng: np.random.Generator) -> ParetoFront:

@@ -33,7 +33,6 @@ from ep2sindy.estimation.observation import LackOfFit, Solution
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
-from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
 from ep2sindy.trust.interruption import is_interruption
 from tests.test_exact_inputs import SWITCH, driven
@@ -149,9 +148,9 @@ def test_smooth_corrections_are_those_of_the_dense_problem(rng: np.random.Genera
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
-def lorenz_problem(**settings: object) -> tuple[EstimationProblem, ep.Trajectory]:
+def lorenz_problem(*relations: str) -> tuple[EstimationProblem, ep.Trajectory]:
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 200)
-    return scale_problem([run], ep.lorenz().model.library, **settings), run  # type: ignore[arg-type]
+    return scale_problem([run], ep.lorenz().model.library.relate(*relations)), run
 
 
 def truth(problem: EstimationProblem, model: ep.SparseModel) -> np.ndarray:
@@ -187,7 +186,7 @@ def test_the_flow_converges_with_the_fourth_order() -> None:
 
 @pytest.mark.parametrize("relations", [(), ("x: x == -1 * x: y",)])
 def test_sensitivities_are_derivatives_of_the_flow(relations: Sequence[str]) -> None:
-    problem, _ = lorenz_problem(relations=[parse_relation(r) for r in relations])
+    problem, _ = lorenz_problem(*relations)
     (record,) = problem.records
     free = np.random.default_rng(0).normal(scale=1e-2, size=problem.n_free)
     support = np.zeros(len(free), dtype=np.bool_)
@@ -321,7 +320,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     system, inside = ep.lotka_volterra(), []
     for seed in range(20):
         run = system.trajectory(noise=0.2, rng=seed)
-        found = ep.estimate([run], system.model.library, terms=terms_of(system.model))
+        found = ep.estimate([run], system.model.library.only(terms_of(system.model)))
         for state in ("x", "y") if not found.misfit else ():
             true = system.model.terms(state)
             for term, (low, high) in found.model.intervals(state).items():
@@ -406,7 +405,7 @@ def test_an_equation_with_all_the_terms_that_it_may_have_is_a_misfit() -> None:
     assert found.misfit.startswith("y' with as many terms as may be (max_terms=3): they may stand")
     assert found.model.covariance is None
     known = {"y": ["x", "y", "x*z"]}
-    assert ep.estimate([run], library, max_terms=3, terms=known).misfit == ""
+    assert ep.estimate([run], library.only(known), max_terms=3).misfit == ""
 
 
 def test_random_times_serve_as_well() -> None:
@@ -434,8 +433,8 @@ def test_runs_share_their_coefficients() -> None:
     found = ep.estimate(runs, system.model.library)
     assert is_right(found.model, system)
     assert [len(path) for path in found.paths] == [150, 150, 150]
-    alone = ep.estimate(runs[:1], system.model.library, terms=terms_of(system.model))
-    both = ep.estimate(runs, system.model.library, terms=terms_of(system.model))
+    alone = ep.estimate(runs[:1], system.model.library.only(terms_of(system.model)))
+    both = ep.estimate(runs, system.model.library.only(terms_of(system.model)))
     spread = [np.sqrt(np.diag(e.model.covariance)).sum() for e in (alone, both)]
     assert spread[1] < spread[0]
 
@@ -449,9 +448,9 @@ def test_relations_and_known_equations_hold() -> None:
     run = system.trajectory(noise=0.1, rng=0)
     found = ep.discover(
         run,
-        method=ep.TrajectorySearch(),
-        relations=["x: x == -1 * x: y", "y: y == -1"],
-        terms={"z": ["z", "x*y"]},
+        ep.polynomial(run.names)
+        .relate("x: x == -1 * x: y", "y: y == -1")
+        .only({"z": ["z", "x*y"]}),
     )
     x, y = found.model.terms("x"), found.model.terms("y")
     assert x["x"] == pytest.approx(-x["y"], rel=1e-12)

@@ -9,14 +9,14 @@ from hydra import compose, initialize_config_dir
 import ep2sindy as ep
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
-from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.result import NoiseTest
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Text
 from ep2sindy.runtime.files import write_json
+from ep2sindy.studies.candidates import REPLACED, add_estimate
 from ep2sindy.studies.libraries import Study
-from ep2sindy.studies.library_result import REPLACED
 from tests.models import model_of
 from tests.programs import ROOT, Computed, composed, computed, on_file, summary_of
 
@@ -59,7 +59,7 @@ def test_two_densities_alone_leave_out_what_needs_more_and_a_seed_fixes_what_is_
     for name, each in (("one", found), ("other", again)):
         write_json(tmp_path / name, each.summary)
     assert (tmp_path / "one").read_text() == (tmp_path / "other").read_text()
-    assert set(found.summary["models"]) == {"simple"}
+    assert set(found.summary["models"]) == {"simple", "simple_thesis_terms"}
     assert "the library ionization is left out: the data have no R_ion" in found.log
     assert "the library velocity is left out: the data have no R_ion, u_iz" in found.log
 
@@ -70,46 +70,70 @@ def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
     ions, neutrals = simple["equations"]["n_i"], simple["equations"]["n_n"]
     # Second-order differences at 1.5 us on a 14 kHz wave: (omega dt)^2 / 6 = 0.3 %, and the
     # smoothing window flattens peaks by about 1 %.
-    assert ions["terms"] == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=0.02)
-    assert neutrals["terms"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=0.02)
-    assert simple["trajectory"]["f_kHz"] == pytest.approx(summary["data"]["f_kHz"], rel=0.02)
-    assert set(summary["models"]) == {"simple", "ionization", "velocity"}
+    assert ions == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=0.02)
+    assert neutrals == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=0.02)
+    run = summary["evaluations"]["simple"]
+    assert run["frequency_Hz"] == pytest.approx(run["record_frequency_Hz"], rel=0.02)
+    assert run["record_frequency_Hz"]["n_i"] == pytest.approx(1e3 * summary["data"]["f_kHz"])
+    refitted = {"simple_living", "simple_refined", "simple_thesis_terms"}
+    assert set(summary["models"]) >= {"simple", "ionization", "velocity"} | refitted
 
 
 def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
-    found = summary_of(breathing_run)["models"]
-    living = found["simple"]["living"]
-    assert living["status"] == "sustained"
+    found = summary_of(breathing_run)
+    run, model = (found[key]["simple_living"] for key in ("evaluations", "models"))
+    assert (
+        run["status"] == found["evaluations"]["simple_refined"]["status"] == "sustained"
+    )  # same terms
+    assert run["f_error"] == pytest.approx(0.0, abs=1e-4)
+    assert run["waveform_error"] == pytest.approx({"n_i": 0.0, "n_n": 0.0}, abs=1e-2)
+    assert run["amplitude_ratio"] == pytest.approx({"n_i": 1.0, "n_n": 1.0}, abs=1e-2)
+    assert set(found["living"]) == {"simple"}  # the others have inputs
+    living = found["living"]["simple"]
     assert living["n_terms"] == 4
-    assert living["f_error"] == pytest.approx(0.0, abs=1e-4)
-    assert living["waveform_error"] == pytest.approx({"n_i": 0.0, "n_n": 0.0}, abs=1e-2)
-    assert living["amplitude_ratio"] == pytest.approx({"n_i": 1.0, "n_n": 1.0}, abs=1e-2)
     assert living["stability"] == "neutral"  # predator and prey
-    assert living["floquet"] == [[1.0, 0.0], pytest.approx([1.0, 0.0], abs=1e-3)]
-    ions = living["coefficients"]["n_i"]["n_i"]
-    assert ions["value"] == pytest.approx(-1.64e5, rel=1e-4)
-    low, high = ions["spread_over_windows"]  # no interval of a rate: the model itself may miss it
-    assert low < ions["value"] < high
-    assert living["by_derivatives"]["status"] == "sustained"  # the same terms here
-    assert found["velocity"]["living"] is None  # it has inputs
-    terms = {(r["state"], r["term"]): r for r in found["simple"]["balance"]["terms"]}
+    assert living["multiplier"] == pytest.approx(1.0, abs=1e-3)
+    ions = model["equations"]["n_i"]["n_i"]
+    assert ions == pytest.approx(-1.64e5, rel=1e-4)
+    low, high = model["intervals"]["n_i"]["n_i"]  # the spread over windows: the model may be wrong
+    assert low < ions < high
+    terms = {(each["part"], each["term"]): each for each in found["terms_simple"]}
     assert len(terms) == 4
-    assert all(each["without_verdict"] != "sustained" for each in terms.values())
-    assert found["simple"]["balance"]["processes"] == []
+    assert all(each["without_status"] != "sustained" for each in terms.values())
+    assert "balance_simple" not in found
     for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
         assert (breathing_run / "figures" / f"{figure}.png").is_file()
-    for table in ("living", "coefficients_living", "terms_simple"):
+    for table in ("living", "coefficients", "terms_simple", "rollout_simple_living"):
         assert (breathing_run / "tables" / f"{table}.csv").is_file()
+
+
+def test_the_page_says_the_model_that_lives_before_candidates(breathing_run: Path) -> None:
+    page = (breathing_run / "report.html").read_text()
+    found, rest = page[page.index('id="found"') :].split("</section>", 1)
+    assert "the cycle is neutral: it neither attracts nor repels" in found
+    assert 'id="figure-free_run_simple"' in found
+    order = [
+        "simple: a model selected by free runs (sustained)", "simple: what the terms mean",
+        "simple: forecasts over time held out", "The selected models",
+        "Run freely from the first sample", "simple: candidates", "ionization: candidates",
+    ]  # fmt: skip
+    titles = re.findall(r"<h[23][^>]*>(.*?)</h", rest)
+    assert [title for title in titles if title in order] == order
 
 
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:
     folder = breathing_run
-    files = ["config.yaml", "provenance.json", "tables/front_velocity.csv", "tables/comparison.csv"]
+    files = [
+        "config.yaml",
+        "provenance.json",
+        "tables/front_velocity.csv",
+        "tables/evaluations.csv",
+    ]
     for name in [*files, "figures/data.png", "figures/trajectories.png"]:
         assert (folder / name).is_file(), name
     assert list(folder.glob("tensorboard/events*"))
     model = SparseModel.load(folder / "models" / "simple.json")
-    assert model.terms("n_i") == summary_of(folder)["models"]["simple"]["equations"]["n_i"]["terms"]
+    assert model.terms("n_i") == summary_of(folder)["models"]["simple"]["equations"]["n_i"]
 
 
 def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) -> None:
@@ -117,7 +141,8 @@ def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) 
     assert "BestSubset (max_terms 4" in page
     assert "max_terms: 4" in page  # the whole config
     summary = summary_of(breathing_run)
-    assert summary["headline"]["simple/f_kHz"] == summary["models"]["simple"]["trajectory"]["f_kHz"]
+    frequency_Hz = summary["evaluations"]["simple"]["frequency_Hz"]["n_i"]
+    assert summary["headline"]["simple/f_kHz"] == 1e-3 * frequency_Hz
 
 
 def test_a_record_too_short_for_forecasts_is_searched_without(tmp_path: Path) -> None:
@@ -130,8 +155,8 @@ def test_a_record_too_short_for_forecasts_is_searched_without(tmp_path: Path) ->
             "trajectory.states=[x,y]", "libraries.model.degree=1", f"output={tmp_path}",
         )
     )  # fmt: skip
-    assert set(found.outcome.models()["model"].terms("x")) == {"y"}
-    assert not found.outcome.skills
+    assert set(found.report.models["model"].terms("x")) == {"y"}
+    assert "forecasts" not in found.summary
     log = " ".join(found.log.split())
     assert "no forecasts: they need 20 samples or more to fit and as many to test, and" in log
 
@@ -159,7 +184,7 @@ def years(tmp_path_factory: pytest.TempPathFactory) -> Computed:
 
 def test_a_record_in_years_reads_in_years_and_is_kept_in_seconds(years: Computed) -> None:
     year = 365.25 * 86400.0
-    found = years.summary["models"]["model"]["equations"]["hare"]["terms"]
+    found = years.summary["models"]["model"]["equations"]["hare"]
     # The estimator's own standard error at this noise is about one per cent.
     assert found == pytest.approx({"hare": 0.6 / year, "hare*lynx": -0.03 / year}, rel=0.05)
     assert years.summary["data"]["dt_s"] == pytest.approx(year / 3.0)
@@ -172,11 +197,11 @@ def test_a_record_in_years_reads_in_years_and_is_kept_in_seconds(years: Computed
 
 
 def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
-    assert years.summary["models"]["model"]["note"] == ""  # the section on the samples says it
-    found = years.summary["models"]["model"]["estimate"]
-    spread = years.outcome.data.states.std(axis=0)
+    assert years.summary["notes"]["model"] == ""  # the section on the samples says it
+    (found,) = years.summary["samples_model"]
+    data = years.report.tables["rollout_model"]
     # Of 91 samples, some of which the parameters take: 10 % is a standard error and a half.
-    noise = [found["noise_std"][name] / s for name, s in zip(("hare", "lynx"), spread, strict=True)]
+    noise = [found["noise_std"][name] / data[f"{name}_data"].std() for name in ("hare", "lynx")]
     assert noise == pytest.approx([0.02, 0.02], rel=0.25)
     assert (found["flow_error"], found["misfit"], found["too_few_samples"]) == (0.0, None, None)
     said = " ".join(years.log.split())
@@ -185,12 +210,12 @@ def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
 
 
 def test_a_report_says_if_the_samples_speak_of_another_model(years: Computed) -> None:
-    result, data = years.outcome.results["model"], years.outcome.data
-    plain = result.sections("model", data)[1]
-    assert REPLACED not in [block.text for block in plain.blocks if isinstance(block, Text)]
-    untested = replace(result, discovery=replace(result.discovery, noise_test=NoiseTest()))
-    other = untested.sections("model", data)[1]
-    assert REPLACED in [block.text for block in other.blocks if isinstance(block, Text)]
+    assert REPLACED not in years.page
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0).window(0, 200)
+    found = replace(ep.discover(run), noise_test=NoiseTest())
+    add_estimate(years.report, "other", found)
+    texts = [each.text for each in years.report.sections[-1].blocks if isinstance(each, Text)]
+    assert REPLACED in texts
 
 
 def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_path: Path) -> None:
@@ -202,10 +227,10 @@ def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_pa
             "bootstraps.n=4", "forecasts=0",
         )
     )  # fmt: skip
-    model = found.summary["models"]["model"]
-    assert model["note"] == found.outcome.results["model"].discovery.note != ""
+    note = found.summary["notes"]["model"]
     log = " ".join(found.log.split())
-    assert log.count(model["note"]) == 1
+    assert note
+    assert log.count(note) == 1
     assert "equations selected by free runs or refinements; run freely" in found.page
 
 
@@ -252,12 +277,12 @@ def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
     chosen = ["formulation=weak", "selection=ebic", "depth=2"]
     left_out = ["~libraries.ionization", "~libraries.velocity"]
     result = computed(composed(*plain(predator_prey, tmp_path), *chosen, *left_out))
-    found = result.summary["models"]["simple"]["equations"]
-    assert np.isnan(found["n_i"]["r2_test"])
-    front = result.outcome.tables()["front_simple"]
+    found = result.summary["equations"]
+    assert found["simple/n_i"]["r2_test"] is None
+    front = result.report.tables["front_simple"]
     for state, rows in front.groupby("equation"):
         assert rows.loc[rows["selected"], "EBIC"].item() == rows["EBIC"].min()
-        assert found[state]["EBIC"] == pytest.approx(rows["EBIC"].min())
+        assert found[f"simple/{state}"]["EBIC"] == pytest.approx(rows["EBIC"].min())
         assert rows["n_terms"].value_counts().max() == 2
     assert "weighted: n_i' = -1.64e+05 n_i" in result.log
 

@@ -15,7 +15,6 @@ from ep2sindy.figures import breathing
 from ep2sindy.figures.breathing import curves_figure, stability_figure
 from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies import points as studied
-from ep2sindy.studies.point_sources import point_sources
 from ep2sindy.studies.scan import scan_points
 from ep2sindy.studies.source import DivergedError, amiss, check_recorded, compile_kernels, doubts
 from tests import programs
@@ -200,7 +199,7 @@ def test_an_operating_point_that_broke_has_a_row_of_its_own(tmp_path: Path) -> N
     point = "points=[{V_D_V: 5000.0, mdot_mg_s: 5.0}]"
     config = programs.composed("+exp=parametric", *toy(tmp_path), point)
     study = study_of(studied.Study, config)
-    (source,) = point_sources(study.source, study.parameters, study.points)
+    (source,) = study._given.sources
     opened = source.open([])
     assert (opened.status, opened.run) == ("diverged", None)
 

@@ -39,9 +39,8 @@ def toy(path: Path, output: Path, *more: str) -> list[str]:
 def glance(path: Path, output: Path, *more: str) -> list[str]:
     """What is said of a smoothed signal; the model, of one term, is chosen without a free run."""
     few = ("depth=1", "search.n_best=1", "search.max_terms=1", "selection=ebic")
-    more = ("embedding=log_rate", *more)
     given = [o for o in toy(path, output, *few) if not o.startswith("selection.")]
-    return [*given, *more]
+    return [*given, "tried=[{how: rate}]", *more]
 
 
 @pytest.fixture(scope="module")
@@ -52,82 +51,88 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_hidden_states_that_are_a_misfit_are_shown_if_they_are_asked_for(tmp_path: Path) -> None:
     t = np.linspace(0.0, 50.0, 501)
     path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)  # no linear equations make it
-    found = computed(composed(*glance(path, tmp_path, "embedding=hidden", "degree=1")))
-    assert found.summary["signal"]["embedding"] == "HiddenStates"
+    found = computed(composed(*glance(path, tmp_path, "tried=[{how: hidden, degree: 1}]")))
+    assert found.summary["signal"]["how"] == "hidden"
     assert found.summary["signal"]["reason"] == "set"
-    assert found.summary["misfit"]
-    assert not found.summary["model"]["intervals"]
+    assert found.summary["signal"]["misfit"]
+    assert not found.summary["models"]["trace"]["intervals"]
 
 
 def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path: Path) -> None:
-    folder = run_config(composed(*toy(record, tmp_path, "embedding=log_rate")))
+    folder = run_config(composed(*toy(record, tmp_path, "tried=[{how: rate}]")))
     summary = summary_of(folder)
-    living = summary["living"]
-    assert living["status"] == "sustained"
-    assert living["held_out"] is True
-    assert abs(living["f_error"]) < 0.005
-    assert living["amplitude_ratio"] == pytest.approx(1.0, abs=0.03)
-    assert living["waveform_error"] < 0.1
-    assert living["multiplier"] < 0.5
-    assert living["n_terms_known"] == 1
-    assert summary["model"]["equations"]["I"] == pytest.approx({"I*g": 1.0})
-    assert summary["signal"]["embedding"] == "LogRate"
+    run = summary["evaluations"]["trace"]
+    assert run["status"] == "sustained"
+    assert abs(run["f_error"]) < 0.005
+    assert run["amplitude_ratio"]["I"] == pytest.approx(1.0, abs=0.03)
+    assert run["waveform_error"]["I"] < 0.1
+    assert run["multiplier"] < 0.5
+    assert summary["models"]["trace"]["equations"]["I"] == pytest.approx({"I*g": 1.0})
+    assert summary["signal"]["how"] == "rate"
+    assert summary["signal"]["known"] == {"I": "I*g"}
     assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
     log = (folder / "run.log").read_text()
-    assert "known: I' = 1 I g" in log
+    assert "known: I' = I g" in " ".join(log.split())
     assert "intervals are not given" in " ".join(log.split())  # of smoothed states
-    assert summary["misfit"]
-    forecast = summary["forecast"]
+    assert summary["signal"]["misfit"]
+    forecast = summary["forecasts"]["trace"]
     assert set(forecast["nrmse"]) == {"model", "persistence", "harmonics", "autoregression"}
     assert max(forecast["nrmse"]["model"]) < 0.3
-    assert summary["states"]["2"]["error"] < 0.3
-    for name in ("free_run", "plane", "waveform", "front", "forecast"):
-        assert (folder / "figures" / f"{name}.png").exists()
+    (tried,) = summary["tried"]
+    assert tried["n_states"] == 2
+    assert tried["error"] < 0.3
+    for name in ("free_run", "cycle", "waveform", "front", "forecast"):
+        assert (folder / "figures" / f"{name}_trace.png").exists()
 
 
-@pytest.mark.parametrize("embedding", ["rate", "delays"])
-def test_a_signal_of_either_sign_can_be_taken(embedding: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", ["derivative", "delays"])
+def test_a_signal_of_either_sign_can_be_taken(how: str, tmp_path: Path) -> None:
     t = 0.12 * np.arange(850)  # 16 periods
     run = ep.systems.van_der_pol(mu=0.5).model.simulate(t, [2.0, 0.0])
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
-    settings = {"rate": toy(path, tmp_path, "search.max_terms=3", "degree=3")}
-    settings |= {"delays": glance(path, tmp_path, "degree=1")}
-    found = computed(composed(*settings[embedding], f"embedding={embedding}"))
+    settings = {
+        "derivative": toy(path, tmp_path, "search.max_terms=3", "tried=[{how: derivative}]"),
+        "delays": glance(path, tmp_path, "tried=[{how: delays, degree: 1}]"),
+    }
+    found = computed(composed(*settings[how]))
     assert found.summary["signal"]["reason"] == "set"
-    if embedding == "rate":
-        assert found.summary["model"]["equations"]["I"] == {"v": 1.0}
-        assert set(found.summary["model"]["equations"]["v"]) == {"I", "v", "I^2*v"}
-        assert found.summary["living"]["status"] == "sustained"
+    if how == "derivative":
+        equations = found.summary["models"]["trace"]["equations"]
+        assert equations["I"] == {"v": 1.0}
+        assert set(equations["v"]) == {"I", "v", "I^2*v"}
+        assert found.summary["evaluations"]["trace"]["status"] == "sustained"
     else:
-        assert found.summary["living"]["n_terms_known"] == 0
+        assert found.summary["signal"]["known"] == {}
         assert "I_before" in found.log
 
 
 def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path: Path) -> None:
     run = ep.lorenz().trajectory().window(0, 2500)
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
-    found = computed(composed(*glance(path, tmp_path, "degree=2", "embedding=rate")))
-    assert set(found.summary["states"]) == {"2", "3"}
+    both = "tried=[{how: auto, degree: 2}, {how: auto, degree: 2, n_states: 3}]"
+    found = computed(composed(*glance(path, tmp_path, both)))
+    assert [each["n_states"] for each in found.summary["tried"]] == [2, 3]
 
 
 @pytest.mark.slow
 def test_the_law_of_chaos_is_found_in_one_of_its_states(tmp_path: Path) -> None:
     run = ep.lorenz().trajectory(noise=0.02, rng=2)
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
-    found = computed(composed(*toy(path, tmp_path, "degree=2"))).summary
-    assert set(found["states"]) == {"3"}
-    assert found["model"]["equations"]["I"] == {"v": 1.0}
-    assert set(found["model"]["equations"]["v"]) == {"v", "I*w"}
-    assert set(found["model"]["equations"]["w"]) == {"1", "w", "I^2", "I*v"}
-    assert found["living"]["status"].startswith("no cycle to compare; its statistics are the")
-    assert max(found["forecast"]["nrmse"]["model"]) < 0.2
+    found = computed(composed(*toy(path, tmp_path))).summary
+    assert [(each["how"], each["n_states"]) for each in found["tried"]] == [("hidden", 3)]
+    equations = found["models"]["trace"]["equations"]
+    assert equations["I"] == {"v": 1.0}
+    assert set(equations["v"]) == {"v", "I*w"}
+    assert set(equations["w"]) == {"1", "w", "I^2", "I*v"}
+    assert found["evaluations"]["trace"]["status"].endswith("its statistics are the record's")
+    assert max(found["forecasts"]["trace"]["nrmse"]["model"]) < 0.2
 
 
 def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
     path = scope(tmp_path / "scope.csv", *signal(6.4))
     found = computed(composed(*glance(path, tmp_path, "held_out=0.2")))
-    assert found.summary["living"]["held_out"] is False
-    assert found.summary["forecast"] is None
+    assert found.summary["signal"]["n_fitted"] == found.summary["data"]["n_samples"]
+    assert "forecasts" not in found.summary
     assert "too short to hold out" in " ".join(found.log.split())
 
 
@@ -136,8 +141,8 @@ def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
     [
         (lambda t, x: (t[:200], x[:200]), [], "must hold 6 periods or more"),
         (lambda t, x: (t, np.random.default_rng(0).random(len(t))), [], "must oscillate"),
-        (lambda t, x: (t, x - 1.0), ["embedding=log_rate"], "needs a positive signal: I falls"),
-        (lambda t, x: (t, x), ["n_states=some"], "n_states must be auto or a number: 'some' came"),
+        (lambda t, x: (t, x - 1.0), ["tried=[{how: rate}]"], "needs a positive signal: I falls"),
+        (lambda t, x: (t, x), ["tried=[{how: lags}]"], "how must be auto, hidden"),
     ],
 )
 def test_what_cannot_be_taken_is_refused(change, more, message, tmp_path: Path) -> None:
@@ -161,7 +166,7 @@ def test_a_recognised_signal_without_a_unit_takes_the_one_given(tmp_path: Path) 
     found = computed(config)
     assert found.summary["data"]["units"] == {"I": "A", "g": "s^-1"}
     mean = signal(12.0)[1].mean()
-    assert found.outcome.tested.states.states[:, 0].mean() == pytest.approx(1e-3 * mean, rel=1e-2)
+    assert found.report.tables["states"]["I"].mean() == pytest.approx(1e-3 * mean, rel=1e-2)
 
 
 def test_a_unit_that_the_data_contradict_is_refused(tmp_path: Path) -> None:
@@ -174,18 +179,18 @@ def test_a_unit_that_the_data_contradict_is_refused(tmp_path: Path) -> None:
 def test_a_mean_that_was_lost_is_asked_for_and_given_back(tmp_path: Path) -> None:
     t, x = signal(12.0)
     path = scope(tmp_path / "scope.csv", t, x - x.mean())
-    lost = computed(composed(*glance(path, tmp_path, "embedding=rate")))
-    assert lost.summary["signal"]["embedding"] == "Rate"
+    lost = computed(composed(*glance(path, tmp_path, "tried=[{how: auto}]")))
+    assert lost.summary["signal"]["how"] == "derivative"
     assert "offset=MEAN gives it back" in " ".join(lost.log.split())
-    given = computed(composed(*glance(path, tmp_path, f"offset={x.mean()}")))
-    assert given.summary["signal"]["embedding"] == "LogRate"
+    given = computed(composed(*glance(path, tmp_path, "tried=[{how: auto}]", f"offset={x.mean()}")))
+    assert given.summary["signal"]["how"] == "rate"
     assert "offset=MEAN" not in given.log
 
 
 def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_path: Path) -> None:
     trace = computed(composed(*toy(record, tmp_path)))
     found = trace.summary
-    assert found["signal"]["embedding"] == "HiddenStates"
+    assert found["signal"]["how"] == "hidden"
     assert found["states"]["2"]["unexplained"] is None
     assert not found["misfit"]
     assert found["model"]["equations"]["I"] == pytest.approx({"I*g": 1.0})
@@ -214,7 +219,7 @@ def test_an_offset_that_no_equations_tell_is_refused(tmp_path: Path) -> None:
     t = np.linspace(0.0, 50.0, 501)
     path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)
     with pytest.raises(ValueError, match=r"offset=fit asks for equations .* write offset=NUMBER"):
-        computed(composed(*toy(path, tmp_path, "offset=fit", "degree=1")))
+        computed(composed(*toy(path, tmp_path, "offset=fit", "tried=[{how: hidden, degree: 1}]")))
     with pytest.raises(ValueError, match="offset must be a number or fit: 'fitted' came"):
         computed(composed(*toy(path, tmp_path, "offset=fitted")))
 

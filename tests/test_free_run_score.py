@@ -191,7 +191,7 @@ def test_relations_hold_to_the_last_digit(rule):
     run = PREY.trajectory(noise=0.02, rng=0)
     how = replace(recipe(max_terms=2, n_best=1, formulation=ep.WeightedWeak()), selection=rule)
     library = ep.polynomial(["x", "y"], degree=2)
-    tied = ep.discover(run, library, how, relations=[SHARED]).model
+    tied = ep.discover(run, library.relate(SHARED), how).model
     assert tied.terms("x")["x*y"] == -tied.terms("y")["x*y"]
     assert tied.terms("x")["x*y"] == pytest.approx(-1.0, rel=0.05)
 
@@ -199,8 +199,9 @@ def test_relations_hold_to_the_last_digit(rule):
 def test_a_coefficient_keeps_the_value_it_is_given():
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     value, how = "x: x*y == -1.1", ep.Regression(ep.WeightedWeak())
-    free, fixed = (ep.discover(run, None, how, relations=r) for r in ((), [value]))
-    together = ep.discover(run, relations=[value])
+    library = ep.polynomial(["x", "y"])
+    free, fixed = (ep.discover(run, own, how) for own in (library, library.relate(value)))
+    together = ep.discover(run, library.relate(value))
     for found in (fixed, together):
         assert found.model.terms("x")["x*y"] == -1.1
         assert found.misfit  # ten percent off in two percent of noise
@@ -210,9 +211,7 @@ def test_a_coefficient_keeps_the_value_it_is_given():
 def test_a_known_equation_is_not_searched():
     oscillator = ep.systems.damped_oscillator(zeta=0.05)
     run = oscillator.trajectory(noise=0.01, rng=0)
-    known = ep.discover(
-        run, ep.polynomial(["x", "v"], degree=2), terms={"x": ["v"]}, relations=["x: v == 1"]
-    )
+    known = ep.discover(run, ep.polynomial(["x", "v"]).only({"x": ["v"]}).relate("x: v == 1"))
     assert known.model.terms("x") == {"v": 1.0}
     assert [c.terms for c in known.fronts["x"].candidates][1:] == [("v",)]
     assert known.model.terms("v") == pytest.approx({"x": -9.0, "v": -0.3}, rel=0.05)

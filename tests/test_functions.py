@@ -504,7 +504,7 @@ def test_intervals_hold_the_truth_where_functions_bend_in_noise() -> None:
     errors = []
     for seed in range(6):
         run = ep.pendulum().trajectory(noise=0.1, rng=seed)
-        model = ep.discover(run, library, terms=known).model
+        model = ep.discover(run, library.only(known)).model
         ends = model.intervals("w")["sin(theta)"]
         errors.append((np.mean(ends) + 9.81) / (np.ptp(ends) / 3.92))
     # 1 / sqrt(6) by chance, three times over, and 0.2 by noise above second order.

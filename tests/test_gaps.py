@@ -125,8 +125,7 @@ def test_forecasts_that_are_counted_do_not_lead_across_a_gap() -> None:
 def test_a_delayed_value_is_not_taken_from_within_a_gap() -> None:
     t = np.delete(np.arange(3000) * 0.01, slice(1000, 1530))
     run = Trajectory(t, np.sin(2.0 * np.pi * t)[:, None], ["x"])
-    signal = ep.signals.prepare_signal(run, decimate=None)
-    found = ep.signals.Delays().embed(signal).run
+    found = ep.embed(run, "delays", decimate=None).run
     assert found.columns(["x_before"])[:, 0] == pytest.approx(
         np.sin(2.0 * np.pi * (found.t - 0.25)), abs=2e-3
     )

@@ -8,6 +8,7 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import _hidden_names
 from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_guess_by, with_guesses
 from ep2sindy.estimation.likelihood import TrajectoryFit, hessian_on, observe
 from ep2sindy.estimation.noise import noise_beside
@@ -91,11 +92,11 @@ def test_the_experiment_finds_it_too(tmp_path) -> None:
     only("x").to_dataframe().to_csv(path)
     given = ["+exp=discover", "data=recognised", f"data.path={path}", "trajectory.states=[x]"]
     more = ["hidden=[g]", "relations=['g: x*g == 1']", "forecasts=4", f"output={tmp_path}"]
-    summary = computed(composed(*given, *more)).summary["models"]["model"]
-    terms = summary["equations"]["g"]["terms"]
+    summary = computed(composed(*given, *more)).summary
+    terms = summary["models"]["model"]["equations"]["g"]
     assert set(terms) == set(GROWTH)
     assert terms["x*g"] == pytest.approx(1.0, rel=1e-12)
-    assert list(summary["estimate"]["noise_std"]) == ["x"]
+    assert list(summary["samples_model"][0]["noise_std"]) == ["x"]
     with pytest.raises(ValueError, match="one library and without living"):
         computed(composed("+exp=breathing", "+hidden=[g]", f"output={tmp_path}"))
 
@@ -116,8 +117,18 @@ def test_a_hidden_state_that_shrinks_gains_no_freedom() -> None:
     assert sizes[1][1] == pytest.approx(1e-6 * sizes[0][1])
 
 
+def test_a_number_of_hidden_states_makes_names_that_no_run_has() -> None:
+    assert _hidden_names(1, ["x"]) == ["h"]
+    assert _hidden_names(2, ["x", "h1"]) == ["h2", "h3"]
+    assert _hidden_names(["w"], ["x"]) == ["w"]
+    with pytest.raises(ValueError, match="hidden must be a whole number, zero or more: -1 came"):
+        ep.discover(only("x"), hidden=-1)
+
+
 def test_a_relation_sets_the_scale() -> None:
-    model = ep.discover(only("x"), hidden=["w"], relations=["x: x*w == 2"]).model
+    model = ep.discover(
+        only("x"), ep.polynomial(["x", "w"]).relate("x: x*w == 2"), hidden=["w"]
+    ).model
     assert model.terms("x") == {"x*w": 2.0}
     law = {"1": 1.0 / 9.0, "x": -1.0 / 3.0, "w": -1.0 / 3.0, "x*w": 1.0}  # w = g / 2
     assert dict(model.terms("w")) == pytest.approx(law, rel=0.05)
@@ -136,7 +147,7 @@ def test_ways_in_from_one_state() -> None:
 
 def test_ways_in_from_two_states_and_by_a_relation() -> None:
     library = ep.polynomial(["x", "y", "z"], degree=2)
-    ways = entrances(library, ["x", "y"], ["z"], ())
+    ways = entrances(library, ["x", "y"], ["z"])
     terms = {"z", "x*z", "y*z"}
     assert {(w.state, w.term) for (w,) in ways} == {(s, t) for s in "xy" for t in terms}
     fixed = relations_of(["2 * y: x*z == -4"])
@@ -144,7 +155,7 @@ def test_ways_in_from_two_states_and_by_a_relation() -> None:
         (Entrance("z", "y", "x*z", -2.0, given=True),)
     ]
     with pytest.raises(ValueError, match="'z' has none in"):
-        entrances(ep.polynomial(["x", "y"], degree=2), ["x", "y"], ["z"], ())
+        entrances(ep.polynomial(["x", "y"], degree=2), ["x", "y"], ["z"])
 
 
 def test_growth_rates_come_first_where_a_state_is_positive() -> None:
@@ -155,7 +166,7 @@ def test_growth_rates_come_first_where_a_state_is_positive() -> None:
         groups = list(with_guesses(Task([moved], library, hidden=["g"])))
         ((known, ways),) = groups[0]
         assert ways[0].term == first
-        assert known.terms == {"x": (first,)}
+        assert known.facts.only == {"x": (first,)}
         assert known.hidden == ()
 
 
@@ -212,7 +223,7 @@ def test_what_was_not_measured_counts_nothing() -> None:
     ("call", "message"),
     [
         (lambda: ep.discover(only("x"), hidden=["x"]), "one that no run has: .'x'. came with"),
-        (lambda: ep.discover(only("x"), hidden=["g", "g"]), "hidden states must differ"),
+        (lambda: ep.discover(only("x"), hidden=["g", "g"]), "'g'. came with samples or twice"),
         (
             lambda: ep.discover(only("x"), method=ep.Regression(), hidden=["g"]),
             "a regression needs samples of every state",

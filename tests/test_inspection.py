@@ -434,5 +434,5 @@ def test_a_field_over_x_and_y_names_the_command_that_takes_a_point(
     shown = capsys.readouterr().out.splitlines()
     (line,) = (each for each in shown if each.startswith("  ep2sindy +exp=discover"))
     found = computed(composed(*shlex.split(line)[1:], "forecasts=0", "output=out"))
-    terms = found.summary["models"]["model"]["equations"]["a"]["terms"]
+    terms = found.summary["models"]["model"]["equations"]["a"]
     assert terms == pytest.approx({"b": 1e5}, rel=1e-3)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.library.facts import Known
 from ep2sindy.model.comparison import Status
-from ep2sindy.operating.law import Known, LawConstraint, constrain_law, law_of_constraint
+from ep2sindy.operating.law import LawConstraint, constrain_law, law_of_constraint
 from ep2sindy.operating.left_out import LawTrial, run_left_out
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
 from tests.test_operating_law import GRID, LIBRARY, LINEAR, SHORT, STATES, STRUCTURE
@@ -40,7 +41,7 @@ def records() -> tuple[ep.operating.OperatingRecord, ...]:
 
 
 def held(relations: list[str] = RELATIONS, known: Known = KNOWN) -> LawConstraint:
-    return constrain_law(LIBRARY, STRUCTURE, relations, known, parameters=["a", "b"])
+    return constrain_law(LIBRARY.relate(*relations).known(known), STRUCTURE, parameters=["a", "b"])
 
 
 def by_rows(relations: LawConstraint) -> PointFits:

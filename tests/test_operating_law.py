@@ -71,7 +71,7 @@ def by_rows(
         [replace(part, trajectories=(run,)) for part in exact_rows(run, **at)]
         for run, at in zip(runs, points, strict=True)
     ]
-    held = constrain_law(LIBRARY, structure, relations, known, parameters=parameters)
+    held = constrain_law(LIBRARY.relate(*relations).known(known), structure, parameters=parameters)
     values = np.array([list(run.parameters.values()) for run in runs])
     return fit_rows(parameters, values, problems, held, provenance={})
 

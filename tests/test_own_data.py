@@ -51,7 +51,7 @@ def test_two_commands_lead_from_a_file_to_its_equations(
     assert not ended("+exp=discover", "data=scope", *rest)
     (run,) = (folder / "outputs" / "discover").iterdir()
     summary = json.loads((run / "summary.json").read_text())
-    terms = summary["models"]["model"]["equations"]["x"]["terms"]
+    terms = summary["models"]["model"]["equations"]["x"]
     assert terms == pytest.approx({"x": -10.0, "y": 10.0}, rel=0.05)
     page, log = (run / "report.html").read_text(), (run / "run.log").read_text()
     for part in ("data: scope.csv", "995 samples", "x in 1"):
@@ -107,8 +107,8 @@ def test_several_files_are_several_records(folder: Path) -> None:
     ]  # fmt: skip
     found = computed(composed(*overrides, "data.path=run*.csv"))
     assert all(f"data: run{k}.csv; 1000 samples" in found.log for k in range(2))
-    assert len(found.outcome.tables()["records"]) == 2
-    assert found.summary["models"]["model"]["equations"]["x"]["terms"] == pytest.approx(
+    assert len(found.report.tables["records"]) == 2
+    assert found.summary["models"]["model"]["equations"]["x"] == pytest.approx(
         {"x": -10.0, "y": 10.0}, rel=0.01
     )
 
@@ -180,7 +180,7 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
         "+exp=discover", "data=recognised", "data.path=a.csv", "trajectory.states=[x,y,z]",
         "search=best_subset", "selection=ebic", f"output={folder}",
     ))  # fmt: skip
-    assert "records" not in found.outcome.tables()
+    assert "records" not in found.report.tables
     assert f"500 samples of {SECONDS.duration_text(step, digits=4)} from" in found.log
     assert [text for text in found.warnings if "the record has 1 gap" in text]
 

@@ -43,7 +43,7 @@ MODELS = {
         },
     ),
     "constrained": GivenModel(
-        constrain_law(LIBRARY, TERMS, [SHARED], parameters=PARAMETERS),
+        constrain_law(LIBRARY.relate(SHARED), TERMS, parameters=PARAMETERS),
         {"L": LENGTH, "g": INJECTED, "eps": Quantity("x: x*y*R")},
     ),
 }

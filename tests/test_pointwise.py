@@ -255,22 +255,21 @@ def exchanging(noise: float) -> xr.Dataset:
     return xr.Dataset(data, coords={"time": ("time", T, {"units": "s"}), "z": ("z", Z[:2])})
 
 
-def sharing(**changes: object) -> PointSearch:
-    settings = {"states": ["x", "y"], "formulation": EXACT[1], "relations": [SHARED]} | changes
-    library = ep.named_terms(["x", "y", "u", "w"], ["u", "w"])
+def sharing(*relations: str, **changes: object) -> PointSearch:
+    settings = {"states": ["x", "y"], "formulation": EXACT[1]} | changes
+    library = ep.named_terms(["x", "y", "u", "w"], ["u", "w"]).relate(*relations)
     draws = ep.Bootstraps(n=4, n_culled=0)
     return searching(**{"library": library, "bootstraps": draws, **settings})
 
 
 def test_relations_tie_equations_at_every_point_and_in_every_draw() -> None:
-    exact = ep.pointwise(exchanging(0.0), sharing(), workers=Serial())
+    exact = ep.pointwise(exchanging(0.0), sharing(SHARED), workers=Serial())
     expected = np.array([[2.0, -1.0], [-2.0, 3.0]])[:, :, None] + np.zeros(2)
     for name in ("coef", "coef_draws"):
         np.testing.assert_allclose(*np.broadcast_arrays(exact[name], expected), rtol=1e-6)
     np.testing.assert_allclose(exact["r2_test"], 1.0, rtol=1e-9)
     noisy, free = (
-        ep.pointwise(exchanging(0.05), sharing(relations=tied), workers=Serial())
-        for tied in ([SHARED], [])
+        ep.pointwise(exchanging(0.05), sharing(*tied), workers=Serial()) for tied in ([SHARED], [])
     )
     for name in ("coef", "coef_draws"):
         x, y = (noisy[name].sel(term="u", equation=e) for e in ("x", "y"))
@@ -285,7 +284,7 @@ def test_a_draw_of_all_rows_is_the_fit_of_all_rows() -> None:
     """Blocks as long as the rows draw each of them once."""
     whole = ep.Bootstraps(n=2, n_culled=0, smallest=1.0, largest=1.0, block=len(T))
     form = ep.Differential(smoother=NoSmoothing(), split=ep.RandomSplit(test_fraction=0.0))
-    search = sharing(formulation=form, bootstraps=whole)
+    search = sharing(SHARED, formulation=form, bootstraps=whole)
     result = ep.pointwise(exchanging(0.05), search, workers=Serial())
     same = np.broadcast_arrays(result["coef_draws"], result["coef"])
     np.testing.assert_allclose(*same, rtol=1e-9)
@@ -293,6 +292,6 @@ def test_a_draw_of_all_rows_is_the_fit_of_all_rows() -> None:
 
 def test_relations_that_cannot_hold_are_refused_at_once() -> None:
     with pytest.raises(ValueError, match="n_culled must be 0, 1 came"):
-        sharing(bootstraps=ep.Bootstraps(n=4, n_culled=1))
+        sharing(SHARED, bootstraps=ep.Bootstraps(n=4, n_culled=1))
     with pytest.raises(ValueError, match="'v'"):
-        sharing(relations=["x: v == -1 * y: v"])
+        sharing("x: v == -1 * y: v")

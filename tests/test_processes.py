@@ -136,6 +136,6 @@ def test_a_discovery_under_roles_is_printed_by_process() -> None:
     method = ep.Regression(
         search=ep.BestSubset(max_terms=3, n_best=60), selection=ep.RefinedScore(), depth=6
     )
-    found = ep.discover(run, library, method, roles=roles)
+    found = ep.discover(run, library.with_roles(roles), method)
     assert re.search(r"x' = 1 - 1 \(.*\) x y - 0\.5 \(.*\) x \[", repr(found))
     assert "<i>x</i>" in found._repr_html_()

@@ -85,7 +85,7 @@ def test_bad_reactions_say_what_must_hold():
 def test_a_closed_network_is_found_and_conserves(equations, start, end_s, roles, noise):
     """E + C and A + C are constant, so that two states tell the same without roles."""
     run = record(equations, start, end_s, noise, 1)
-    found = ep.discover(run, ep.polynomial(list(equations), degree=2), roles=roles)
+    found = ep.discover(run, ep.polynomial(list(equations), degree=2).with_roles(roles))
     for state, terms in equations.items():
         assert found.model.terms(state) == pytest.approx(terms, rel=noise or 1e-6)
     rates = found.model.coef / np.abs(found.model.coef).max()
@@ -96,7 +96,7 @@ def test_a_closed_network_is_found_and_conserves(equations, start, end_s, roles,
 def test_a_state_that_starts_at_zero_is_estimated_on_the_model_s_path():
     """This noise would have C start below zero."""
     run = record(ASSOCIATION, (1.0, 0.6, 0.0), 6.0, 0.05, 1)
-    found = ep.estimate(run, ep.polynomial(["A", "B", "C"], degree=2), roles=JOINING)
+    found = ep.estimate(run, ep.polynomial(["A", "B", "C"], degree=2).with_roles(JOINING))
     (path,) = found.paths
     assert path.min() == path[0, 2] == 0.0
     again = found.model.simulate(run.t, path[0]).states
@@ -111,9 +111,8 @@ def test_a_config_tells_roles(tmp_path):
     )  # fmt: skip
     told = "roles={_target_: ep2sindy.Roles, exchange: [['A + B', C]], nonnegative: true}"
     found = programs.computed(programs.composed(*given, told))
-    (result,) = found.outcome.results.values()
-    assert [(p.role, p.term) for p in result.discovery.constraint.processes] == [
-        ("A + B to C", "A*B"), ("C to A + B", "C")
-    ]  # fmt: skip
+    terms = found.summary["models"]["model"]["equations"]
+    assert terms["A"] == terms["B"] == {term: -coef for term, coef in terms["C"].items()}
+    assert list(terms["C"]) == ["C", "A*B"]
     with pytest.raises(ValueError, match=r"must name states: \['Q'\] came"):
         programs.computed(programs.composed(*given, told.replace("A + B", "A + Q")))

@@ -411,9 +411,11 @@ def test_relations_and_known_coefficients_are_exact_at_points_and_in_laws(
     method: ep.Regression | ep.TrajectorySearch,
 ) -> None:
     found = ep.discover(
-        family(0.01, 2), LIBRARY, method, law=1, relations=RELATIONS, known=KNOWN,
-        exclude={"n_i": ["n_n"]},
-    )  # fmt: skip
+        family(0.01, 2),
+        LIBRARY.relate(*RELATIONS).known(KNOWN).exclude({"n_i": ["n_n"]}),
+        method,
+        law=1,
+    )
     at = {"V_D": 310.0, "mdot_mgs": 4.4}
     models = [own.model for own in found.points.values()]
     places = list(zip(models, PARAMETERS.values(), strict=True))
@@ -427,7 +429,7 @@ def test_relations_and_known_coefficients_are_exact_at_points_and_in_laws(
 
 def test_terms_that_are_told_are_those_of_every_point() -> None:
     runs, terms = family(0.05, 3), {state: list(own) for state, own in TRUTH.items()}
-    found = ep.discover(runs, LIBRARY, METHOD, law=1, terms=terms)
+    found = ep.discover(runs, LIBRARY.only(terms), METHOD, law=1)
     for own in found.points.values():
         assert {s: sorted(own.model.terms(s)) for s in terms} == {
             s: sorted(each) for s, each in terms.items()
@@ -452,7 +454,7 @@ def predators(noise: float = 0.0) -> tuple[ep.Trajectory, ...]:
 def test_roles_hold_at_every_point_and_in_the_law() -> None:
     roles = ep.Roles(exchange=[("x", "y")], outflow=["y"], inflow={"x": ["x"]}, nonnegative=True)
     method = ep.Regression(selection=ep.FreeRunScore())
-    found = ep.discover(predators(), method=method, roles=roles, law=1)
+    found = ep.discover(predators(), ep.polynomial(["x", "y"]).with_roles(roles), method, law=1)
     for model in [*(own.model for own in found.points.values()), found.law.at(a=0.65)]:
         assert model.terms("x")["x*y"] == -model.terms("y")["x*y"]
     assert found.law.at(a=0.65).terms("x") == pytest.approx({"x": 0.65, "x*y": -1.0}, rel=1e-4)

@@ -12,7 +12,7 @@ from ep2sindy.library.equations import equation_html, latex_derivative, latex_te
 from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.library.roles import constraint_of, shares_of
-from ep2sindy.studies.balance import compared_processes
+from ep2sindy.studies.processes import compared_processes
 from ep2sindy.studies.source import Zones, told_roles
 from tests.models import model_of
 from tests.programs import composed, computed
@@ -175,7 +175,7 @@ def refined(depth: int) -> ep.Regression:
 
 def test_a_search_in_zones_finds_the_truth_and_conserves() -> None:
     library = ep.polynomial(NAMES, degree=3)
-    found = ep.discover(chain(), library, refined(depth=4), roles=ROLES.in_zones(SIZES))
+    found = ep.discover(chain(), library.with_roles(ROLES.in_zones(SIZES)), refined(depth=4))
     for state, terms in CHAIN.items():
         assert found.model.terms(state) == pytest.approx(terms, rel=2e-3)
     ours, theirs = (found.model.terms(s)["n_i@a"] for s in ("n_i@a", "n_i@b"))
@@ -187,7 +187,7 @@ def test_a_search_in_zones_finds_the_truth_and_conserves() -> None:
 
 def test_every_role_of_zones_goes_forward() -> None:
     back = ep.Roles(exchange=[("n_i", "n_n")], outflow=STATES, inflow={"n_n": 0.4}).in_zones(SIZES)
-    found = ep.discover(chain(), ep.polynomial(NAMES, degree=3), refined(depth=2), roles=back)
+    found = ep.discover(chain(), ep.polynomial(NAMES, degree=3).with_roles(back), refined(depth=2))
     assert "n_i@a to n_n@a > 0 in the mean" in found.note  # no model gives ions to neutrals
 
 
@@ -288,17 +288,15 @@ def test_the_experiment_reports_zones_and_their_processes(tmp_path: Path) -> Non
     record = chain()
     found = computed(composed(*toy(tmp_path)))
     assert found.summary["data"]["variables"] == NAMES
-    result = found.summary["models"]["zones"]
-    living = result["living"]["coefficients"]
-    taken = living["n_i@a"]["n_i@a"]["value"]
-    assert living["n_i@b"]["n_i@a"]["value"] == pytest.approx(-taken / 2, rel=1e-6)
-    assert living["n_n@a"]["1"]["value"] == pytest.approx(1.2e24, rel=0.01)  # free in a file
-    processes = {each["process"]: each for each in result["balance"]["processes"]}
-    recorded = [each["recorded"] for each in processes.values()]
-    assert np.isnan(recorded).all()  # a file of densities alone
+    living = found.summary["models"]["zones_living"]["equations"]
+    taken = living["n_i@a"]["n_i@a"]
+    assert living["n_i@b"]["n_i@a"] == pytest.approx(-taken / 2, rel=1e-6)
+    assert living["n_n@a"]["1"] == pytest.approx(1.2e24, rel=0.01)  # free in a file
+    processes = {each["process"]: each for each in found.summary["balance_zones"]}
+    assert {each["recorded"] for each in processes.values()} == {None}  # densities alone
     assert processes["neutrals from a to b"]["modelled"] == pytest.approx(
         G * 1e24 * record.states[:, 1].mean(), rel=0.01
     )
-    terms = [(each["process"], each["term"]) for each in result["balance"]["terms"]]
+    terms = [(each["part"], each["term"]) for each in found.summary["terms_zones"]]
     assert ("ions from a to b", "n_i@a") in terms
     assert "<mi>i</mi><mo>,</mo><mi>a</mi>" in found.page  # n with the index i,a

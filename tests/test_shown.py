@@ -10,7 +10,7 @@ def test_what_is_found_in_a_record_over_years_is_shown_per_year() -> None:
     run = ep.datasets.hare_lynx()
     assert "t = 0 to 20 year in steps of 1 year" in repr(run)
     terms = {"hare": ["hare", "hare*lynx"], "lynx": ["lynx", "hare*lynx"]}
-    found = ep.discover(run, terms=terms)
+    found = ep.discover(run, ep.polynomial(run.names).only(terms))
     year_s = run.clock.seconds
     growth = found.model.terms("hare")["hare"]
     for shown in (repr(found), str(found.model), found.model._repr_html_()):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.library.relations import parse_relation
 from ep2sindy.runtime.values import check_kind
 
 PREY = ep.lotka_volterra()
@@ -40,9 +39,7 @@ def test_runs_that_do_not_agree_are_refused_by_every_method(method, wrong: str) 
 
 
 ASKED = [
-    ({"terms": {"z": ["x"]}}, r"unknown state 'z'; there are \['x', 'y'\]"),
-    ({"terms": {"x": []}}, r"an equation whose terms are given must have some: \['x'\]"),
-    ({"relations": ["z: x == 1"]}, r"unknown state 'z'; there are \['x', 'y'\]"),
+    ({"library": LIBRARY.only({"z": ["x"]})}, r"unknown state 'z'; there are \['x', 'y'\]"),
     ({"runs": []}, "at least one run is needed: an empty list came"),
     ({"library": ep.polynomial(["x", "u"], degree=1)}, r"the library needs \['u'\]: sample it as"),
 ]
@@ -55,23 +52,40 @@ def test_what_cannot_be_asked_is_not_estimated(asked: dict, message: str) -> Non
 
 
 def test_an_estimate_takes_runs_and_relations_as_discover_does() -> None:
-    whole = ep.estimate([RUN], LIBRARY, relations=["x: x*y == -1 * y: x*y"])
+    whole = ep.estimate([RUN], LIBRARY.relate("x: x*y == -1 * y: x*y"))
     terms = whole.model.terms("x"), whole.model.terms("y")
     assert terms[0]["x*y"] == pytest.approx(-terms[1]["x*y"], rel=1e-12)
-    alone = ep.estimate(RUN, LIBRARY, relations=["x: x*y == -1 * y: x*y"])
+    alone = ep.estimate(RUN, LIBRARY.relate("x: x*y == -1 * y: x*y"))
     assert np.array_equal(alone.model.coef, whole.model.coef)
 
 
 def test_a_task_keeps_its_values_and_takes_a_tuple_of_runs() -> None:
     terms = {"x": ["x", "x*y"]}
-    task = ep.discovery.Task([RUN, OTHER], LIBRARY, [parse_relation("y: y == 1")], terms)
+    task = ep.discovery.Task([RUN, OTHER], LIBRARY.relate("y: y == 1").only(terms))
     terms["x"].append("y")
     assert task.states == ("x", "y")
-    assert task.terms == {"x": ("x", "x*y")}
+    assert task.facts.only == {"x": ("x", "x*y")}
     assert [each.text for each in task.relations] == ["y: y == 1"]
-    assert replace(task, relations=()).runs == task.runs == (RUN, OTHER)
+    assert replace(task, library=LIBRARY).runs == task.runs == (RUN, OTHER)
     with pytest.raises(TypeError):
-        task.terms["y"] = ["y"]
+        task.facts.only["y"] = ["y"]
+
+
+def test_a_library_keeps_what_is_known_through_a_sum_and_a_model_does_not() -> None:
+    known = LIBRARY.relate("y: y == 1") + ep.polynomial(["x", "y"], degree=3).exclude({"x": ["y"]})
+    assert known.facts.lines == ["y: y == 1", "x' has no y"]
+    model = ep.SparseModel(known, ["x", "y"], np.ones((len(known), 2)))
+    assert (model.library.facts.lines, known.take(np.arange(3)).facts.lines) == ([], [])
+    assert LIBRARY.facts.lines == []
+
+
+def test_a_coefficient_known_of_the_point_is_a_number_at_each() -> None:
+    runs = [replace(RUN, parameters={"a": 2.0}), replace(OTHER, parameters={"a": 3.0})]
+    library = LIBRARY.known({"x": {"x": {"a": 0.25}}})
+    found = ep.discover(runs, library, ep.Regression())
+    assert [own.model.terms("x")["x"] for own in found.points.values()] == [0.5, 0.75]
+    with pytest.raises(ValueError, match="known coefficients differ between"):
+        ep.estimate(runs, library)
 
 
 def driven(x0: float, f_Hz: float) -> ep.Trajectory:

@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.app.schema import study_of
-from ep2sindy.discovery.one_signal import SignalSearch, method_by_runs
+from ep2sindy.discovery.one_signal import (
+    Preparation,
+    best_of,
+    fitted_part,
+    run_on_rest,
+    try_in_turn,
+)
 from ep2sindy.library.units import Clock
-from ep2sindy.signals.embedding import DROWNED, unexplained
+from ep2sindy.signals.embedding import DROWNED, Embedding, unexplained
 from ep2sindy.signals.smoothers import ratio_bounds
 from ep2sindy.signals.spectrum import signal_memory_s
-from ep2sindy.studies.trace import Study
-from tests.programs import composed
 
 A, B = 2.0, 1.0  # of the Toda oscillator: g' = A - B x
 
@@ -37,23 +40,17 @@ def sine(n_periods=20.0, *, per_period=60, mean=0.0):
     return recorded(1e-3 * turn, mean + np.sin(2 * np.pi * turn))
 
 
-def chosen_for(run):
-    return ep.signals.embed(ep.signals.prepare_signal(run))
-
-
 def discovered(states, *, degree, max_terms):
     recipe = ep.Regression(
         ep.Differential(ep.signals.KalmanSmoother()), ep.BestSubset(max_terms=max_terms)
     )
-    library = ep.polynomial(states.run.state_names, degree=degree)
-    known = {"relations": states.relations, "terms": states.terms}
-    return ep.discover(states.run, library, recipe, **known).model
+    return ep.discover(states.run, states.library(degree), recipe).model
 
 
 def test_the_growth_rate_is_that_of_the_signal():
     run = toda()
-    chosen = chosen_for(recorded(run.t, run.states[:, 0]))
-    assert chosen.embedding == ep.signals.LogRate()
+    chosen = ep.embed(recorded(run.t, run.states[:, 0]))
+    assert chosen.embedding == Embedding("rate")
     states = chosen.run
     assert states.state_names == ("x", "g")
     assert states.units == {"x": "A", "g": "s^-1"}
@@ -65,7 +62,7 @@ def test_the_growth_rate_is_that_of_the_signal():
 
 def test_the_toda_oscillator_is_found_with_its_known_equation_exact():
     run = toda()
-    found = chosen_for(recorded(run.t, run.states[:, 0]))
+    found = ep.embed(recorded(run.t, run.states[:, 0]))
     model = discovered(found, degree=3, max_terms=3)
     assert model.terms("x") == {"x*g": 1.0}
     kept = {term: model.terms("g")[term] for term in ("1", "x")}
@@ -73,8 +70,8 @@ def test_the_toda_oscillator_is_found_with_its_known_equation_exact():
 
 
 def test_a_sine_of_either_sign_is_a_harmonic_oscillator():
-    found = chosen_for(sine())
-    assert found.embedding == ep.signals.Rate()
+    found = ep.embed(sine())
+    assert found.embedding == Embedding("derivative")
     assert "either sign" in found.reason
     assert found.run.units == {"x": "A", "v": "A s^-1"}
     model = discovered(found, degree=2, max_terms=2)
@@ -83,20 +80,19 @@ def test_a_sine_of_either_sign_is_a_harmonic_oscillator():
 
 
 def test_delays_are_the_signal_a_part_of_a_period_before():
-    embedded = ep.signals.Delays().embed(ep.signals.prepare_signal(sine()))
+    embedded = ep.embed(sine(), "delays")
     x, before = embedded.run.states[40:-40].T
     phase = 2e3 * np.pi * embedded.run.t[40:-40]
     np.testing.assert_allclose(x, np.sin(phase), atol=0.01)
     np.testing.assert_allclose(before, -np.cos(phase), atol=0.01)
-    assert embedded.relations == ()
-    assert embedded.searched == ["x", "x_before"]
+    assert not embedded.known
 
 
 def test_noise_that_drowns_the_derivative_asks_for_delays():
     clean = sine(60.0)
     noise = 1.5 * DROWNED * np.random.default_rng(0).standard_normal(clean.n_samples)
-    chosen = chosen_for(recorded(clean.t, clean.states[:, 0] + noise))
-    assert chosen.embedding == ep.signals.Delays()
+    chosen = ep.embed(recorded(clean.t, clean.states[:, 0] + noise))
+    assert chosen.embedding == Embedding("delays")
     assert "noise" in chosen.reason
 
 
@@ -142,7 +138,7 @@ def test_what_is_faster_than_asked_counts_as_noise():
     assert ratio_bounds(10.0, 1.0, 1.0, (-14.0, 4.0)) == pytest.approx((0.0, 0.0))
     clean = sine(40.0, mean=3.0)
     x = clean.states[:, 0] + 0.1 * np.sin(25 * 2e3 * np.pi * clean.t)
-    fine = ep.signals.LogRate(harmonics=7.0).embed(ep.signals.prepare_signal(recorded(clean.t, x)))
+    fine = ep.embed(recorded(clean.t, x), "rate", harmonics=7.0)
     assert fine.noise_std > 0.05  # 0.1 / sqrt(2) of it
     assert np.abs(fine.run.states[20:-20, 0] - clean.states[20:-20, 0]).max() < 0.03
 
@@ -222,36 +218,35 @@ def test_three_states_of_a_signal_are_a_chain_of_derivatives():
     t = np.linspace(0.0, 60.0, 3001)
     two_lines = recorded(t, np.sin(t) + 0.5 * np.sin(2 * t))
     signal = ep.signals.prepare_signal(two_lines, decimate=None)
-    chosen = ep.signals.embed(signal, n_states=3)
-    states = chosen
+    states = ep.embed(signal, n_states=3)
     assert states.run.state_names == ("x", "v", "w")
     assert states.run.units == {"x": "A", "v": "A s^-1", "w": "A s^-2"}
-    assert states.terms == {"x": ("v",), "v": ("w",)}
-    assert states.searched == ["w"]
+    assert states.known == {"x": "v", "v": "w"}
     inner = slice(100, -100)
     bend = -np.sin(t) - 2.0 * np.sin(2 * t)
     assert np.abs(states.run.states[:, 2] - bend)[inner].max() < 0.1
-    log = ep.signals.LogRate(n_states=3)
-    positive = ep.signals.prepare_signal(recorded(t, np.exp(np.sin(t))), decimate=None)
-    found = log.embed(positive)
+    found = ep.embed(recorded(t, np.exp(np.sin(t))), "rate", n_states=3, decimate=None)
     assert found.run.state_names == ("x", "g", "h")
-    assert found.relations == ("x: x*g == 1", "g: h == 1")
+    assert found.run.units == {"x": "A", "g": "s^-1", "h": "s^-2"}
+    assert found.known == {"x": "x*g", "g": "h"}
     assert np.abs(found.run.states[:, 2] + np.sin(t))[inner].max() < 0.05
-    before = ep.signals.Delays(n_states=3).embed(signal)
+    before = ep.embed(signal, "delays", n_states=3)
     assert before.run.state_names == ("x", "x_before", "x_before2")
+    hidden = ep.embed(signal, "hidden", n_states=3)
+    assert hidden.run.state_names == ("x",)
+    assert hidden.hidden == ("v", "w")
+    assert hidden.library(degree=1).names == ("1", "x", "v", "w")
 
 
 def test_signals_of_several_runs_get_one_embedding():
     high, low = (ep.signals.prepare_signal(sine(mean=mean)) for mean in (3.0, 0.0))
-    assert [type(each.embedding) for each in map(ep.signals.embed, (high, low))] == [
-        ep.signals.LogRate,
-        ep.signals.Rate,
-    ]
-    assert {each.embedding for each in ep.signals.embed([high, high])} == {ep.signals.LogRate()}
-    both = ep.signals.embed([high, low], n_states=3)
-    assert {each.embedding for each in both} == {ep.signals.Rate(n_states=3)}
+    assert [each.embedding.how for each in map(ep.embed, (high, low))] == ["rate", "derivative"]
+    alike = ep.signals.embed_alike
+    assert {each.embedding for each in alike([high, high])} == {Embedding("rate")}
+    both = alike([high, low], n_states=3)
+    assert {each.embedding for each in both} == {Embedding("derivative", n_states=3)}
     with pytest.raises(ValueError, match="a signal or more: an empty list"):
-        ep.signals.embed([])
+        alike([])
 
 
 def test_neighbours_tell_how_many_states_there_are():
@@ -259,14 +254,14 @@ def test_neighbours_tell_how_many_states_there_are():
     signal = ep.signals.prepare_signal(recorded(lorenz.t, lorenz.states[:, 0]))
     assert signal.cycle is None
     assert signal.frequency_Hz == pytest.approx(0.9, rel=0.3)  # turns of either wing
-    two, three = (unexplained(signal, ep.signals.Rate(n_states=n)) for n in (2, 3))
-    loop = ep.signals.prepare_signal(sine())
-    assert unexplained(loop, ep.signals.Rate()) < 1e-3 < 0.5 * three < two
+    two, three = (unexplained(ep.embed(signal, "derivative", n_states=n)) for n in (2, 3))
+    loop = ep.embed(sine(), "derivative")
+    assert unexplained(loop) < 1e-3 < 0.5 * three < two
 
 
 def test_a_signal_named_as_the_rate_keeps_its_name():
     run = sine(mean=3.0)
-    found = chosen_for(recorded(run.t, run.states[:, 0], name="g"))
+    found = ep.embed(recorded(run.t, run.states[:, 0], name="g"))
     assert found.run.state_names == ("g", "g_rate")
 
 
@@ -302,17 +297,20 @@ def test_a_short_record_is_refused_in_its_own_unit_of_time():
 @pytest.mark.parametrize("mean", [0.0, 0.9])
 def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
     signal = ep.signals.prepare_signal(sine(mean=mean))
-    message = r"needs a positive signal: x falls to .* \(embedding=rate"
+    message = r"needs a positive signal: x falls to .* its derivative instead"
     with pytest.raises(ValueError, match=message):
-        ep.signals.LogRate().embed(signal)
-    assert ep.signals.embed(signal).embedding == ep.signals.Rate()
+        ep.embed(signal, "rate")
+    assert ep.embed(signal).embedding == Embedding("derivative")
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: ep.signals.LogSmoother(0.0), "finest_s must be positive and finite"),
-        (lambda: ep.signals.Rate(n_states=6), "n_states must be 2 to 5: 6 came"),
+        (lambda: ep.embed(sine(), n_states=6), "n_states must be 2 to 5: 6 came"),
+        (lambda: ep.embed(sine(), "lags"), "how must be auto, hidden, rate, derivative, delays"),
+        (lambda: ep.embed(sine(), harmonics=0.5), "harmonics must be one or more: 0.5 came"),
+        (lambda: ep.embed(sine(), decimate=0), "decimate must be auto, null or a whole number"),
         (lambda: ep.signals.prepare_signal(ep.lotka_volterra().trajectory()), "one signal must be"),
         (
             lambda: ep.signals.LogSmoother().estimate(np.arange(9.0), -np.ones(9)),
@@ -329,53 +327,42 @@ def test_settings_that_cannot_be_are_refused(make, message):
         make()
 
 
-# One call from signal to tested model
+# From a signal to a tested model
 
 
-def test_one_call_finds_the_law_of_a_signal_and_the_state_that_nobody_measured() -> None:
+def tried(signal, method=None, *preparations, held_out=0.25):
+    attempts = try_in_turn(fitted_part(signal, held_out), preparations, method or ep.Regression())
+    return attempts, *run_on_rest(signal, best_of(attempts))
+
+
+def test_hidden_states_that_explain_a_signal_end_the_list() -> None:
     """With g = 2/3 - y, x' = x (2/3 - y) and y' = y (x - 1/3) are these two equations."""
     prey = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
-    found = ep.from_one_signal(prey, "x", degree=2, decimate=4)
-    assert found.model.terms("x") == pytest.approx({"x*g": 1.0}, rel=1e-12)
+    signal = ep.signals.prepare_signal(prey, "x", decimate=4)
+    ways = [Preparation("hidden", degree=1), Preparation("hidden", degree=2), Preparation("auto")]
+    (attempt,), states, free = tried(signal, None, *ways)
+    assert attempt.preparation == ways[1]
+    assert attempt.found.model.terms("x") == pytest.approx({"x*g": 1.0}, rel=1e-12)
     exact = {"1": 2 / 9, "x": -2 / 3, "g": -1 / 3, "x*g": 1.0}
-    assert found.model.terms("g") == pytest.approx(exact, rel=0.05)
-    assert found.evaluation.is_similar
-    assert found.evaluation.record.t[0] == found.signal.t[round(0.75 * len(found.signal.t)) - 1]
-    assert found.evaluation.forecast is not None
-    text = repr(found)
-    assert "x: the signal and 1 that nobody measured" in text
-    assert "its end, which was not fitted: follows" in text
-    assert found.discovery.model == found.model
+    assert attempt.found.model.terms("g") == pytest.approx(exact, rel=0.05)
+    assert attempt.searched == ["g"]
+    assert np.isnan(attempt.share)
+    assert free.is_similar
+    assert free.record.t[0] == signal.t[round(0.75 * len(signal.t)) - 1]
+    assert states.state_names == ("x", "g")
+    assert free.forecast is not None
 
 
-def test_one_call_makes_states_by_smoothing_where_it_is_asked_to() -> None:
-    run = sine(mean=0.0)
-    found = ep.from_one_signal(
-        run, embedding="rate", degree=1, method=ep.Regression(), held_out=0.0
-    )
-    (x,) = run.state_names
-    rate = 2.0 * np.pi * found.signal.frequency_Hz
-    assert found.model.terms(x) == {"v": 1.0}
-    assert found.model.terms("v") == pytest.approx({x: -(rate**2)}, rel=1e-2)
-    assert found.evaluation.forecast is None
-    assert "run freely over all of it" in repr(found)
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"embedding": "lags"}, "embedding must be auto, hidden or log_rate or rate or delays"),
-        ({"n_states": "few"}, "n_states must be auto or a number: 'few' came"),
-        ({"held_out": 1.0}, "held_out must be a share, 0 or more and below 1: 1.0 came"),
-        ({"decimate": 0}, "decimate must be auto, null or a whole number"),
-    ],
-)
-def test_settings_of_one_call_are_checked(setting: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        ep.from_one_signal(sine(), **setting)
-
-
-def test_the_method_of_one_call_is_that_of_the_experiment() -> None:
-    study = study_of(Study, composed("+exp=trace"))
-    assert study.method == method_by_runs()
-    assert study._search == SignalSearch(method_by_runs(), functions=study.functions)
+def test_a_later_preparation_must_forecast_clearly_better() -> None:
+    signal = ep.signals.prepare_signal(sine())
+    ways = [Preparation("delays", degree=0), Preparation("derivative", degree=1)]
+    ways += [Preparation("derivative", degree=2), Preparation("derivative", n_states=3)]
+    attempts, _, free = tried(signal, None, *ways, held_out=0.0)
+    assert [each.preparation for each in attempts] == ways[:3]  # it repeats itself: two states do
+    best = best_of(attempts)
+    assert best is attempts[1]
+    assert best.found.model.terms("x") == {"v": 1.0}
+    rate = 2.0 * np.pi * signal.frequency_Hz
+    assert best.found.model.terms("v") == pytest.approx({"x": -(rate**2)}, rel=1e-2)
+    assert free.forecast is None
+    assert free.record.n_samples == len(signal.t)

@@ -2,13 +2,14 @@
 
 They look for samples outside the domain of a library's functions, for states that repeat
 another state, and for samples that two runs share. A `Task` is what a method is asked: trajectories
-that agree, a library, and what is known of the equations.
+that agree, and a library with what is known of the equations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -16,11 +17,11 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import check_nonnegative
 from ep2sindy.data.runs import trajectories_of
-from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
+from ep2sindy.data.trajectory import Trajectory, check_agreement
+from ep2sindy.library.facts import Facts
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import check_state
-from ep2sindy.library.relations import Relation, complete, relations_of
-from ep2sindy.library.roles import Roles
+from ep2sindy.library.relations import Relation, complete
 from ep2sindy.runtime.values import check_kind, check_list
 
 # Check that the functions of a library are defined along the trajectories.
@@ -165,140 +166,77 @@ def _common_start(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What a method is asked: equations of these runs, from this library, with what is known.
+    """What a method is asked: equations of these runs, from this library, with what it knows.
 
     runs: trajectories of the same states, which agree in the units of the library's variables.
-    relations: between coefficients. terms: for each state whose equation is known but for its
-    coefficients, all terms of that equation; it is not searched. roles: of terms, for equations
-    that conserve what states exchange. hidden: states that nobody measured. exclude: for each state
-    that is named, terms of the library that its equation may not have.
+    hidden: states that nobody measured.
     Raises ValueError for runs that do not agree or that share samples, a state that repeats
-    another, a variable that a run lacks, a relation, term or role of unknown names, roles beside
-    relations, terms, exclude or hidden states, states that are negative where roles say that they
-    are not, or a term that is excluded and named elsewhere.
+    another, a variable that a run lacks, facts of unknown states, roles beside hidden states, or
+    states that are negative where roles say that they are not.
     """
 
     runs: Sequence[Trajectory]
     library: Library
-    relations: Sequence[Relation] = ()
-    terms: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    roles: Roles | None = None
     hidden: Sequence[str] = ()
-    exclude: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_kind("library", self.library, Library, "ep.polynomial(['x', 'y'], degree=2)")
         check_list("hidden", self.hidden)
-        for name, value in {
-            "runs": tuple(trajectories_of(self.runs, partial=True)),
-            "relations": relations_of(self.relations),
-            "terms": read_only_mapping(_names_by_state("terms", self.terms)),
-            "hidden": tuple(self.hidden),
-            "exclude": read_only_mapping(_names_by_state("exclude", self.exclude)),
-        }.items():
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "runs", tuple(trajectories_of(self.runs, partial=True)))
+        object.__setattr__(self, "hidden", tuple(self.hidden))
         self._check_hidden()
         seen = [name for name in self.library.variables if name not in self.hidden]
         check_agreement(self.runs, seen)
-        check_repeats(self.runs, tied=self.roles is not None)
-        self._check_known()
+        roles = self.facts.roles
+        check_repeats(self.runs, tied=roles is not None)
+        if roles is not None:
+            roles.processes(self.library, self.states)
+            for state in roles.positive:
+                check_nonnegative(state, [run.columns([state])[:, 0] for run in self.runs])
+        for state in (*self.facts.excluded, *(state for state, _ in self.facts.places)):
+            if state not in self.states:
+                raise ValueError(f"unknown state {state!r}; there are {list(self.states)}")
+
+    @property
+    def facts(self) -> Facts:
+        """What is known of the equations."""
+        return self.library.facts
 
     @property
     def states(self) -> tuple[str, ...]:
         """Names of the states, one equation each; hidden ones last."""
         return (*self.runs[0].state_names, *self.hidden)
 
-    def allowed(self, equation: str) -> Bool[np.ndarray, " terms"]:
-        """Mask of the library's terms that an equation may have."""
-        mask = np.ones(len(self.library), dtype=np.bool_)
-        mask[[self.library.index(name) for name in self.exclude.get(equation, ())]] = False
-        return mask
+    @property
+    def relations(self) -> Sequence[Relation]:
+        """Between coefficients, at the operating point of the first run."""
+        return self.library.at_operating_point(self.runs[0].parameters).facts.relations
 
     def complete(
         self, equation: str, found: Sequence[Bool[np.ndarray, "_ terms"]]
     ) -> list[Bool[np.ndarray, "_ terms"]]:
         """Supports found for an equation in every draw, made consistent with what is known."""
-        if equation in self.terms:
-            known = np.zeros((1, len(self.library)), dtype=np.bool_)
-            known[0, [self.library.index(name) for name in self.terms[equation]]] = True
+        facts, library = self.facts, self.library
+        if equation in facts.only:
+            known = np.zeros((1, len(library)), dtype=np.bool_)
+            known[0, [library.index(name) for name in facts.only[equation]]] = True
             return [known] * len(found)
-        if not self.relations:
-            return list(found)
-        return [complete(masks, self.library, equation, self.relations) for masks in found]
+        # At another point a coefficient may be another number than zero: its term is in.
+        told = [Relation(((1.0, *place),), 1.0, "") for place in facts.known_factors]
+        relations = [*facts.relations, *told]
+        return [complete(masks, library, equation, relations) for masks in found]
 
     def _check_hidden(self) -> None:
         for name in self.hidden:
             check_state(name)
-        measured = [name for run in self.runs for name in run.names]
-        if twice := [name for name in self.hidden if name in measured]:
+        measured = {name for run in self.runs for name in run.names}
+        if twice := [name for name, n in Counter([*measured, *self.hidden]).items() if n > 1]:
             raise ValueError(
-                f"a hidden state is one that no run has: {twice} came with samples; leave them "
-                "out of hidden, or out of the runs"
+                f"a hidden state is one that no run has: {twice} came with samples or twice; leave "
+                "them out of hidden, or out of the runs"
             )
-        if len(set(self.hidden)) < len(self.hidden):
-            raise ValueError(f"hidden states must differ: {list(self.hidden)} came")
-
-    def _check_known(self) -> None:
-        """Raise ValueError for an unknown state or term, or an equation without terms."""
-        if self.roles is not None:
-            check_kind("roles", self.roles, Roles, "ep.Roles(exchange=[('n_n', 'n_i')])")
-            if self.relations or self.terms or self.exclude:
-                raise ValueError(
-                    "roles say which terms the equations may have and how they are tied: "
-                    "relations, terms or exclude came as well; give roles alone, or leave them out"
-                )
-            if self.hidden:
-                raise ValueError(
-                    f"roles need samples of every state: {list(self.hidden)} came as hidden; give "
-                    "relations between coefficients instead, or leave roles out"
-                )
-            self.roles.processes(self.library, self.states)
-            for state in self.roles.positive:
-                check_nonnegative(state, [run.columns([state])[:, 0] for run in self.runs])
-        named = [(state, term) for r in self.relations for _, state, term in r.factors]
-        named += [(state, term) for state, terms in self.terms.items() for term in terms]
-        for state in (*self.terms, *self.exclude, *(state for state, _ in named)):
-            if state not in self.states:
-                raise ValueError(f"unknown state {state!r}; there are {list(self.states)}")
-        for _, term in named:
-            self.library.index(term)
-        if empty := [state for state, terms in self.terms.items() if not terms]:
-            raise ValueError(f"an equation whose terms are given must have some: {empty} has none")
-        for state in self.exclude:
-            if not self.allowed(state).any():
-                raise ValueError(
-                    f"exclude must leave terms to every equation: all {len(self.library)} of the "
-                    f"library came for {state!r}; leave some of them out of exclude"
-                )
-        for state, term in named:
-            if not self.allowed(state)[self.library.index(term)]:
-                raise ValueError(
-                    f"a term is excluded, or it is named in terms and relations: {term!r} of "
-                    f"{state!r} came in both; leave it out of one of them"
-                )
-
-
-def _names_by_state(key: str, given: object) -> dict[str, tuple[str, ...]]:
-    """The terms of every state that are named. Raises ValueError for what are no lists of names."""
-    example = f"{key}={{'x': ['x', 'x*y']}}"
-    if not isinstance(given, Mapping):
-        raise ValueError(f"{key} must be lists of terms by state, like {example}: {given!r} came")
-    found = {}
-    for state, names in given.items():
-        check_list(f"the {key} of {state!r}", names)
-        if isinstance(names, Mapping) and names:
-            term, value = next(iter(names.items()))
+        if self.hidden and self.facts.roles is not None:
             raise ValueError(
-                f"{key} names terms, without coefficients, like {example}: {dict(names)!r} came "
-                f"for {state!r}; a coefficient that is known is a relation, "
-                f"relations=['{state}: {term} == {value}']"
+                f"roles need samples of every state: {list(self.hidden)} came as hidden; give "
+                "relations between coefficients instead, or leave roles out"
             )
-        if not isinstance(names, Sequence):
-            raise ValueError(f"{key} must be a list for every state: {names!r} came for {state!r}")
-        if wrong := [name for name in names if not isinstance(name, str)]:
-            raise ValueError(
-                f"{key} must hold names of terms, like {example}: {wrong[0]!r} came for "
-                f"{state!r}; the constant term is '1'"
-            )
-        found[state] = tuple(names)
-    return found

@@ -1,9 +1,7 @@
 # Discover
 from ep2sindy.data.coerce import Task as Task
-from ep2sindy.discovery.method import DiscoveryMethod as DiscoveryMethod
-from ep2sindy.discovery.choice import IdentifiedEquations as IdentifiedEquations
+from ep2sindy.discovery.result import DiscoveryMethod as DiscoveryMethod
 from ep2sindy.estimation.estimate import Estimate as Estimate
-from ep2sindy.discovery.one_signal import SignalDiscovery as SignalDiscovery
 from ep2sindy.discovery.pointwise import PointSearch as PointSearch
 from ep2sindy.discovery.regimes import find_regimes as find_regimes
 from ep2sindy.discovery.regimes import Regimes as Regimes

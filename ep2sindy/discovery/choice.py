@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,11 +16,10 @@ from scipy.linalg import block_diag
 
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory, spread_blocks
-from ep2sindy.estimation.estimate import Estimate
+from ep2sindy.discovery.result import Discovery, DiscoveryMethod, NoiseTest
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.formulations import RandomSplit, Weak
 from ep2sindy.regression.front import Candidate, LeftOver, ParetoFront, fit_support
@@ -28,7 +27,7 @@ from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.whitening import NEGLIGIBLE, whiten_rows
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.criteria import Decision, OtherSystem, Selection, cheapest_first, support_of
+from ep2sindy.selection.criteria import Decision, cheapest_first, support_of
 
 # Most combinations, of the fronts that relations join, to look at for one with the terms.
 MAX_COMBINATIONS = 100_000
@@ -48,57 +47,14 @@ N_STEPS = 8
 SMALLEST = np.finfo(np.float64).tiny  # for exact fits, without residuals
 
 
-@dataclass(frozen=True, eq=False)
-class NoiseTest:
-    """Test whether a model explains the data to within their noise.
-
-    left: for each state, the residuals of its equation on rows. It is empty if no rows were tested,
-    as after a trajectory search, which tests whole trajectories.
-    misfit: the reason why the model does not explain the data; empty if it does, or if nothing was
-    tested. tested: False if nothing was tested.
-    """
-
-    left: Mapping[str, LeftOver] = field(default_factory=dict)
-    misfit: str = ""
-    tested: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class IdentifiedEquations:
-    """Result of applying a method to runs.
-
-    fronts: the candidates of every equation, with the scores of the selection rule. chosen: for
-    each front, the selected candidate. model: of the chosen terms; its coefficients may differ from
-    the candidates' by weighting, constraints or refinement. note: how the rule decided; else empty.
-    left: for each state, the residuals of the final fit on rows whose noise is known. n_free: for
-    each state named by a relation that holds in the model, the number of free coefficients of its
-    equation. constraint: that the coefficients obey; None if they are all free. others: systems of
-    the same size that would do as well. ambiguities: terms that these data cannot tell apart, and
-    warnings of too few rows for the terms. remarks: sentences on where the samples deviate from the
-    assumptions. estimate: of states and coefficients together; None after a regression.
-    """
-
-    fronts: Sequence[ParetoFront]
-    chosen: Sequence[Candidate]
-    model: SparseModel
-    note: str = ""
-    left: Mapping[str, LeftOver] = field(default_factory=dict)
-    n_free: Mapping[str, int] = field(default_factory=dict)
-    constraint: Constraint | None = None
-    others: Sequence[OtherSystem] = ()
-    ambiguities: Sequence[Ambiguity] = ()
-    remarks: Sequence[str] = ()
-    estimate: Estimate | None = None
-
-
 def choose(
     fronts: Sequence[ParetoFront],
-    rule: Selection,
+    method: DiscoveryMethod,
     task: Task,
     *,
     provenance: Mapping[str, str],
     progress: Progress = SILENT,
-) -> IdentifiedEquations:
+) -> Discovery:
     """Select from the candidates of a regression, and fit: constrained, weighted or unchanged.
 
     A rule that runs whole systems has fitted the winner. For any other, under relations, only
@@ -107,9 +63,9 @@ def choose(
     Raises ValueError for relations that no combination has the terms for, or that tie so many
     states to each other that their combinations exceed a hundred thousand.
     """
-    decision = rule.decide(fronts, task, progress=progress)
+    decision = method.selection.decide(fronts, task, progress=progress)
     if decision.model is not None:
-        return choose_system(fronts, decision, task.runs, provenance=provenance)
+        return choose_system(fronts, decision, method, task.runs, provenance=provenance)
     library, relations, units = fronts[0].rows.library, task.relations, task.runs[0].units
     scored = [front.with_scores(s) for front, s in zip(fronts, decision.scores, strict=True)]
     if relations:
@@ -121,22 +77,23 @@ def choose(
         model = constrained_fit(problems, held, units=units, provenance=provenance)
         won = [f.with_scores(_won(f.scores, int(k))) for f, k in zip(scored, place, strict=True)]
         best = [front.candidates[k] for front, k in zip(won, place, strict=True)]
-        n_free = _count_free(held, bound)
-        return IdentifiedEquations(won, best, model, n_free=n_free, constraint=held)
+        test = NoiseTest(n_free=_count_free(held, bound))
+        return replace(join_choice(won, best, model, method), noise_test=test, constraint=held)
     best = [front.best for front in scored]
     fits = [fit_last(*pair) for pair in zip(scored, best, strict=True)]
     model = assemble_model(library, fits, units=units, provenance=provenance)
-    left = {fit.equation: fit.left for fit in fits if fit.left is not None}
-    return IdentifiedEquations(scored, best, model, left=left)
+    test = NoiseTest({fit.equation: fit.left for fit in fits if fit.left is not None})
+    return replace(join_choice(scored, best, model, method), noise_test=test)
 
 
 def choose_system(
     fronts: Sequence[ParetoFront],
     decision: Decision,
+    method: DiscoveryMethod,
     runs: Sequence[Trajectory],
     *,
     provenance: Mapping[str, str],
-) -> IdentifiedEquations:
+) -> Discovery:
     """The choice that the decision of a rule that runs systems makes, with its scores."""
     assert decision.model is not None
     scored = [f.with_scores(s) for f, s in zip(fronts, decision.scores, strict=True)]
@@ -145,12 +102,28 @@ def choose_system(
     held = decision.constraint
     if held is not None and len(held.free) == len(held.coefficients):
         held = None
-    return IdentifiedEquations(
-        scored, best, model, decision.note, constraint=held, others=decision.others
+    found = join_choice(scored, best, model, method)
+    return replace(found, note=decision.note, constraint=held, others=decision.others)
+
+
+def join_choice(
+    fronts: Sequence[ParetoFront],
+    chosen: Sequence[Candidate],
+    model: SparseModel,
+    method: DiscoveryMethod,
+) -> Discovery:
+    """The candidates of every equation, and those that were chosen as they are in the model."""
+    terms = {each.equation: model.terms(each.equation) for each in chosen}
+    coef = [np.array([terms[c.equation].get(name, 0.0) for name in c.terms]) for c in chosen]
+    return Discovery(
+        {front.equation: front for front in fronts},
+        {c.equation: replace(c, coef=own) for c, own in zip(chosen, coef, strict=True)},
+        model,
+        method,
     )
 
 
-def judge_noise(choice: IdentifiedEquations, runs: Sequence[Trajectory]) -> NoiseTest:
+def judge_noise(choice: Discovery, runs: Sequence[Trajectory]) -> NoiseTest:
     """Test the residuals of the chosen model against the noise of the samples.
 
     A state that the final fit has tested on its own rows keeps that result. Any other state is
@@ -166,18 +139,18 @@ def judge_noise(choice: IdentifiedEquations, runs: Sequence[Trajectory]) -> Nois
     if estimate is not None and estimate.model is choice.model:
         return NoiseTest(misfit=estimate.misfit, tested=True)
     runs = runs if estimate is None else estimate.runs  # with hidden states
-    states, tested = choice.model.states, choice.left
+    states, tested, n_free = choice.model.states, choice.noise_test.left, choice.noise_test.n_free
     unknown = [state for state in states if state not in tested]
     found = {**tested, **(_test_on_weak_rows(choice, runs, unknown) if unknown else {})}
     ordered = {state: found[state] for state in states if state in found}
-    return NoiseTest(ordered, _describe_misfit(ordered, choice.n_free), tested=bool(ordered))
+    return NoiseTest(ordered, _describe_misfit(ordered, n_free), bool(ordered), n_free)
 
 
 def _test_on_weak_rows(
-    choice: IdentifiedEquations, runs: Sequence[Trajectory], states: Sequence[str]
+    choice: Discovery, runs: Sequence[Trajectory], states: Sequence[str]
 ) -> dict[str, LeftOver]:
     """Residuals of some equations on weak rows, as far as their rows can be made and whitened."""
-    model, left = choice.model, dict[str, LeftOver]()
+    model, n_free, left = choice.model, choice.noise_test.n_free, dict[str, LeftOver]()
     try:
         # Same result as with the whole library, at a fraction of the cost.
         used = np.isin(model.library.names, [name for s in states for name in model.terms(s)])
@@ -191,8 +164,8 @@ def _test_on_weak_rows(
     for state in states:
         problem, fit = problems[state], Candidate.of(state, model.terms(state))
         with suppress(ValueError, np.linalg.LinAlgError):
-            if state in choice.n_free:
-                left[state] = _test_fit(problem, fit, n_free=choice.n_free[state])
+            if state in n_free:
+                left[state] = _test_fit(problem, fit, n_free=n_free[state])
             elif (tested := reweight(problem, fit, negligible=NEGLIGIBLE).left) is not None:
                 left[state] = tested
     return left
@@ -232,12 +205,6 @@ def _describe_misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> 
 def fit_last(front: ParetoFront, candidate: Candidate) -> Candidate:
     """Final fit of a selected candidate, weighted if the noise of its rows is known."""
     return candidate if front.rows.noisy is None else reweight(front.rows, candidate)
-
-
-def as_in(model: SparseModel, candidate: Candidate) -> Candidate:
-    """A candidate with the coefficients that it has in a model."""
-    terms = model.terms(candidate.equation)
-    return replace(candidate, coef=np.array([terms.get(name, 0.0) for name in candidate.terms]))
 
 
 def assemble_model(

@@ -5,24 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain, count, islice
 
 import numpy as np
 
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import IdentifiedEquations, as_in, judge_noise
-from ep2sindy.discovery.method import DiscoveryMethod, TrajectorySearch
-from ep2sindy.discovery.result import Discovery, join_points
+from ep2sindy.discovery.choice import judge_noise
+from ep2sindy.discovery.method import TrajectorySearch
+from ep2sindy.discovery.result import Discovery, DiscoveryMethod, join_points
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.library.relations import Relation, relations_of
-from ep2sindy.library.roles import Roles
-from ep2sindy.operating.law import NOTHING, Known, LawFunctions
+from ep2sindy.operating.law import LawFunctions
 from ep2sindy.operating.records import group_by_point, most_central, values_of
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.runtime.values import check_kind
+from ep2sindy.runtime.values import check_count, check_kind
 
 
 @one_thread()
@@ -33,14 +32,9 @@ def discover(
     *,
     law: LawFunctions | Sequence[LawFunctions] | None = None,
     shared: bool = False,
+    hidden: Sequence[str] | int = (),
     t: object = None,
     inputs: Sequence[str] = (),
-    relations: Sequence[Relation | str] = (),
-    terms: Mapping[str, Sequence[str]] | None = None,
-    roles: Roles | None = None,
-    hidden: Sequence[str] = (),
-    exclude: Mapping[str, Sequence[str]] | None = None,
-    known: Known = NOTHING,
     seed: int | np.random.Generator = 0,
     workers: Workers | None = None,
     progress: Progress | bool = False,
@@ -51,15 +45,12 @@ def discover(
     likelihood of whole trajectories, a `Regression` by rows.
     runs: one run, or a list or dict of runs: Trajectory, DataFrame, Dataset, (t, x), or x with t,
     its times or its step in s; inputs: columns that are inputs; see `trajectories_of`. library:
-    None means every product of the first run's variables and of hidden states up to degree 2.
-    method: None means TrajectorySearch(), the best method we know for noisy data. relations:
-    between coefficients, such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in the search,
-    in the selection and in the model. terms: for each state whose equation is known but for its
-    coefficients, all terms of that equation. roles: of terms, for equations that conserve what
-    states exchange (`Roles`); for a `Regression` by FreeRunScore or RefinedScore. hidden: names of
-    states that nobody measured; they and their equations are found with the others', by a
-    `TrajectorySearch`. exclude: for each state that is named, terms of the library that its
-    equation may not have, such as {"x": ["x^2"]}. progress: True shows bars.
+    candidate terms, with what is known of the equations: `Library.relate`, `only`, `exclude`,
+    `known` and `with_roles`. None means every product of the first run's variables and of hidden
+    states up to degree 2. method: None means TrajectorySearch(), the best method we know for noisy
+    data. hidden: names of states that nobody measured, or their number, for states h, or h1, h2,
+    ...; they and their equations are found with the others', by a `TrajectorySearch`. progress:
+    True shows bars.
 
     Runs whose `parameters` differ are of several operating points, and each point is searched
     alone, by the workers; `points` of the result holds what was found there. shared: True finds one
@@ -69,11 +60,10 @@ def discover(
     of each parameter p, p^2 and 1/p (`PointFits.choose_functions`); or a list of these, of which
     one is chosen. Supports of several points are found by rows (`search_shared`), or under roles at
     the most central point; a TrajectorySearch then refines the coefficients of every point on its
-    trajectories. known: coefficients that are known functions of the parameters, in SI, such as
-    {"n_n": {"1": {"mdot_mg_s": 4.6e22}}}.
-    Raises ValueError for a relation, term or role that the library or the states do not have, roles
-    that the method cannot keep, runs whose states or units differ, states or samples that repeat,
-    runs that lack parameters, or points that do not suffice for the law.
+    trajectories.
+    Raises ValueError for facts of states that there are not, roles that the method cannot keep,
+    runs whose states or units differ, states or samples that repeat, runs that lack parameters, or
+    points that do not suffice for the law.
 
     >>> growth = (0.5, 0.7, 0.9, 1.1)
     >>> runs = [ep.lotka_volterra(a=a).trajectory(noise=0.02, rng=0) for a in growth]
@@ -84,40 +74,32 @@ def discover(
     """
     method = method or TrajectorySearch()
     trajectories = trajectories_of(runs, t=t, inputs=inputs, partial=True)
-    names = dict.fromkeys([*trajectories[0].names, *hidden])
-    library = polynomial(list(names)) if library is None else library
+    names = trajectories[0].names
+    hidden = _hidden_names(hidden, names)
+    library = polynomial(list(dict.fromkeys([*names, *hidden]))) if library is None else library
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")
-    terms, exclude = ({} if given is None else given for given in (terms, exclude))
-    task = Task(trajectories, library, relations_of(relations), terms, roles, hidden, exclude)
+    task = Task(trajectories, library, hidden)
     rng, watch = np.random.default_rng(seed), as_progress(progress)
     together = shared or law is not None
-    if known and not together:
-        raise ValueError(
-            "known coefficients are functions of the parameters of several operating points: give "
-            "law=1 or shared=True as well, or relations=['x: y == 1'] for runs of one point"
-        )
     if not together and all(run.parameters == task.runs[0].parameters for run in task.runs):
         return _discover_point((task, rng), method=method, progress=watch)
     points = group_by_point(task.runs, [v for v in library.variables if v not in hidden])
-    if not together:
-        return _discover_each(task, points, method, rng, workers or Serial(), watch)
-    return _discover_together(task, points, method, law, known, rng, watch)
-
-
-def _discover_each(
-    task: Task,
-    points: Mapping[str, Sequence[Trajectory]],
-    method: DiscoveryMethod,
-    rng: np.random.Generator,
-    workers: Workers,
-    progress: Progress,
-) -> Discovery:
-    """Every point searched alone."""
-    tasks = [replace(task, runs=runs) for runs in points.values()]
+    if together:
+        return _discover_together(task, points, method, law, rng, watch)
+    tasks = [replace(task, runs=own) for own in points.values()]
     pieces = list(zip(tasks, rng.spawn(len(tasks)), strict=True))
-    stage = progress.stage(len(pieces), "point", "discovery")
-    found = collect(workers, partial(_discover_point, method=method), pieces, stage)
+    stage = watch.stage(len(pieces), "point", "discovery")
+    found = collect(workers or Serial(), partial(_discover_point, method=method), pieces, stage)
     return join_points(dict(zip(points, found, strict=True)), values_of(points))
+
+
+def _hidden_names(hidden: Sequence[str] | int, taken: Sequence[str]) -> Sequence[str]:
+    """Names of hidden states: those given, or of a number of them h, or h1, h2, ..."""
+    if not isinstance(hidden, int):
+        return hidden
+    n = check_count("hidden", hidden, 0)
+    names = chain(["h"] * (n == 1), map("h{}".format, count(1)))
+    return list(islice((name for name in names if name not in taken), n))
 
 
 def _discover_together(
@@ -125,7 +107,6 @@ def _discover_together(
     points: Mapping[str, Sequence[Trajectory]],
     method: DiscoveryMethod,
     law: LawFunctions | Sequence[LawFunctions] | None,
-    known: Known,
     rng: np.random.Generator,
     progress: Progress,
 ) -> Discovery:
@@ -134,14 +115,14 @@ def _discover_together(
     from ep2sindy.discovery.several_points import PointsTask
 
     structure = None
-    if task.roles is not None:
+    if task.facts.roles is not None:
         middle = list(points.values())[most_central(values_of(points))]
         one = replace(task, runs=middle)
         structure = _discover_point((one, rng), method=method).constraint
         assert structure is not None
         terms = {s: [t for state, t in structure.coefficients if state == s] for s in task.states}
-        task = replace(task, roles=None, terms=terms)
-    several = PointsTask(task, points, known, method, structure)
+        task = replace(task, library=task.library.plain.only(terms))
+    several = PointsTask(task, points, method, structure)
     return several.discover(law, rng=rng, progress=progress)
 
 
@@ -152,25 +133,10 @@ def _discover_point(
     progress: Progress = SILENT,
 ) -> Discovery:
     task, rng = piece
-    return _discovery(method.identify(task, rng=rng, progress=progress), method, task.runs)
-
-
-def _discovery(
-    found: IdentifiedEquations, method: DiscoveryMethod, runs: Sequence[Trajectory]
-) -> Discovery:
-    test = judge_noise(found, runs)
+    found = method.identify(task, rng=rng, progress=progress)
+    test = judge_noise(found, task.runs)
     # Intervals of a model that does not explain the data would not cover the truth.
-    model = replace(found.model, clock=runs[0].clock)
-    return Discovery(
-        fronts={front.equation: front for front in found.fronts},
-        chosen={each.equation: as_in(found.model, each) for each in found.chosen},
-        model=replace(model, covariance=None) if test.misfit else model,
-        method=method,
-        ambiguities=found.ambiguities,
-        noise_test=test,
-        note=found.note or test.misfit,
-        remarks=found.remarks,
-        estimate=found.estimate,
-        constraint=found.constraint,
-        others=found.others,
-    )
+    covariance = None if test.misfit else found.model.covariance
+    model = replace(found.model, clock=task.runs[0].clock, covariance=covariance)
+    note = found.note or test.misfit
+    return replace(found, model=model, method=method, noise_test=test, note=note)

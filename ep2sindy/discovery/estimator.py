@@ -19,8 +19,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 
 if TYPE_CHECKING:
-    from ep2sindy.discovery.method import DiscoveryMethod
-    from ep2sindy.discovery.result import Discovery
+    from ep2sindy.discovery.result import Discovery, DiscoveryMethod
     from ep2sindy.library.library import Library
     from ep2sindy.model.model import SparseModel
 
@@ -30,7 +29,7 @@ class SINDy(BaseEstimator):
 
     degree, functions: of the library of terms, as for `ep.polynomial`; library: in place of both, a
     library over the names of the features. method: None means `TrajectorySearch()`, as for
-    `ep.discover`. relations: between coefficients. seed: of the search.
+    `ep.discover`. seed: of the search.
     In `fit` and `score`, times t take the place of y. Folds must keep them in order, as KFold() and
     TimeSeriesSplit() do.
     Attributes after `fit`: model_, discovery_, input_names_ of the columns of u, n_features_in_,
@@ -48,7 +47,6 @@ class SINDy(BaseEstimator):
     functions: Sequence[str]
     library: Library | None
     method: DiscoveryMethod | None
-    relations: Sequence[str]
     seed: int
     discovery_: Discovery
     model_: SparseModel
@@ -62,14 +60,12 @@ class SINDy(BaseEstimator):
         functions: Sequence[str] = (),
         library: Library | None = None,
         method: DiscoveryMethod | None = None,
-        relations: Sequence[str] = (),
         seed: int = 0,
     ) -> None:
         self.degree = degree
         self.functions = functions
         self.library = library
         self.method = method
-        self.relations = relations
         self.seed = seed
 
     def fit(
@@ -87,9 +83,7 @@ class SINDy(BaseEstimator):
         library = self.library
         if library is None:
             library = polynomial(runs[0].names, degree=self.degree, functions=self.functions)
-        self.discovery_ = discover(
-            runs, library, self.method, relations=self.relations, seed=self.seed
-        )
+        self.discovery_ = discover(runs, library, self.method, seed=self.seed)
         self.model_ = self.discovery_.model
         self.input_names_ = tuple(runs[0].input_names)
         return self

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -19,9 +19,10 @@ from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import IdentifiedEquations, choose, choose_system
+from ep2sindy.discovery.choice import choose, choose_system, join_choice
+from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.cost import check_limit_s
-from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
+from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate
 from ep2sindy.library.library import Library
 from ep2sindy.library.roles import Roles
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
@@ -46,32 +47,6 @@ class Finding:
 
     kept: Mapping[str, Sequence[frozenset[str]]]
     selected: Mapping[str, frozenset[str]] | None
-
-
-@runtime_checkable
-class DiscoveryMethod(Protocol):
-    """Protocol of a method that finds equations from runs: `TrajectorySearch`, or `Regression`.
-
-    selection: the rule that chooses among candidates; it is named in the headline of the result.
-    identify: answers a `Task`. A method of one's own may ask another one:
-
-    >>> class Smallest:
-    ...     selection = ep.Evidence()
-    ...
-    ...     def identify(self, task, *, rng, progress):
-    ...         own = ep.TrajectorySearch(max_terms=2)
-    ...         return own.identify(task, rng=rng, progress=progress)
-    >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
-    >>> list(ep.discover(run, method=Smallest()).model.terms("x"))
-    ['x', 'x*y']
-    """
-
-    @property
-    def selection(self) -> Selection: ...
-
-    def identify(
-        self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
-    ) -> IdentifiedEquations: ...
 
 
 @dataclass(frozen=True)
@@ -117,20 +92,20 @@ class TrajectorySearch:
 
     def identify(
         self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
-    ) -> IdentifiedEquations:
+    ) -> Discovery:
         """Estimate states and coefficients, and choose; the search is deterministic.
 
         Ambiguities are terms whose values at the samples are alike. Raises ValueError for roles
         with a rule that runs models.
         """
-        if task.roles is not None and self.selection.basis == "runs":
+        if task.facts.roles is not None and self.selection.basis == "runs":
             raise ValueError(
                 "a search of trajectories keeps roles by likelihood: selection must be Evidence(), "
                 f"{self.selection!r} came; Regression(selection=FreeRunScore()) judges by runs"
             )
         found = self._estimate(task, progress)
-        library = found.model.library  # with the terms of known equations
-        task = replace(task, runs=found.runs, hidden=(), library=library)
+        library = task.library.with_known_terms(task.states)
+        task = Task(found.runs, library)
         return replace(
             self._choose(found, task, progress),
             ambiguities=_ambiguities_of_samples(task),
@@ -140,8 +115,10 @@ class TrajectorySearch:
 
     def _estimate(self, task: Task, progress: Progress) -> Estimate:
         provenance = self.provenance | _labels(task)
-        return estimate_task(
-            task,
+        return estimate(
+            task.runs,
+            task.library,
+            hidden=task.hidden,
             max_terms=self.max_terms,
             align=self.align,
             courses=self.courses,
@@ -150,18 +127,18 @@ class TrajectorySearch:
             progress=progress,
         )
 
-    def _choose(self, found: Estimate, task: Task, progress: Progress) -> IdentifiedEquations:
+    def _choose(self, found: Estimate, task: Task, progress: Progress) -> Discovery:
         """Candidates of every equation with their scores, and the model by the selection rule."""
         fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
         decision = self.selection.decide(fronts, task, progress=progress)
         if decision.model is not None:
-            choice = choose_system(fronts, decision, task.runs, provenance=found.model.provenance)
+            provenance = found.model.provenance
+            choice = choose_system(fronts, decision, self, task.runs, provenance=provenance)
             return replace(choice, model=replace(choice.model, courses=found.model.courses))
         scored = [front.with_scores(s) for front, s in zip(fronts, decision.scores, strict=True)]
         best = [front.best for front in scored]
-        return IdentifiedEquations(
-            scored, best, found.model, found.note, constraint=found.constraint
-        )
+        choice = join_choice(scored, best, found.model, self)
+        return replace(choice, note=found.note, constraint=found.constraint)
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
@@ -263,7 +240,7 @@ class Regression:
 
     def identify(
         self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
-    ) -> IdentifiedEquations:
+    ) -> Discovery:
         """Assemble rows, search them, and choose. Raises ValueError for hidden states."""
         if task.hidden:
             raise ValueError(
@@ -272,16 +249,16 @@ class Regression:
             )
         if any(run.missing is not None for run in task.runs):
             task = replace(task, runs=[run.complete() for run in task.runs])
-        if task.roles is None:
+        if task.facts.roles is None:
             equations = self.search_equations(task, rng=rng, progress=progress)
             fronts = [equation.front for equation in equations]
             choice = self.choose(fronts, task, progress=progress)
         else:
-            choice = self._choose_under(task.roles, task, rng=rng, progress=progress)
+            choice = self._choose_under(task.facts.roles, task, rng=rng, progress=progress)
         found: list[Ambiguity] = []
-        for rows in dict.fromkeys(front.rows for front in choice.fronts):
+        for rows in dict.fromkeys(front.rows for front in choice.fronts.values()):
             # Known equations are not searched, so too few rows do no harm to them.
-            if not set(rows.equations) <= set(task.terms):
+            if not set(rows.equations) <= set(task.facts.only):
                 found += few_rows(rows)
             found += ambiguities(rows)
         remarks = _limits(task.runs)
@@ -289,7 +266,7 @@ class Regression:
 
     def _choose_under(
         self, roles: Roles, task: Task, *, rng: np.random.Generator, progress: Progress
-    ) -> IdentifiedEquations:
+    ) -> Discovery:
         """Search all equations at once for systems that keep the roles, and let the rule decide.
 
         The search is made once, on all training rows: bootstraps weigh one equation at a time.
@@ -304,13 +281,13 @@ class Regression:
                 "roles tie all equations together, so a rule must judge whole systems: selection "
                 f"must be FreeRunScore() or RefinedScore(), {self.selection!r} came"
             )
-        library = roles.with_known_terms(task.library, task.states)
+        library = task.library.with_known_terms(task.states)
         with progress.stage(None, "", "rows of the regression"):
             problems = self.formulation.assemble(task.runs, library, rng=rng)
         systems = search_conserving_systems(problems, task, roles, self.search, depth=self.depth)
         decision = self.selection.judge(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)
-        return choose_system(systems.fronts, decision, task.runs, provenance=provenance)
+        return choose_system(systems.fronts, decision, self, task.runs, provenance=provenance)
 
     def search_equations(
         self, task: Task, *, rng: np.random.Generator | int, progress: Progress = SILENT
@@ -324,7 +301,7 @@ class Regression:
                 draws = draw_resamples(problem, self.bootstraps, rng=rng)
             for k, equation in enumerate(problem.equations):
                 with progress.stage(len(draws.xx), "draw", f"search for {equation}'") as advance:
-                    allowed = task.allowed(equation)
+                    allowed = task.library.allowed(equation)
                     proposed = draws.search(self.search, k, advance, allowed=allowed)
                 found = task.complete(equation, proposed)
                 supports = pool(draws, k, found)
@@ -334,10 +311,10 @@ class Regression:
 
     def choose(
         self, fronts: Sequence[ParetoFront], task: Task, *, progress: Progress = SILENT
-    ) -> IdentifiedEquations:
+    ) -> Discovery:
         """Select a candidate from every front, and fit it."""
         provenance = self.provenance | _labels(task)
-        return choose(fronts, self.selection, task, provenance=provenance, progress=progress)
+        return choose(fronts, self, task, provenance=provenance, progress=progress)
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int

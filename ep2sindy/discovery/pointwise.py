@@ -21,7 +21,7 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression, SearchedEquation
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Constraint, Relation, constraint, relations_of
+from ep2sindy.library.relations import Constraint, constraint
 from ep2sindy.library.units import unit_product
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.constrained import fit_draws
@@ -51,8 +51,9 @@ LAYOUT: Mapping[str, tuple[str, ...]] = {
 class PointSearch:
     """Settings of the search at every point, whose spread is taken over the bootstraps.
 
-    relations: between coefficients, such as "n_i: S == -1 * n_n: S" for ionization S, which makes
-    of a neutral an ion; the same at every point.
+    library: with relations between coefficients, if there are some, such as
+    "n_i: S == -1 * n_n: S" for ionization S, which makes of a neutral an ion; the same at every
+    point.
     least_variation: standard deviation of every state, as a share of its root mean square, below
     which a point counts as having no dynamics. seed: every point has the same split and the same
     draws, so that results differ by place alone.
@@ -63,7 +64,6 @@ class PointSearch:
     method: Regression
     least_variation: float = 1e-3
     seed: int = 0
-    relations: Sequence[Relation | str] = ()
 
     def __post_init__(self) -> None:
         check_list("states", self.states)
@@ -76,10 +76,14 @@ class PointSearch:
         check_kind("method", self.method, Regression, "ep.Regression(bootstraps=ep.Bootstraps())")
         if not (n := self.method.bootstraps.n):
             raise ValueError(f"a pointwise study needs bootstraps for its spread: n={n} came")
-        object.__setattr__(self, "relations", relations_of(self.relations))
-        every_term = dict.fromkeys(self.states, self.library.names)
-        constraint(self.library, every_term, self.relations)  # refuses those that cannot hold
-        if self.relations and (n_culled := self.method.bootstraps.n_culled):
+        facts, every_term = self.library.facts, dict.fromkeys(self.states, self.library.names)
+        constraint(self.library, every_term, facts.relations)  # refuses those that cannot hold
+        if facts.roles is not None:
+            raise ValueError(
+                "roles tie all equations together, and a pointwise study searches one at a time: "
+                f"{facts.roles} came; give relations"
+            )
+        if facts.relations and (n_culled := self.method.bootstraps.n_culled):
             raise ValueError(
                 "relations need all their terms in every bootstrap: n_culled must be 0, "
                 f"{n_culled} came"
@@ -262,10 +266,10 @@ def blocks_of(field: xr.Dataset, n_points: int) -> list[dict[str, slice]]:
 
 def search_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
     """Search, select and fit at one point, and the spread over the bootstraps."""
-    task = Task([run], search.library, relations_of(search.relations))
+    task = Task([run], search.library)
     equations = search.method.search_equations(task, rng=np.random.default_rng(search.seed))
     choice = search.method.choose([equation.front for equation in equations], task)
-    parts = zip(equations, choice.chosen, choice.model.coef.T, strict=True)
+    parts = zip(equations, choice.chosen.values(), choice.model.coef.T, strict=True)
     found = [_describe_equation(*part) for part in parts]
     point = {
         name: np.stack([row[name] for row in found], axis=dims.index("equation"))

@@ -7,16 +7,15 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ep2sindy._stubs import dotted_names, place_of
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.runs import Run
-from ep2sindy.discovery.choice import NoiseTest
-from ep2sindy.discovery.method import DiscoveryMethod
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.forecasting.forecast import Forecast, forecast
 from ep2sindy.library.relations import Constraint, Process
@@ -29,12 +28,57 @@ from ep2sindy.operating.records import most_central
 from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.front import Candidate, Cloud, LeftOver, ParetoFront
 from ep2sindy.runtime.files import read_json, write_text
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
-from ep2sindy.selection.criteria import OtherSystem
+from ep2sindy.selection.criteria import OtherSystem, Selection
 
 FORMAT = "ep2sindy.Discovery/1"
 
 MAX_NOTES = 6  # shown in the repr
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseTest:
+    """Test whether a model explains the data to within their noise.
+
+    left: for each state, the residuals of its equation on rows. It is empty if no rows were tested,
+    as after a trajectory search, which tests whole trajectories.
+    misfit: the reason why the model does not explain the data; empty if it does, or if nothing was
+    tested. tested: False if nothing was tested. n_free: for each state named by a relation that
+    holds in the model, the number of free coefficients of its equation.
+    """
+
+    left: Mapping[str, LeftOver] = field(default_factory=dict)
+    misfit: str = ""
+    tested: bool = False
+    n_free: Mapping[str, int] = field(default_factory=dict)
+
+
+@runtime_checkable
+class DiscoveryMethod(Protocol):
+    """Protocol of a method that finds equations from runs: `TrajectorySearch`, or `Regression`.
+
+    selection: the rule that chooses among candidates; it is named in the headline of the result.
+    identify: answers a `Task`. A method of one's own may ask another one:
+
+    >>> class Smallest:
+    ...     selection = ep.Evidence()
+    ...
+    ...     def identify(self, task, *, rng, progress):
+    ...         own = ep.TrajectorySearch(max_terms=2)
+    ...         return own.identify(task, rng=rng, progress=progress)
+    >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
+    >>> list(ep.discover(run, method=Smallest()).model.terms("x"))
+    ['x', 'x*y']
+    """
+
+    @property
+    def selection(self) -> Selection: ...
+
+    def identify(
+        self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
+    ) -> Discovery: ...
+
 
 # What a file may hold beside the values that configs may name.
 STORED = {
@@ -83,7 +127,7 @@ class Discovery:
     chosen: Mapping[str, Candidate]
     model: SparseModel = field(repr=False)
     method: DiscoveryMethod
-    ambiguities: Sequence[Ambiguity]
+    ambiguities: Sequence[Ambiguity] = ()
     noise_test: NoiseTest = field(default_factory=NoiseTest)
     note: str = ""
     remarks: Sequence[str] = ()

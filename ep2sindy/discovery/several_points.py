@@ -10,14 +10,13 @@ from jaxtyping import Float
 
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import as_in
-from ep2sindy.discovery.method import DiscoveryMethod, Regression, TrajectorySearch
-from ep2sindy.discovery.result import Discovery, join_points
+from ep2sindy.discovery.choice import join_choice
+from ep2sindy.discovery.method import Regression, TrajectorySearch
+from ep2sindy.discovery.result import Discovery, DiscoveryMethod, join_points
 from ep2sindy.discovery.shared_support import SharedFront, check_shared, search_shared
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Constraint, Relation
+from ep2sindy.library.relations import Constraint
 from ep2sindy.operating.law import (
-    Known,
     LawConstraint,
     LawFunctions,
     OperatingLaw,
@@ -42,14 +41,13 @@ WINDOWS = RefinementSettings(n_windows=20, periods=2.0, n_reweights=0)
 class PointsTask:
     """What is asked of several operating points together, and the method that answers it.
 
-    points: the runs of each point, by its label. known: coefficients as functions of the
-    parameters. structure: the constraint of terms that a search under roles has found; or None.
+    points: the runs of each point, by its label. structure: the constraint of terms that a search
+    under roles has found; or None.
     Raises ValueError for hidden states, or a method that cannot weigh all points at once.
     """
 
     asked: Task
     points: Mapping[str, Sequence[Trajectory]]
-    known: Known
     method: DiscoveryMethod
     structure: Constraint | None = None
 
@@ -118,12 +116,10 @@ class PointsTask:
         number: int,
     ) -> Discovery:
         model = fits.models[number]
-        own = {front.equation: front.points[label] for front in fronts}
-        return Discovery(
-            fronts=own,
-            chosen={state: as_in(model, front.best) for state, front in own.items()},
+        own = [front.points[label] for front in fronts]
+        return replace(
+            join_choice(own, [front.best for front in own], model, self.regression),
             model=replace(model, clock=self.points[label][0].clock),
-            method=self.regression,
             ambiguities=tuple(dict.fromkeys(a for part in problems for a in ambiguities(part))),
             constraint=fits.relations.at(fits.points[[number]])[0],
         )
@@ -143,14 +139,7 @@ class PointsTask:
     def _fronts(
         self, problems: Mapping[str, Sequence[RegressionRows]], progress: Progress
     ) -> list[SharedFront]:
-        # A term whose coefficient is known is in every support.
-        told = [
-            Relation(((1.0, state, term),), 1.0, "")
-            for state, terms in self.known.items()
-            for term in terms
-        ]
-        task = replace(self.asked, relations=[*self.asked.relations, *told])
-        return search_shared(problems, task, self.regression, progress=progress)
+        return search_shared(problems, self.asked, self.regression, progress=progress)
 
     def _relations(self, fronts: Sequence[SharedFront]) -> LawConstraint:
         """The terms of all points, with their relations."""
@@ -159,8 +148,6 @@ class PointsTask:
         return constrain_law(
             self.asked.library,
             {front.equation: front.chosen for front in fronts},
-            self.asked.relations,
-            self.known,
             parameters=self.parameters,
         )
 

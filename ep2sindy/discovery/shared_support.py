@@ -100,9 +100,9 @@ def _shared_front(
     grams = [problem.train_gram for problem in problems.values()]
     # A term that repeats another at one point may stand for it there, if they differ elsewhere.
     usable = np.any([usable_terms(problem) for problem in problems.values()], axis=0)
-    usable &= task.allowed(equation)
+    usable &= task.library.allowed(equation)
     nothing = found = np.zeros((1, len(usable)), dtype=np.bool_)
-    if equation not in task.terms:
+    if equation not in task.facts.only:
         found = search.shared_supports(
             np.stack([gram.xx * usable[:, None] * usable for gram in grams]),
             np.stack([gram.xy[k] * usable for gram in grams]),

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Process, Relation, constraint
-from ep2sindy.library.roles import Roles
+from ep2sindy.library.relations import Process, constraint
 
 
 class Ties(NamedTuple):
@@ -32,21 +32,16 @@ class Coefficients(NamedTuple):
 def coefficients_of(
     library: Library,
     states: Sequence[str],
-    terms: Mapping[str, Sequence[str]],
-    exclude: Mapping[str, Sequence[str]],
-    relations: Sequence[Relation],
     processes: Sequence[Process],
-    roles: Roles | None,
 ) -> Coefficients:
     """The coefficients of an estimation; see `scale_problem`.
 
     The terms of an equation are those that are known, or all that are not excluded; under roles,
     those that processes or known roles bring into it.
     """
-    barred = {state: {*map(library.index, names)} for state, names in exclude.items()}
+    facts, roles = library.facts, library.facts.roles
     asked = {
-        state: terms.get(state)
-        or [name for k, name in enumerate(library.names) if k not in barred.get(state, ())]
+        state: facts.only.get(state) or list(compress(library.names, library.allowed(state)))
         for state in states
     }
     if roles is not None:
@@ -59,8 +54,8 @@ def coefficients_of(
     ]
     equation, column = np.array(places, dtype=np.int64).reshape(-1, 2).T
     ties = None
-    if relations:
-        held = constraint(library, asked, relations)
+    if facts.relations:
+        held = constraint(library, asked, facts.relations)
         ties = Ties(held.C, held.d, held.free)
     elif roles is not None:
         named = [(states[e], library.names[c]) for e, c in places]

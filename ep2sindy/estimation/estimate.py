@@ -33,11 +33,11 @@ from ep2sindy.estimation.problem import (
 )
 from ep2sindy.estimation.supports import offer_supports, penalise
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.library.relations import Constraint, Relation, relations_of
-from ep2sindy.library.roles import Roles, constraint_of
+from ep2sindy.library.relations import Constraint
+from ep2sindy.library.roles import constraint_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.gram_kernels import invert_gram
-from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
+from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
@@ -137,13 +137,8 @@ def estimate(
     *,
     max_terms: int | None = None,
     align: bool = False,
-    relations: Sequence[Relation | str] = (),
-    terms: Mapping[str, Sequence[str]] | None = None,
-    roles: Roles | None = None,
     hidden: Sequence[str] = (),
-    exclude: Mapping[str, Sequence[str]] | None = None,
     courses: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
     limit_s: float | None = None,
     progress: Progress | bool = False,
@@ -155,15 +150,12 @@ def estimate(
     allows seven, and more where an equation of a large library needs them. align: if True, channels
     found to be late are shifted forward; if False, late channels make the model a misfit, and their
     delays are reported.
-    relations: between coefficients, held in fit and search. terms: for each state whose equation is
-    known but for its coefficients, all terms of that equation. roles: of terms, for equations that
-    conserve what states exchange (`Roles`). hidden: states that nobody measured,
-    which the library has; all ways in which they may enter are compared. exclude: for each state
-    that is named, terms of the library that its equation may not have. courses: input -> how it
-    goes from one sample to the next, "held", "linear" or "smooth"; of others the likeliest course
-    is taken. limit_s: wall time after which the search ends with the best that it has, and says so;
-    of long records it takes parts first. progress: True shows bars, see `Progress`; an interruption
-    (Ctrl-C) then ends the search in the same way.
+    library: with what is known of the equations, as for `discover`. hidden: states that nobody
+    measured, which the library has; all ways in which they may enter are compared. courses: input
+    -> how it goes from one sample to the next, "held", "linear" or "smooth"; of others the
+    likeliest course is taken. limit_s: wall time after which the search ends with the best that it
+    has, and says so; of long records it takes parts first. progress: True shows bars, see
+    `Progress`; an interruption (Ctrl-C) then ends the search in the same way.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.estimate(run, ep.polynomial(["x", "y"], degree=2))
@@ -174,39 +166,22 @@ def estimate(
     more samples than there are or more memory, an unknown input or course, or whatever a `Task`
     refuses.
     """
-    known = trajectories_of(runs, partial=True)
-    task = Task(known, library, relations_of(relations), terms or {}, roles, hidden, exclude or {})
-    return estimate_task(
-        task, max_terms=max_terms, align=align, courses=courses, units=units,
-        provenance=provenance, limit_s=limit_s, progress=as_progress(progress),
-    )  # fmt: skip
-
-
-def estimate_task(
-    task: Task,
-    *,
-    max_terms: int | None,
-    align: bool,
-    courses: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    provenance: Mapping[str, str] | None = None,
-    limit_s: float | None = None,
-    progress: Progress = SILENT,
-) -> Estimate:
-    """Answer a task by `estimate`."""
+    task = Task(trajectories_of(runs, partial=True), library, hidden)
     if max_terms is not None:
         max_terms = check_count("max_terms", max_terms)
     check_limit_s(limit_s)
-    tied = bool(task.relations or task.hidden or task.roles)
-    bytes_each = check_size(task.runs, task.library, task.terms, tied=tied, limit_s=limit_s)
-    monitor, found, part = SearchMonitor(progress, limit_s), None, task.runs
+    facts = task.facts
+    tied = bool(facts.relations or facts.known or facts.roles or task.hidden)
+    bytes_each = check_size(task.runs, task.library, facts.only, tied=tied, limit_s=limit_s)
+    watch = as_progress(progress)
+    monitor, found, part = SearchMonitor(watch, limit_s), None, task.runs
     settings = _Settings(max_terms, align, courses, monitor)
     for larger in growing_parts(task.runs, bytes_each, monitor):
         latest = _answer(replace(task, runs=larger), settings)
         if found is None or not monitor.ended:  # a larger part tells more, once it is done with
             found, part = latest, larger
     assert found is not None
-    answer, runs = found
+    answer, fitted = found
     some, n = (sum(run.n_samples for run in each) for each in (part, task.runs))
     if some < n:
         words = (
@@ -214,13 +189,12 @@ def estimate_task(
             f"record: limit_s={limit_s:g} leaves no time for more, or memory does not hold them"
         )
         answer = replace(answer, remarks=(words, *answer.remarks))
-    library, roles, constraint = task.library, task.roles, None
-    if roles is not None:
-        library = roles.with_known_terms(library, task.states)
+    library, constraint = task.library.with_known_terms(task.states), None
+    if facts.roles is not None:
         played = compress(answer.solution.problem.processes, answer.solution.fit.free != 0.0)
-        constraint = constraint_of(library, task.states, list(played), roles.told)
-    model = _model(answer, library, units or runs[0].units, provenance or {})
-    return replace(_report(answer, model, runs, progress), constraint=constraint)
+        constraint = constraint_of(library, task.states, list(played), facts.roles.told)
+    model = _model(answer, library, fitted[0].units, provenance or {})
+    return replace(_report(answer, model, fitted, watch), constraint=constraint)
 
 
 class _Settings(NamedTuple):
@@ -256,8 +230,7 @@ def _try(
 
     def problem_of(library: Library) -> EstimationProblem:
         return scale_problem(
-            known.runs, library, known.relations, known.terms, measured=measured,
-            exclude=known.exclude, courses=settings.courses, roles=known.roles,
+            known.runs, library, measured=measured, courses=settings.courses,
             monitor=settings.monitor,
         )  # fmt: skip
 
@@ -397,7 +370,7 @@ def _say_too_few(problem: EstimationProblem) -> str:
     return (
         f"{problem.n_samples} samples do not tell which of {n_terms} terms "
         f"({SAMPLES_PER_TERM * n_terms} would): {problem.max_terms} an equation at most were "
-        "tried; name the terms that you know (terms=...), or take a smaller library"
+        "tried; name the terms that you know (Library.only), or take a smaller library"
     )
 
 
@@ -416,6 +389,6 @@ def _open_choice(
         return ""
     return (
         f"{problem.n_samples} samples do not tell these equations from others: the chance that all "
-        f"terms are right is {share:.0%}; name the terms that you know (terms=...), take a smaller "
-        "library, or a longer record"
+        f"terms are right is {share:.0%}; name the terms that you know (Library.only), take a "
+        "smaller library, or a longer record"
     )

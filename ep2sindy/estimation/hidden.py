@@ -12,7 +12,7 @@ Source: Takens 1981, doi:10.1007/BFb0091924, for why one state can show the othe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
 
@@ -65,21 +65,16 @@ class Entrance:
 
 
 def entrances(
-    library: Library,
-    measured: Sequence[str],
-    hidden: Sequence[str],
-    relations: Sequence[Relation],
-    allowed: Callable[[str], Bool[np.ndarray, " terms"]] | None = None,
+    library: Library, measured: Sequence[str], hidden: Sequence[str]
 ) -> list[tuple[Entrance, ...]]:
     """All ways in which hidden states may enter, one entrance for each of them.
 
     A hidden state enters the equation of a state before it, alone or times one of these. The first
     one of a single measured state is its rate or its growth rate, and the next one enters the
     equation of that. A relation that fixes the coefficient of such a term leaves no choice.
-    allowed: mask of the terms that the equation of a state may have; None if it may have all.
     Raises ValueError if there is no term for a hidden state.
     """
-    choices, before = [], list(measured)
+    choices, before, relations = [], list(measured), library.facts.relations
     for name in hidden:
         own = np.zeros(len(library), dtype=np.bool_)
         if name in library.variables:
@@ -89,7 +84,7 @@ def entrances(
             Entrance(name, state, library.names[k])
             for state in shown
             for k in np.flatnonzero(own & (library.degrees <= 2)).tolist()
-            if allowed is None or allowed(state)[k]
+            if library.allowed(state)[k]
         ]
         given = [e for r in relations if (e := _fixed_by(r, name, library, own, before))]
         if not (given or offered):
@@ -111,7 +106,7 @@ def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]
     that takes either sign has a rate.
     """
     measured = task.runs[0].state_names
-    found = entrances(task.library, measured, task.hidden, task.relations, task.allowed)
+    found = entrances(task.library, measured, task.hidden)
     groups = [list(ways) for _, ways in groupby(found, key=lambda ways: ways[0])]
     if len(measured) > 1:
         groups = [found]
@@ -127,14 +122,10 @@ def _insert_guesses(task: Task, ways: Sequence[Entrance]) -> Task:
     The equation of a single measured state has one term, unless others of it are known.
     """
     first, *_ = ways
-    is_rate = len(task.runs[0].state_names) == 1
-    return replace(
-        task,
-        runs=[with_guess(run, task.library, ways) for run in task.runs],
-        relations=(*task.relations, *(way.relation for way in ways if not way.given)),
-        terms={**({first.state: (first.term,)} if is_rate else {}), **task.terms},
-        hidden=(),
-    )
+    library = task.library.relate(*(way.relation for way in ways if not way.given))
+    if len(task.runs[0].state_names) == 1 and first.state not in task.facts.only:
+        library = library.only({first.state: (first.term,)})
+    return Task([with_guess(run, library, ways) for run in task.runs], library)
 
 
 def with_guess(run: Trajectory, library: Library, ways: Sequence[Entrance]) -> Trajectory:

@@ -18,8 +18,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.coefficients import coefficients_of
 from ep2sindy.estimation.cost import SearchMonitor
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Process, Relation
-from ep2sindy.library.roles import Roles
+from ep2sindy.library.relations import Process
 from ep2sindy.model.flow import Steps, ends
 from ep2sindy.model.inputs import Curve, check_courses, curve_through, plausible_courses
 from ep2sindy.model.vector_field import VectorField
@@ -352,32 +351,39 @@ class EstimationProblem:
 
 
 def scale_problem(
-    runs: Sequence[Trajectory], library: Library, relations: Sequence[Relation] = (),
-    terms: Mapping[str, Sequence[str]] | None = None, *, measured: Sequence[str] = (),
-    exclude: Mapping[str, Sequence[str]] | None = None, courses: Mapping[str, str] | None = None,
-    roles: Roles | None = None, monitor: SearchMonitor | None = None,
-) -> EstimationProblem:  # fmt: skip
+    runs: Sequence[Trajectory],
+    library: Library,
+    *,
+    measured: Sequence[str] = (),
+    courses: Mapping[str, str] | None = None,
+    monitor: SearchMonitor | None = None,
+) -> EstimationProblem:
     """Scale records and library, and collect the coefficients that may be in the model.
 
-    relations, terms, roles, exclude: as in `Task`. measured: names of states; empty means all.
-    Inputs that the library does not have are left out; the others are taken by name, in the order
-    of the first run. courses: of inputs between their samples; others have all that these allow.
-    Raises ValueError for an unknown input or course.
+    measured: names of states; empty means all. Inputs that the library does not have are left out;
+    the others are taken by name, in the order of the first run. courses: of inputs between their
+    samples; others have all that these allow.
+    Raises ValueError for an unknown input or course, or coefficients that are known functions of
+    the operating point, of which there are several.
     """
-    states = runs[0].state_names
+    states, point = runs[0].state_names, runs[0].parameters
+    if library.facts.known and any(run.parameters != point for run in runs):
+        raise ValueError(
+            "known coefficients differ between these operating points: estimate one after the "
+            "other, or let ep.discover(runs, library, law=1) find the law of all"
+        )
     inputs = [name for name in runs[0].input_names if name in library.variables]
     allowed = _allow_courses(runs, inputs, courses or {})
-    names, known = [*states, *inputs], terms or {}
-    over = (roles.with_known_terms(library, states) if roles else library).over(names)
+    names, roles = [*states, *inputs], library.facts.roles
+    whole = library.at_operating_point(point).with_known_terms(states)
+    over = replace(whole.over(names), facts=whole.facts)
     size = _rms(runs, names)
     step_s = mean_step(*(run.t for run in runs))
     scaled, numbers = over.scaled(size)
     processes = roles.processes(library, states) if roles else []
-    equation, column, ties = coefficients_of(
-        over, states, known, exclude or {}, relations, processes, roles
-    )
+    equation, column, ties = coefficients_of(over, states, processes)
     to_SI = size[equation] / (numbers[column] * step_s)
-    fixed = np.isin(equation, [states.index(state) for state in known])
+    fixed = np.isin(equation, [states.index(state) for state in library.facts.only])
     problem = EstimationProblem(
         library=scaled,
         term_names=over.names,

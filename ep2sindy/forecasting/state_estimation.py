@@ -184,10 +184,8 @@ def tune_estimator(
             f"{run.n_samples}; pass the record that the model was fitted to, fitted_to=..."
         )
     own = _select_variables(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
-    terms = {state: list(model.terms(state)) for state in model.states}
-    problem = scale_problem(
-        [own], model.library, terms=terms, measured=names, courses=model.courses
-    )
+    known = {state: [*terms] for state in model.states if (terms := model.terms(state))}
+    problem = scale_problem([own], model.library.only(known), measured=names, courses=model.courses)
     paths, free = [record.samples for record in problem.records], _free_of(model, problem)
     # Differences remove what is smooth; those of white noise have a variance of 20.
     differences = np.concatenate([np.diff(path, n=3, axis=0) for path in paths])

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace
-from jaxtyping import Float, Int
-from numpy import ndarray
+from jaxtyping import Bool, Float, Int
 
+from ep2sindy.library.facts import Facts, Known
 from ep2sindy.library.functions import Function, variable_factor
 from ep2sindy.library.names import check_state
+from ep2sindy.library.relations import Relation, relations_of
+from ep2sindy.library.roles import Roles
 from ep2sindy.library.terms import (
     Term,
     check_degrees,
@@ -25,7 +27,7 @@ from ep2sindy.library.terms import (
     product,
     read_term,
 )
-from ep2sindy.runtime.screen import N_LINES, cut, html_table, one_screen, wrap
+from ep2sindy.runtime.screen import N_LINES, cut, html_table, near_words, one_screen, wrap
 from ep2sindy.runtime.values import check_list
 
 
@@ -35,13 +37,26 @@ class Library:
 
     exponents: (terms, variables then functions), non-negative integers; a row of zeros is the
     constant. functions: the factors that are not variables; without them every term is a monomial.
+    facts: what is known of the equations, as `relate`, `only`, `exclude`, `known` and `with_roles`
+    say it; each returns a new library. Models keep the terms alone, and so does `take`.
     Term names read `1`, `n_i`, `n_i*n_n`, `n_i^2`, with factors in the order of `variables`.
-    Raises ValueError for repeated variables or terms, an invalid variable name, or no term.
+    Raises ValueError for repeated variables or terms, an invalid variable name, no term, or facts
+    of unknown terms.
+
+    >>> library = ep.polynomial(["x", "y"], degree=2).exclude({"x": ["x^2"]})
+    >>> library.relate("x: x*y == -1 * y: x*y")
+    Library of 6 terms over x, y
+    1 of degree 0: 1
+    2 of degree 1: x y
+    3 of degree 2: x^2 x*y y^2
+    known: x: x*y == -1 * y: x*y
+    known: x' has no x^2
     """
 
     variables: Sequence[str]
     exponents: Int[np.ndarray, "terms factors"]
     functions: Sequence[Function] = ()
+    facts: Facts = field(default_factory=Facts)
 
     def __post_init__(self) -> None:
         check_list("variables", self.variables)
@@ -58,18 +73,87 @@ class Library:
             raise ValueError("a library needs at least one term: none came")
         if len(set(map(tuple, exponents.tolist()))) < len(exponents):
             raise ValueError(f"terms must be unique: {list(self.names)}")
+        self.facts.check(self)
 
     def __len__(self) -> int:
         return len(self.exponents)
 
     def __add__(self, other: Library) -> Library:
-        """Join two libraries over the same variables; each term appears once, in order."""
+        """Join two libraries over the same variables; each term appears once, in order.
+
+        What is known by both holds.
+        """
         if other.variables != self.variables:
             raise ValueError(
                 f"libraries to be joined must share their variables: {list(self.variables)} "
                 f"against {list(other.variables)}"
             )
-        return library_of(self.variables, [*self.terms, *other.terms])
+        joined = library_of(self.variables, [*self.terms, *other.terms])
+        return replace(joined, facts=self.facts | other.facts)
+
+    def relate(self, *relations: Relation | str) -> Library:
+        """With linear relations between coefficients, "x: x*y == -1 * y: x*y" or "x: y == 1".
+
+        They hold in the search, in the selection and in the model; numbers are in SI.
+        """
+        return self._knowing(Facts(relations=relations_of(relations)))
+
+    def only(self, terms: Mapping[str, Sequence[str]]) -> Library:
+        """With equations that are known but for their coefficients: state -> all of its terms."""
+        return self._knowing(Facts(only=terms))
+
+    def exclude(self, terms: Mapping[str, Sequence[str]]) -> Library:
+        """With terms that an equation may not have, such as {"x": ["x^2"]}."""
+        return self._knowing(Facts(excluded=terms))
+
+    def known(self, coefficients: Known) -> Library:
+        """With coefficients that are known functions of the operating point, in SI.
+
+        Such as {"n_n": {"1": {"mdot_mg_s": 4.6e22}}}, of runs with these `Trajectory.parameters`.
+        """
+        return self._knowing(Facts(known=coefficients))
+
+    def with_roles(self, roles: Roles | None) -> Library:
+        """With roles of terms, for equations that conserve what states exchange; see `Roles`."""
+        return self._knowing(Facts(roles=roles))
+
+    def _knowing(self, more: Facts) -> Library:
+        return replace(self, facts=self.facts | more)
+
+    @cached_property
+    def plain(self) -> Library:
+        """The terms alone, without what is known."""
+        known = any(vars(self.facts).values())
+        return Library(self.variables, self.exponents, self.functions) if known else self
+
+    def allowed(self, state: str) -> Bool[np.ndarray, " terms"]:
+        """Mask of the terms that the equation of a state may have."""
+        mask = np.ones(len(self), dtype=np.bool_)
+        mask[[self.index(name) for name in self.facts.excluded.get(state, ())]] = False
+        return mask
+
+    def at_operating_point(self, parameters: Mapping[str, float]) -> Library:
+        """This library with relations in place of `known`: the numbers at an operating point."""
+        told = []
+        for (state, term), factors in self.facts.known_factors.items():
+            functions = functions_of_point(list(parameters), f"{state}: {term}", factors)
+            values = functions.evaluate(np.array([*parameters.values()]))
+            value = float(values @ np.array([*factors.values()]))
+            told.append(Relation(((1.0, state, term),), value, f"{state}: {term} == {value!r}"))
+        return replace(self, facts=replace(self.facts, known={})).relate(*told) if told else self
+
+    def with_known_terms(self, states: Sequence[str]) -> Library:
+        """With all terms of equations that the roles know; those added stand in no other.
+
+        Raises ValueError for a term of something that is no variable or state.
+        """
+        told = self.facts.roles.known if self.facts.roles else {}
+        missing = dict.fromkeys(term for _, term in told if term not in self.names)
+        if not missing:
+            return self
+        variables = tuple(dict.fromkeys([*self.variables, *states]))
+        more = [read_term(term, variables) for term in missing]
+        return replace(library_of(variables, [*self.terms, *more]), facts=self.facts)
 
     @cached_property
     def terms(self) -> tuple[Term, ...]:
@@ -103,10 +187,31 @@ class Library:
         return table
 
     def __repr__(self) -> str:
-        return library_text(self.variables, self.names, self.degrees)
+        """Terms by degree, and what is known, as text that fits one screen."""
+        lines = [f"Library of {len(self)} terms over {', '.join(self.variables)}"]
+        by_degree = list(self._by_degree.items())
+        for k, (degree, found) in enumerate(by_degree):
+            left = N_LINES - len(lines) - (len(by_degree) - k - 1)
+            head = f"{len(found)} of degree {degree}:"
+            lines += wrap([head, *found], what="terms", n_lines=max(1, min(6, left)))
+        return one_screen([*lines, *(f"known: {line}" for line in self.facts.lines)])
 
     def _repr_html_(self) -> str:
-        return library_html(self.names, self.degrees)
+        """Terms by degree, and what is known, as a table."""
+        rows = [
+            [str(degree), str(len(found)), html.escape(cut(", ".join(found), 1000))]
+            for degree, found in self._by_degree.items()
+        ]
+        rows += [["known", "", html.escape(cut(line, 1000))] for line in self.facts.lines]
+        return html_table(["degree", "terms", ""], rows)
+
+    @property
+    def _by_degree(self) -> dict[int, list[str]]:
+        degrees = self.degrees.tolist()
+        found: dict[int, list[str]] = {degree: [] for degree in sorted(set(degrees))}
+        for name, degree in zip(self.names, degrees, strict=True):
+            found[degree].append(name)
+        return found
 
     def index(self, name: str) -> int:
         """Position of a term; factors may come in any order. Raises ValueError if absent."""
@@ -114,7 +219,10 @@ class Library:
             return self._named[name]
         term = read_term(name, self.variables)
         if term not in self._places:
-            raise ValueError(f"unknown term {name!r}; this library has {list(self.names)}")
+            raise ValueError(
+                f"unknown term {name!r}; this library has {list(self.names)}"
+                f"{near_words(name, self.names)}"
+            )
         return self._places[term]
 
     def places(self, other: Library) -> list[int]:
@@ -126,7 +234,10 @@ class Library:
         return tuple(term.unit(units) for term in self.terms)
 
     def take(self, rows: np.ndarray) -> Library:
-        """Sub-library of some terms, by position or mask, with only the functions they need."""
+        """Sub-library of some terms, by position or mask, with only the functions they need.
+
+        What is known of equations is left out.
+        """
         n, exponents = len(self.variables), self.exponents[rows]
         used = np.flatnonzero(exponents[:, n:].any(axis=0))
         kept, functions = [*range(n), *(n + used)], [self.functions[k] for k in used.tolist()]
@@ -148,7 +259,8 @@ class Library:
         pairs = [f.scaled(s) for f, s in zip(self.functions, own, strict=True)]
         numbers = np.append(scale, [number for number, _ in pairs])
         functions = [function for _, function in pairs]
-        return replace(self, functions=functions), np.prod(numbers**self.exponents, axis=1)
+        scaled = Library(self.variables, self.exponents, functions)
+        return scaled, np.prod(numbers**self.exponents, axis=1)
 
     def evaluate(self, values: Any) -> Any:
         """Evaluate every term at every sample.
@@ -264,6 +376,19 @@ def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:
     return Library(variables, exponents, functions)
 
 
+def functions_of_point(
+    parameters: Sequence[str], coefficient: str, factors: Mapping[str, float]
+) -> Library:
+    """Functions of the parameters by which a coefficient is known. Raises ValueError for others."""
+    try:
+        return named_terms(parameters, list(map(str, factors)))
+    except ValueError as error:
+        raise ValueError(
+            f"the known coefficient {coefficient} must be a sum of functions of "
+            f"{list(parameters)}, the Trajectory.parameters, such as {{p: 2.0}}: {error}"
+        ) from error
+
+
 def named_terms(variables: Sequence[str], names: Sequence[str]) -> Library:
     """Library of exactly these terms, in this order."""
     check_list("variables", variables)
@@ -304,35 +429,3 @@ def polynomial(
     ]
     full = Library(variables, np.array(rows, dtype=np.int64), factors)
     return full + named_terms(variables, products) if products else full
-
-
-# Display of a library, on a screen or in a notebook.
-
-
-def library_text(
-    variables: Sequence[str], names: Sequence[str], degrees: Int[ndarray, " terms"]
-) -> str:
-    """Terms of a library by degree, as text that fits one screen."""
-    lines = [f"Library of {len(names)} terms over {', '.join(variables)}"]
-    by_degree = list(_by_degree(names, degrees).items())
-    for k, (degree, found) in enumerate(by_degree):
-        left = N_LINES - len(lines) - (len(by_degree) - k - 1)
-        head = f"{len(found)} of degree {degree}:"
-        lines += wrap([head, *found], what="terms", n_lines=max(1, min(6, left)))
-    return one_screen(lines)
-
-
-def library_html(names: Sequence[str], degrees: Int[ndarray, " terms"]) -> str:
-    """Terms of a library by degree, as an HTML table."""
-    rows = [
-        [str(degree), str(len(found)), html.escape(cut(", ".join(found), 1000))]
-        for degree, found in _by_degree(names, degrees).items()
-    ]
-    return html_table(["degree", "terms", ""], rows)
-
-
-def _by_degree(names: Sequence[str], degrees: Int[ndarray, " terms"]) -> dict[int, list[str]]:
-    found: dict[int, list[str]] = {degree: [] for degree in sorted(set(degrees.tolist()))}
-    for name, degree in zip(names, degrees.tolist(), strict=True):
-        found[degree].append(name)
-    return found

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ep2sindy.library.library import Library
 from ep2sindy.library.names import NUMBER, PRODUCT, VARIABLE
+from ep2sindy.library.terms import NamedTerms
 from ep2sindy.runtime.values import check_list, read_only
 
 ROUNDING = 1e-12  # a sum this small relative to its addends has cancelled and counts as zero
@@ -179,7 +179,7 @@ class Constraint:
 
 
 def constraint(
-    library: Library,
+    library: NamedTerms,
     support: Mapping[str, Sequence[str]],
     relations: Sequence[Relation | str] = (),
 ) -> Constraint:
@@ -231,7 +231,7 @@ def constraint(
 
 
 def place_of(
-    library: Library, coefficients: Sequence[tuple[str, str]], state: str, term: str, who: str
+    library: NamedTerms, coefficients: Sequence[tuple[str, str]], state: str, term: str, who: str
 ) -> int:
     """Index of the coefficient (state, term); `who`, such as a relation, is named in errors."""
     try:
@@ -281,7 +281,7 @@ def binding(
 
 def complete(
     masks: Bool[np.ndarray, "supports terms"],
-    library: Library,
+    library: NamedTerms,
     equation: str,
     relations: Sequence[Relation],
 ) -> Bool[np.ndarray, "_ terms"]:

@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.library.library import Library, library_of
 from ep2sindy.library.names import factors_of, product_of
 from ep2sindy.library.relations import Constraint, Place, Process
-from ep2sindy.library.terms import read_term
+from ep2sindy.library.terms import NamedTerms, read_term
 from ep2sindy.runtime.values import check_list
 
 KNOWN, FREE, EITHER = "known", "free", "known or free"
@@ -252,7 +251,7 @@ class Roles:
             forward=True,
         )
 
-    def processes(self, library: Library, states: Sequence[str]) -> list[Process]:
+    def processes(self, library: NamedTerms, states: Sequence[str]) -> list[Process]:
         """Every process that is to be found, of those that the library and these roles allow.
 
         Raises ValueError for a role of something that is no state, a term that the library lacks,
@@ -279,7 +278,7 @@ class Roles:
             ]
         return found
 
-    def _played(self, role: Role, library: Library) -> Iterator[Process]:
+    def _played(self, role: Role, library: NamedTerms) -> Iterator[Process]:
         """The processes by which a role may be played."""
         giver, taker, how = role
         if not giver:
@@ -318,19 +317,7 @@ class Roles:
         signed = self.nonnegative or (not role.taker and role.how == FREE)
         return Process(role.name, term, MappingProxyType(factors), one_sign=signed)
 
-    def with_known_terms(self, library: Library, states: Sequence[str]) -> Library:
-        """The library with all terms of the known equations; those added stand in no other.
-
-        Raises ValueError for a term of something that is no variable or state.
-        """
-        missing = [term for _, term in self.known if term not in library.names]
-        if not missing:
-            return library
-        variables = tuple(dict.fromkeys([*library.variables, *states]))
-        more = [read_term(term, variables) for term in dict.fromkeys(missing)]
-        return library_of(variables, [*library.terms, *more])
-
-    def _check(self, library: Library, states: Sequence[str]) -> None:
+    def _check(self, library: NamedTerms, states: Sequence[str]) -> None:
         if unknown := [state for state in self.states if state not in states]:
             raise ValueError(
                 f"roles must name states: {unknown} came, and the states are {list(states)}"
@@ -342,12 +329,11 @@ class Roles:
             )
         if self.inflow:
             library.index("1")
-        names = self.with_known_terms(library, states).names
+        variables = tuple(dict.fromkeys([*library.variables, *states]))
         for _, term in self.known:
-            if term not in names:
+            if (name := read_term(term, variables).name) != term:
                 raise ValueError(
-                    f"a known term must be written as the library does, "
-                    f"{names[library.index(term)]!r}: {term!r} came"
+                    f"a known term must be written as the library does, {name!r}: {term!r} came"
                 )
 
 
@@ -401,7 +387,7 @@ def sum_known(told: Sequence[Process]) -> dict[Place, float]:
 
 
 def constraint_of(
-    library: Library,
+    library: NamedTerms,
     states: Sequence[str],
     processes: Sequence[Process],
     told: Sequence[Process] = (),

@@ -8,12 +8,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import comb, prod
+from typing import Protocol, runtime_checkable
 
 from ep2sindy.library.functions import Function, function_names, function_of
 from ep2sindy.library.names import RECIPROCAL, split_term
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.values import check_count, check_list
 from ep2sindy.trust.memory import check_memory
+
+
+@runtime_checkable
+class NamedTerms(Protocol):
+    """Protocol of a list of terms, as relations and roles need it: a `Library`."""
+
+    @property
+    def variables(self) -> Sequence[str]: ...
+
+    @property
+    def names(self) -> Sequence[str]: ...
+
+    def index(self, name: str) -> int: ...
 
 
 @dataclass(frozen=True)

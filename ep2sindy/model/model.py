@@ -67,6 +67,7 @@ class SparseModel:
     def __post_init__(self) -> None:
         object.__setattr__(self, "states", tuple(self.states))
         object.__setattr__(self, "coef", read_only(self.coef))
+        object.__setattr__(self, "library", self.library.plain)
         names = dict.fromkeys((*self.states, *self.library.variables))
         units = {name: self.units.get(name, "1") for name in names}
         object.__setattr__(self, "units", MappingProxyType(units))

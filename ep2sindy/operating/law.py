@@ -20,8 +20,8 @@ from scipy.special import ndtri
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import point_label
 from ep2sindy.library.equations import equation_text
-from ep2sindy.library.library import Library, named_terms
-from ep2sindy.library.relations import Constraint, Relation, constraint, relations_of
+from ep2sindy.library.library import Library, functions_of_point, named_terms
+from ep2sindy.library.relations import Constraint, Relation, constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_as, read_stored, texts_in
 from ep2sindy.operating.records import check_varying, read_points
@@ -30,10 +30,6 @@ from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.values import read_only
 
 FORMAT = "ep2sindy.OperatingLaw/1"
-
-# State -> term -> function of the parameters -> its factor, as in `OperatingLaw.numbers`.
-Known = Mapping[str, Mapping[str, Mapping[str, float]]]
-NOTHING: Known = MappingProxyType({})
 
 # The degree of polynomials of the parameters, functions of them, or those chosen of many.
 LawFunctions = int | Library | Literal["auto"]
@@ -379,26 +375,21 @@ class LawConstraint:
 def constrain_law(
     library: Library,
     structure: Mapping[str, Sequence[str]],
-    relations: Sequence[Relation | str] = (),
-    known: Known = NOTHING,
     *,
     parameters: Sequence[str],
 ) -> LawConstraint:
-    """Eliminate one coefficient of the structure per relation and per known coefficient.
+    """Eliminate one coefficient of the structure per relation and known coefficient of the library.
 
-    relations: as for `constraint`. known: coefficients as sums of functions of the parameters, in
-    SI, such as `{"n_n": {"1": {"mdot_mg_s": 4.6e22}}}` for an inflow of neutrals.
     Raises ValueError for relations that `constraint` refuses, for a function that is not of the
     parameters or has no finite factor, or if no coefficient is left free.
     """
-    given = relations_of(relations)
+    given = library.facts.relations
     functions = named_terms(list(parameters), ["1"])
     told = {}
-    for state, terms in known.items():
-        for term, factors in terms.items():
-            own = _known_functions(parameters, f"{state}: {term}", factors)
-            functions = functions + own
-            told[state, str(term)] = dict(zip(own.names, factors.values(), strict=True))
+    for (state, term), factors in library.facts.known_factors.items():
+        own = functions_of_point(parameters, f"{state}: {term}", factors)
+        functions = functions + own
+        told[state, term] = dict(zip(own.names, factors.values(), strict=True))
     columns = []
     for name in functions.names:
         # Relations are linear in their values: one function of the parameters at a time.
@@ -429,18 +420,6 @@ def read_coefficients(model: SparseModel, constraint: Constraint) -> Float[np.nd
     """Coefficients of a model in the order of the constraint's."""
     index, states = model.library.index, model.states.index
     return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])
-
-
-def _known_functions(
-    parameters: Sequence[str], coefficient: str, factors: Mapping[str, float]
-) -> Library:
-    try:
-        return named_terms(list(parameters), list(map(str, factors)))
-    except ValueError as error:
-        raise ValueError(
-            f"the known coefficient {coefficient} must be a sum of functions of "
-            f"{list(parameters)}, such as {{{parameters[-1]}: 2.0}}: {error}"
-        ) from error
 
 
 def _text(state: str, term: str, factors: Mapping[str, float]) -> str:

@@ -38,11 +38,11 @@ def search_conserving_systems(
     with these bounds would put another to zero, which is a smaller system. problems: rows of the
     task's library with the terms of known equations, `with_known_terms`.
     Raises ValueError for roles that do not fit the task, or if no system plays them all.
-    Called by `ep.discover(run, roles=roles, method=ep.Regression(selection=ep.FreeRunScore()))`;
-    docs/roles.md shows what comes of it.
+    Called by `ep.discover(run, library.with_roles(roles), method)` for a method such as
+    ep.Regression(selection=ep.FreeRunScore()); docs/roles.md shows what comes of it.
     """
     processes = roles.processes(task.library, task.states)
-    task = replace(task, library=problems[0].library)
+    task = replace(task, library=task.library.with_known_terms(task.states))
     columns, target = _join_rows(problems, task, processes, roles.known)
     norms = column_norms(columns)
     unit = columns / norms

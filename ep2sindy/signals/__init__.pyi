@@ -9,7 +9,5 @@ from ep2sindy.signals.attractor import find_cycle as find_cycle
 from ep2sindy.signals.attractor import mean_cycle as mean_cycle
 from ep2sindy.signals.trace import prepare_signal as prepare_signal
 from ep2sindy.signals.trace import Trace as Trace
-from ep2sindy.signals.embedding import Rate as Rate  # for configs
-from ep2sindy.signals.embedding import LogRate as LogRate  # for configs
-from ep2sindy.signals.embedding import Delays as Delays  # for configs
-from ep2sindy.signals.embedding import embed as embed
+from ep2sindy.signals.embedding import Embedded as Embedded
+from ep2sindy.signals.embedding import embed_alike as embed_alike

@@ -37,7 +37,7 @@ class Delay:
     {'x_lag1': 1.5, 'x_lag2': -1.5}
     >>> t = np.linspace(0.0, 60.0, 601)
     >>> long = delay.along(ep.Trajectory(t, 2.0 + np.sin(t)[:, None], ["x"]))
-    >>> roles = ep.Roles(equations=delay.equations)  # for `ep.discover` of the long run
+    >>> roles = ep.Roles(equations=delay.equations)  # `library.with_roles(roles)` of the long run
     >>> long.state_names, float(long.t[0])
     (('x', 'x_lag1', 'x_lag2', 'x_lag3'), 6.0)
     """

@@ -1,24 +1,24 @@
-"""Embeddings: states made of one signal and its growth rate, its derivative or its past."""
+"""States made of one signal: its growth rate, its derivative or its past."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from types import MappingProxyType
-from typing import Protocol, overload, runtime_checkable
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.gaps import between_gaps
+from ep2sindy.data.runs import Run
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.values import check_count
 from ep2sindy.signals.log_smoother import LogSmoother
 from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import signal_memory_s
-from ep2sindy.signals.trace import Trace
+from ep2sindy.signals.trace import Trace, prepare_signal
 
 # Number of harmonics that the smoothers follow; faster components count as noise. Two states
 # cannot describe more. Ion-transit oscillations, ten times faster, would spoil the derivative.
@@ -39,243 +39,231 @@ CUBIC = 3  # degree of a spline, which needs more samples than that
 # Noise level, in standard deviations of the signal, above which no derivative is taken.
 DROWNED = 0.5
 
+# What the states are, by how they are made.
+SAYS = {
+    "hidden": "the signal and {n} that nobody measured",
+    "rate": "the signal and its growth rate{more}",
+    "derivative": "the signal and its derivative{more}",
+    "delays": f"the signal and itself {DELAY:g} of a period before{{times}}",
+}
 
-@runtime_checkable
-class Embedding(Protocol):
-    """Interface of the embeddings.
 
-    n_states: number of states made of a signal, the signal first. says: description in words.
+@dataclass(frozen=True)
+class Embedding:
+    """How states are made of a signal x.
+
+    how: "rate": x and its growth rate g = d ln x / dt, so that x' = x g is known; x is positive.
+    "derivative": x and its derivative v, so that x' = v is known. "delays": x and x a quarter of a
+    period before, for which no derivative is needed; no equation is known. "hidden": x alone is
+    given, and `discover` finds the other states with their equations.
+    n_states: in all; of more than two, the others are derivatives, g' = h and v' = w, or values two
+    delays before, and so on. harmonics: of the period, which the smoother follows.
+    Raises ValueError for another `how`, fewer than two states, more than five, or harmonics below
+    one.
     """
 
-    @property
-    def n_states(self) -> int: ...
+    how: str
+    n_states: int = 2
+    harmonics: float = HARMONICS
+
+    def __post_init__(self) -> None:
+        if self.how not in SAYS:
+            raise ValueError(f"how must be auto, {', '.join(SAYS)}: {self.how!r} came")
+        if not self.harmonics >= 1.0:
+            raise ValueError(f"harmonics must be one or more: {self.harmonics} came")
+        if not 2 <= check_count("n_states", self.n_states) <= MAX_STATES:
+            raise ValueError(
+                f"n_states must be 2 to {MAX_STATES}: {self.n_states} came; an oscillation needs "
+                "two, and higher derivatives are noise"
+            )
 
     @property
-    def says(self) -> str: ...
+    def says(self) -> str:
+        n = self.n_states - 1
+        more = f", with {n - 1} more derivative{'s'[: n - 2]}" if n > 1 else ""
+        return SAYS[self.how].format(n=n, more=more, times=f", {n} times" if n > 1 else "")
 
-    def embed(self, signal: Trace) -> Embedded: ...
+    def names(self, signal: Trace) -> tuple[str, ...]:
+        """The states. Of hidden ones too, the first is a growth rate if the signal is positive."""
+        x, n = signal.name, self.n_states
+        if self.how == "delays":
+            return x, *(f"{x}_before{k}" for k in ("", *range(2, n)))
+        is_rate = self.how == "rate" or (self.how == "hidden" and signal.is_positive)
+        letters = ("ghkl" if is_rate else "vwuz")[: n - 1]
+        return x, *(name if name != x else f"{name}_rate" for name in letters)
+
+    def embed(self, signal: Trace, reason: str = "set") -> Embedded:
+        """The states of a signal. Raises ValueError for a growth rate of one that is not positive.
+
+        reason: why they are made so, in words.
+        """
+        names, unit = self.names(signal), signal.unit
+        t, states, noise_std = self._states(signal)
+        units = [unit] * len(names)
+        known = {}
+        if self.how in ("rate", "derivative"):
+            of_first = unit if self.how == "derivative" else "1"
+            units[1:] = [unit_product([(of_first, 1), ("s", -k)]) for k in range(1, self.n_states)]
+            known = dict(pairwise(names))
+        if self.how == "rate":
+            known[names[0]] = f"{names[0]}*{names[1]}"
+        own = names[: len(states)]
+        run = replace(
+            signal.run,
+            t=t,
+            states=np.column_stack(states),
+            state_names=own,
+            units=dict(zip(own, units, strict=False)),
+            inputs=np.empty((len(t), 0)),
+        )
+        return Embedded(self, signal, run, names, known, noise_std, reason)
+
+    def _states(self, signal: Trace) -> tuple[np.ndarray, list[np.ndarray], float]:
+        """Times, every state at these, and the standard deviation of the noise in the signal."""
+        t, n = signal.t, self.n_states
+        if self.how == "hidden":
+            return t, [signal.x], float("nan")
+        finest_s = signal.period_s / (2.0 * np.pi * self.harmonics)  # a radian of the highest one
+        coarsest_s = max(signal_memory_s(t, signal.x, kept=KEPT), finest_s)
+        if self.how == "rate":
+            _check_positive(signal)
+            growth = LogSmoother(finest_s, coarsest_s).estimate(t, signal.x)
+            states = [growth.smoothed, *_differentiate(t, growth.log, n)[1:]]
+            return t, states, growth.noise_std
+        smoother = KalmanSmoother(finest_s=finest_s, coarsest_s=coarsest_s)
+        found = smoother.estimate(t, signal.x[:, None])
+        x, noise_std = found.smoothed[:, 0], float(found.noise_std[0])
+        if self.how == "derivative":
+            return t, [x, found.derivative[:, 0], *_differentiate(t, x, n)[2:]], noise_std
+        lags_s = DELAY * signal.period_s * np.arange(1, n)
+        pieces = [(a, b) for a, b in between_gaps(t) if b - a > CUBIC]
+        parts = [_append_past(t[a:b], x[a:b], lags_s) for a, b in pieces]
+        late, states_late = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return late, list(states_late.T), noise_std
 
 
 @dataclass(frozen=True, eq=False)
 class Embedded:
-    """A signal as a trajectory of states, with the equations that are known exactly.
+    """States of a signal, with what is known of their equations.
 
-    embedding: that made the states. relations, terms: in the form that `discover` takes. noise_std:
-    standard deviation of the noise in the signal, in its unit; it includes components faster than
-    the smoother follows. reason: why this embedding was taken, in words.
+    embedding: how they were made. signal: as prepared. run: the states along it, the signal first;
+    hidden ones are not in it. names: of all states. known: state -> the only term of its equation,
+    whose coefficient is one. noise_std: standard deviation of the noise in the signal, in its unit;
+    it includes components faster than the smoother follows. NaN before hidden states are found.
+    reason: why the states are made so, in words.
     """
 
     embedding: Embedding
+    signal: Trace
     run: Trajectory
-    relations: Sequence[str]
-    terms: Mapping[str, Sequence[str]]
+    names: Sequence[str]
+    known: Mapping[str, str]
     noise_std: float
-    reason: str = "set"
+    reason: str
 
     @property
-    def searched(self) -> list[str]:
-        """States whose equations are not known."""
-        return [name for name in self.run.state_names if name not in self.terms]
-
-
-@dataclass(frozen=True)
-class LogRate:
-    """A positive signal x and its growth rate g = d ln x / dt, so that x' = x g is known.
-
-    harmonics: number of harmonics of the period that the smoother follows. n_states: 3 adds the
-    derivative of the growth rate, g' = h, and so on.
-    """
-
-    harmonics: float = HARMONICS
-    n_states: int = 2
-
-    def __post_init__(self) -> None:
-        _check_settings(self)
+    def hidden(self) -> Sequence[str]:
+        """States that nobody measured, as `discover` takes them."""
+        return self.names[len(self.run.state_names) :]
 
     @property
-    def says(self) -> str:
-        return f"the signal and its growth rate{_and_derivatives(self.n_states)}"
-
-    def names(self, signal: str) -> tuple[str, ...]:
-        return _name_chain(signal, "ghkl"[: self.n_states - 1])
-
-    def embed(self, signal: Trace) -> Embedded:
-        """Raises ValueError for a signal that is not positive."""
-        x, g, *higher = self.names(signal.name)
-        if not signal.is_positive:
-            share = 100.0 * float((signal.x <= 0.0).mean())
-            raise ValueError(
-                f"a growth rate needs a positive signal: {x} falls to {signal.x.min():.4g} "
-                f"{signal.unit}, {share:.2g} % of its samples are zero or less, and noise does not "
-                "explain it; take its derivative instead (embedding=rate, ep.signals.Rate()), "
-                "or an offset out of it"
-            )
-        smoother = LogSmoother(**_memory_bounds(signal, self.harmonics))
-        found = smoother.estimate(signal.t, signal.x)
-        states = [found.smoothed, *_differentiate(signal.t, found.log, self.n_states)[1:]]
-        chain = {x: f"{x}*{g}"} | dict(pairwise([g, *higher]))
-        return _assemble(self, signal, "s^-1", states, chain, found.noise_std)
-
-
-@dataclass(frozen=True)
-class Rate:
-    """A signal x of either sign and its derivative v, so that x' = v is known.
-
-    harmonics: number of harmonics of the period that the smoother follows. n_states: 3 adds the
-    derivative of v, v' = w, and so on.
-    """
-
-    harmonics: float = HARMONICS
-    n_states: int = 2
-
-    def __post_init__(self) -> None:
-        _check_settings(self)
+    def relations(self) -> list[str]:
+        return [f"{state}: {term} == 1" for state, term in self.known.items()]
 
     @property
-    def says(self) -> str:
-        return f"the signal and its derivative{_and_derivatives(self.n_states)}"
+    def terms(self) -> dict[str, list[str]]:
+        return {state: [term] for state, term in self.known.items()}
 
-    def names(self, signal: str) -> tuple[str, ...]:
-        return _name_chain(signal, "vwuz"[: self.n_states - 1])
+    def library(
+        self, degree: int = 3, functions: Sequence[str] = (), function_degree: int = 1
+    ) -> Library:
+        """Products of the states up to a degree, and functions, with what is known.
 
-    def embed(self, signal: Trace) -> Embedded:
-        names = self.names(signal.name)
-        smoothed, derivative, noise_std = _smooth(signal, self.harmonics)
-        states = [smoothed, derivative, *_differentiate(signal.t, smoothed, self.n_states)[2:]]
-        unit = unit_product([(signal.unit, 1), ("s", -1)])
-        return _assemble(self, signal, unit, states, dict(pairwise(names)), noise_std)
+        degree, functions, function_degree: see `polynomial`.
+        """
+        library = polynomial(
+            self.names, degree=degree, functions=functions, function_degree=function_degree
+        )
+        return library.relate(*self.relations).only(self.terms)
 
-
-@dataclass(frozen=True)
-class Delays:
-    """A signal and its own delayed values.
-
-    This embedding needs no derivative, but no equation is known beforehand either. The delay is a
-    quarter of the period. n_states: 3 adds the value two delays before, and so on.
-    """
-
-    harmonics: float = HARMONICS
-    n_states: int = 2
-
-    def __post_init__(self) -> None:
-        _check_settings(self)
-
-    @property
-    def says(self) -> str:
-        more = "" if self.n_states == 2 else f", {self.n_states - 1} times"
-        return f"the signal and itself {DELAY:g} of a period before{more}"
-
-    def names(self, signal: str) -> tuple[str, ...]:
-        return signal, *(f"{signal}_before{k}" for k in ("", *range(2, self.n_states)))
-
-    def embed(self, signal: Trace) -> Embedded:
-        smoothed, _, noise_std = _smooth(signal, self.harmonics)
-        lags_s = DELAY * signal.period_s * np.arange(1, self.n_states)
-        parts = [
-            _append_past(signal.t[a:b], smoothed[a:b], lags_s)
-            for a, b in between_gaps(signal.t)
-            if b - a > CUBIC
-        ]
-        t, states = (np.concatenate(each) for each in zip(*parts, strict=True))
-        late = signal.with_samples(t, states[:, 0])
-        return _assemble(self, late, "", list(states.T), {}, noise_std)
+    def along(self, run: Trajectory) -> Trajectory:
+        """The states along other samples of the signal, which are the first column of a run."""
+        return self.embedding.embed(self.signal.with_samples(run.t, run.states[:, 0])).run
 
 
-AnyEmbedding = LogRate | Rate | Delays
-
-
-# The embeddings by the names that settings give them.
-EMBEDDINGS: Mapping[str, Callable[..., AnyEmbedding]] = MappingProxyType(
-    {"log_rate": LogRate, "rate": Rate, "delays": Delays}
-)
-
-
-@overload
-def embed(signal: Trace, *, n_states: int = 2, harmonics: float = HARMONICS) -> Embedded: ...
-@overload
 def embed(
-    signal: Sequence[Trace], *, n_states: int = 2, harmonics: float = HARMONICS
-) -> list[Embedded]: ...
-def embed(
-    signal: Trace | Sequence[Trace], *, n_states: int = 2, harmonics: float = HARMONICS
-) -> Embedded | list[Embedded]:
-    """Embed a signal as states by the embedding that its sign and its noise ask for.
+    run: Run | Trace,
+    how: str = "auto",
+    signal: str | None = None,
+    *,
+    n_states: int = 2,
+    harmonics: float = HARMONICS,
+    decimate: int | str | None = "auto",
+    detrend: bool | str = "auto",
+) -> Embedded:
+    """Make states of one measured signal, so that equations can be found for it.
 
-    signal: one, or the same signal of several runs. These all get one embedding, so that equations
-    of one form can hold for all: the growth rate if the signal is positive in every run, and delays
-    if noise drowns the derivative in one. n_states, harmonics: of the embedding, see `LogRate`.
+    A single first-order equation cannot oscillate, so an oscillating signal needs a second state.
+    run: a run as `discover` takes it, or a signal that is prepared (`prepare_signal`). how: "rate",
+    "derivative", "delays" or "hidden", see `Embedding`; "auto" takes the growth rate of a positive
+    signal and the derivative of any other, or delays if noise drowns the derivative. signal: the
+    variable; None takes the only state. n_states, harmonics: see `Embedding`. decimate, detrend:
+    see `prepare_signal`.
+    Raises ValueError for a signal that does not oscillate, or holds under six periods or under six
+    samples a period, and for settings that do not suit it.
+
+    >>> t = np.linspace(0.0, 60.0, 1201)
+    >>> states = ep.embed((t, np.sin(t)))
+    >>> states.run.state_names, states.known
+    (('x', 'v'), {'x': 'v'})
+    >>> found = ep.discover(states.run, states.library(degree=1), ep.Regression())
+    >>> round(found.model.terms("v")["x"], 2)
+    -1.0
+    """
+    if not isinstance(run, Trace):
+        run = prepare_signal(run, signal, decimate=decimate, detrend=detrend)
+    return embed_alike([run], how, n_states=n_states, harmonics=harmonics)[0]
+
+
+def embed_alike(
+    signals: Sequence[Trace], how: str = "auto", *, n_states: int = 2, harmonics: float = HARMONICS
+) -> list[Embedded]:
+    """Make states of the same signal of several runs, by one embedding.
+
+    Equations of one form can then hold for all. "auto" takes the growth rate if the signal is
+    positive in every run, and delays if noise drowns the derivative in one.
+    signals: as prepared. how, n_states, harmonics: see `embed`.
     Raises ValueError for no signal.
     """
-    if isinstance(signal, Trace):
-        return embed([signal], n_states=n_states, harmonics=harmonics)[0]
-    if not signal:
+    if not signals:
         raise ValueError("an embedding needs a signal or more: an empty list came")
-    name = signal[0].name
-    if all(each.is_positive for each in signal):
-        log_rate = LogRate(harmonics, n_states)
-        return [replace(log_rate.embed(each), reason=f"{name} is positive") for each in signal]
-    either, rate = f"{name} takes either sign", Rate(harmonics, n_states)
-    found = [replace(rate.embed(each), reason=either) for each in signal]
-    share = max(
-        own.noise_std / float(each.x.std()) for own, each in zip(found, signal, strict=True)
-    )
+
+    def make(how: str, reason: str) -> list[Embedded]:
+        embedding = Embedding(how, n_states, harmonics)
+        return [embedding.embed(each, reason) for each in signals]
+
+    if how != "auto":
+        return make(how, "set")
+    name = signals[0].name
+    if all(each.is_positive for each in signals):
+        return make("rate", f"{name} is positive")
+    either = f"{name} takes either sign"
+    found = make("derivative", either)
+    share = max(each.noise_std / float(each.signal.x.std()) for each in found)
     if share <= DROWNED:
         return found
-    delays = Delays(harmonics, n_states)
-    reason = f"{either}, and noise is {share:.2f} of its standard deviation"
-    return [replace(delays.embed(each), reason=reason) for each in signal]
+    return make("delays", f"{either}, and noise is {share:.2f} of its standard deviation")
 
 
-def _smooth(signal: Trace, harmonics: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Kalman-smoothed signal, its derivative, and the noise; follows at most `harmonics`."""
-    smoother = KalmanSmoother(**_memory_bounds(signal, harmonics))
-    found = smoother.estimate(signal.t, signal.x[:, None])
-    return found.smoothed[:, 0], found.derivative[:, 0], float(found.noise_std[0])
-
-
-def _memory_bounds(signal: Trace, harmonics: float) -> dict[str, float]:
-    """Bounds on the memory of a smoother, in s, by the period and by the spectrum of the signal.
-
-    The finest is the time in which the highest harmonic advances by one radian.
-    """
-    finest_s = signal.period_s / (2.0 * np.pi * harmonics)
-    coarsest_s = signal_memory_s(signal.t, signal.x, kept=KEPT)
-    return {"finest_s": finest_s, "coarsest_s": max(coarsest_s, finest_s)}
-
-
-def _assemble(
-    embedding: AnyEmbedding, signal: Trace, rate_unit: str, states: Sequence[np.ndarray],
-    chain: Mapping[str, str], noise_std: float,
-) -> Embedded:  # fmt: skip
-    """States of a signal, with the equations that are known.
-
-    rate_unit: unit of the second state, of which those after it are derivatives; empty if all have
-    the signal's. chain: state -> the only term of its equation, whose coefficient is one.
-    """
-    names = embedding.names(signal.name)
-    rates = [unit_product([(rate_unit or signal.unit, 1), ("s", -k)]) for k in range(len(names))]
-    units = [signal.unit, *rates] if rate_unit else [signal.unit] * len(names)
-    run = Trajectory(
-        t=signal.t,
-        states=np.column_stack(states),
-        state_names=names,
-        units=dict(zip(names, units, strict=False)),
-        label=signal.name,
-        clock=signal.clock,
-        parameters=signal.parameters,
+def _check_positive(signal: Trace) -> None:
+    if signal.is_positive:
+        return
+    share = 100.0 * float((signal.x <= 0.0).mean())
+    raise ValueError(
+        f"a growth rate needs a positive signal: {signal.name} falls to {signal.x.min():.4g} "
+        f"{signal.unit}, {share:.2g} % of its samples are zero or less, and noise does not explain "
+        "it; take its derivative instead (derivative), or an offset out of it"
     )
-    relations = tuple(f"{state}: {term} == 1" for state, term in chain.items())
-    terms = {state: (term,) for state, term in chain.items()}
-    return Embedded(embedding, run, relations, terms, noise_std)
-
-
-def _name_chain(signal: str, letters: str) -> tuple[str, ...]:
-    """Names of the states, changed where the signal already has one."""
-    return signal, *(name if name != signal else f"{name}_rate" for name in letters)
-
-
-def _and_derivatives(n_states: int) -> str:
-    return "" if n_states == 2 else f", with {n_states - 2} more derivative{'s'[: n_states - 3]}"
 
 
 def _append_past(t: np.ndarray, x: np.ndarray, lags_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -291,17 +279,7 @@ def _differentiate(t: np.ndarray, x: np.ndarray, n: int) -> list[np.ndarray]:
     return [x, *(spline.derivative(order)(t) for order in range(1, n))]
 
 
-def _check_settings(embedding: LogRate | Rate | Delays) -> None:
-    if not embedding.harmonics >= 1.0:
-        raise ValueError(f"harmonics must be one or more: {embedding.harmonics} came")
-    if not 2 <= check_count("n_states", embedding.n_states) <= MAX_STATES:
-        raise ValueError(
-            f"n_states must be 2 to {MAX_STATES}: {embedding.n_states} came; an oscillation needs "
-            "two, and higher derivatives are noise"
-        )
-
-
-def unexplained(signal: Trace, embedding: AnyEmbedding) -> float:
+def unexplained(states: Embedded) -> float:
     """Share of the next state's variance that neighbours in the given states do not explain.
 
     The next state, such as a further derivative, is a function of the given ones if these are
@@ -311,17 +289,17 @@ def unexplained(signal: Trace, embedding: AnyEmbedding) -> float:
     """
     from scipy.spatial import cKDTree  # imported only to count states
 
-    wider = replace(embedding, n_states=embedding.n_states + 1)
-    run = wider.embed(signal).run
+    signal, own = states.signal, states.embedding
+    run = replace(own, n_states=own.n_states + 1).embed(signal).run
     inner = slice(EDGE, run.n_samples - EDGE)  # derivatives are poor at the ends
-    states = run.states[inner] - run.states[inner].mean(axis=0)
-    states = states / states.std(axis=0)
-    states = states[np.linspace(0, len(states) - 1, min(len(states), MAX_POINTS)).astype(int)]
-    apart = 0.5 * signal.period_s / (run.dt_s * run.n_samples) * len(states)
-    known, following = states[:, :-1], states[:, -1]
-    n_asked = min(len(states), N_NEIGHBOURS + 2 * int(apart) + 1)
+    values = run.states[inner] - run.states[inner].mean(axis=0)
+    values = values / values.std(axis=0)
+    values = values[np.linspace(0, len(values) - 1, min(len(values), MAX_POINTS)).astype(int)]
+    apart = 0.5 * signal.period_s / (run.dt_s * run.n_samples) * len(values)
+    known, following = values[:, :-1], values[:, -1]
+    n_asked = min(len(values), N_NEIGHBOURS + 2 * int(apart) + 1)
     _, places = cKDTree(known).query(known, k=n_asked)
-    far = np.abs(places - np.arange(len(states))[:, None]) > apart
+    far = np.abs(places - np.arange(len(values))[:, None]) > apart
     order = np.cumsum(far, axis=1)
     used = far & (order <= N_NEIGHBOURS)
     means = (following[places] * used).sum(axis=1) / np.maximum(used.sum(axis=1), 1)

@@ -94,7 +94,7 @@ class LogSmoother:
         if not mean > 0.0:
             raise ValueError(
                 f"a signal must be positive for its logarithm to be taken: its mean is {mean:.3g}; "
-                "take its derivative instead (ep.signals.Rate)"
+                'take its derivative instead, ep.embed(run, "derivative")'
             )
         y, process = x / mean, WienerProcess.at(steps, lumped=True)
         limits = (LOG10_RATIO_MIN, LOG10_RATIO_MAX)

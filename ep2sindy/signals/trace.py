@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.gaps import between_gaps, mean_step
+from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.values import read_only
@@ -105,9 +106,22 @@ class Trace:
     def is_positive(self) -> bool:
         return is_positive(self.t, self.x)
 
+    @property
+    def run(self) -> Trajectory:
+        """The signal as a run of one state."""
+        return Trajectory(
+            t=self.t,
+            states=self.x[:, None],
+            state_names=(self.name,),
+            units={self.name: self.unit},
+            label=self.name,
+            clock=self.clock,
+            parameters=self.parameters,
+        )
+
 
 def prepare_signal(
-    run: Trajectory,
+    run: Run,
     signal: str | None = None,
     *,
     decimate: int | str | None = "auto",
@@ -115,11 +129,11 @@ def prepare_signal(
 ) -> Trace:
     """Make a trace of one variable of a run.
 
-    signal: None takes the only state. decimate: number of samples that are replaced by their
-    mean; "auto" leaves a hundred per period, None leaves all. detrend: whether to subtract the
-    straight line that the signal follows beside its cycle, and keep the mean; "auto" does so if the
-    line is certain, and large beside the troughs of a positive signal or beside the standard
-    deviation of any other.
+    run: as `discover` takes it. signal: None takes the only state. decimate: number of samples that
+    are replaced by their mean; "auto" leaves a hundred per period, None leaves all. detrend:
+    whether to subtract the straight line that the signal follows beside its cycle, and keep the
+    mean; "auto" does so if the line is certain, and large beside the troughs of a positive signal
+    or beside the standard deviation of any other.
     Raises ValueError for a signal that does not oscillate, under six periods or under six samples a
     period, or a wrong setting.
 
@@ -127,6 +141,7 @@ def prepare_signal(
     >>> ep.signals.prepare_signal(ep.Trajectory(t, 3 + np.sin(6e4*t)[:, None], ["I"])).is_positive
     True
     """
+    run = trajectory_of(run)
     name = run.state_names[0] if signal is None and len(run.state_names) == 1 else signal
     if name is None:
         raise ValueError(f"one signal must be named: this run has {list(run.names)}")

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.living import balance_figure
@@ -17,12 +15,14 @@ from ep2sindy.library.relations import Constraint, constraint
 from ep2sindy.library.roles import constraint_of
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
-from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
+from ep2sindy.model.stability import LimitCycle
+from ep2sindy.report.report import Report
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
 from ep2sindy.studies.processes import ComparedProcess, compared_processes, ends_of
 from ep2sindy.studies.source import IONS, NEUTRALS, Zones
+from ep2sindy.studies.views import largest
 
 CAPTION = (
     "What zones gain or lose by each process, over two periods: in the record (grey), and by "
@@ -31,6 +31,10 @@ CAPTION = (
 NOTE = (
     "Rates are means over the record; the model's are its terms at the record's densities. R2: of "
     "the model's rate against the record's, sample by sample."
+)
+COUNTERPARTS = (
+    "By the record: the coefficients of the same terms by least squares of the recorded process on "
+    "them, with its R2 at each instant."
 )
 
 
@@ -57,8 +61,7 @@ class TermRole:
     part: what it is a term of: a process in words, or the state whose equation holds it. is_known:
     whether nothing was fitted, so that it is not left out. without: free run of the model refined
     without the process, or without the coefficient in all of its equations; None if it is known or
-    cannot be refined. counterpart: the coefficient by least squares of the recorded process on all
-    of the model's terms for it, with fit_r2; NaN if the record does not give it.
+    cannot be refined. process: of the term, whose counterpart the record may give.
     """
 
     part: str
@@ -66,48 +69,40 @@ class TermRole:
     coef: float
     is_known: bool
     without: Evaluation | None
-    counterpart: float = float("nan")
-    fit_r2: float = float("nan")
+    process: ComparedProcess | None = None
+
+    @property
+    def counterpart(self) -> float:
+        """The coefficient by least squares of the recorded process on all of its terms, or NaN."""
+        return np.nan if self.process is None else self.process.counterpart.get(self.term, np.nan)
 
     @property
     def ratio(self) -> float:
-        return self.coef / self.counterpart if self.counterpart else float("nan")
+        return self.coef / (self.counterpart or np.nan)
 
     @property
-    def verdict(self) -> str:
+    def status(self) -> str:
         """What becomes of the model without the term, in words."""
         if self.is_known:
             return "known"
         return self.without.text if self.without else "cannot be refined"
 
 
-COEFFICIENT: Metrics[TermRole] = [
+TERMS: Metrics[TermRole] = [
+    Metric("part", lambda role: role.part, View.SHOWN, "process or equation of"),
     Metric("term", lambda role: role.term, View.SHOWN),
     Metric("coefficient", lambda role: role.coef, View.SHOWN),
-]
-LEFT_OUT: Metrics[TermRole] = [
-    Metric("without_verdict", lambda role: role.verdict, View.SHOWN, "without it"),
-    Metric("without_f_error", lambda role: role.without.f_error if role.without else np.nan),
+    Metric("counterpart", lambda role: role.counterpart, View.SHOWN, "by the record"),
+    Metric("ratio", lambda role: role.ratio, View.SHOWN, format="{:.2f}"),
+    Metric("fit_r2", lambda r: r.process and r.process.fit_r2, View.SHOWN, "its R2", "{:.3f}"),
+    Metric("without_status", lambda role: role.status, View.SHOWN, "without it"),
+    Metric("without_f_error", lambda role: role.without and role.without.f_error),
     Metric(
         "without_waveform_error",
-        lambda role: max(role.without.waveform_error.values()) if role.without else np.nan,
+        lambda role: role.without and largest(role.without.waveform_error),
         View.SHOWN, "waveform", "{:.3f}",
     ),
 ]  # fmt: skip
-BY_PROCESS: Metrics[TermRole] = [
-    Metric("process", lambda role: role.part, View.SHOWN),
-    *COEFFICIENT,
-    Metric("counterpart", lambda role: role.counterpart, View.SHOWN, "by the record"),
-    Metric("ratio", lambda role: role.ratio, View.SHOWN, format="{:.2f}"),
-    Metric("fit_r2", lambda role: role.fit_r2, View.SHOWN, "its R2", "{:.3f}"),
-    *LEFT_OUT,
-]
-BY_EQUATION: Metrics[TermRole] = [
-    Metric("state", lambda role: role.part),
-    Metric("equation", lambda role: f"{role.part}'", View.SCREEN),
-    *COEFFICIENT,
-    *LEFT_OUT,
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,51 +115,30 @@ class ModelBalance:
 
     processes: Sequence[ComparedProcess]
     terms: Sequence[TermRole]
-    data: Trajectory = field(repr=False)
-    period_s: float | None = None
 
-    @property
-    def _of_terms(self) -> Metrics[TermRole]:
-        return BY_PROCESS if self.processes else BY_EQUATION
 
-    def tables(self, name: str) -> dict[str, pd.DataFrame]:
-        found = {f"terms_{name}": ResultTable(self.terms, self._of_terms).csv()}
-        if self.processes:
-            found[f"balance_{name}"] = ResultTable(self.processes, PROCESSES).csv()
-        return found
+def add_balance(
+    report: Report, name: str, found: ModelBalance, data: Trajectory, cycle: LimitCycle | None
+) -> None:
+    """Add the processes, then one row per term, and the model without it.
 
-    def figures(self, name: str) -> dict[str, Captioned]:
-        rows = [each for each in self.processes if each.recorded is not None]
-        if not rows or self.period_s is None:
-            return {}
-        shown = self.data.t - self.data.t[0] <= 2.0 * self.period_s
-        parts = {each.name: (each.recorded[shown], each.modelled[shown]) for each in rows}  # type: ignore[index]
-        draw = partial(balance_figure, self.data.t[shown], parts, clock=self.data.clock)
-        return {f"balance_{name}": Captioned(draw, CAPTION)}
-
-    def section(self, name: str) -> Section:
-        """The processes, then one row per term, and the model without it."""
-        blocks: list[Block] = []
-        if self.processes:
-            rows = ResultTable(self.processes, PROCESSES).screen()
-            blocks.append(Table(rows, title="what is exchanged, in record and model", note=NOTE))
-        rows = ResultTable(self.terms, self._of_terms).screen()
-        blocks.append(Table(rows, title="each term by its process, and left out"))
-        if any(np.isfinite(each.counterpart) for each in self.terms):
-            blocks.append(Text(
-                "By the record: the coefficients of the same terms by least squares of the "
-                "recorded process on them, with its R2 at each instant."
-            ))  # fmt: skip
-        return Section(
-            f"{name}: what the terms mean", [*blocks, *pictures(self.figures(name))], level=3
-        )
-
-    def summary(self) -> dict[str, Any]:
-        """The entry in `summary.json`."""
-        return {
-            "processes": [facts(each, PROCESSES) for each in self.processes],
-            "terms": [facts(role, self._of_terms) for role in self.terms],
-        }
+    name: of the library. data: samples of the processes. cycle: of the model; without one there is
+    no figure.
+    """
+    report.section(f"{name}: what the terms mean", level=3)
+    if found.processes:
+        title = "what is exchanged, in record and model"
+        rows = ResultTable(found.processes, PROCESSES)
+        report.table(f"balance_{name}", rows, title=title, note=NOTE)
+    known = [each for each in found.processes if each.recorded is not None]
+    if known and cycle is not None:
+        shown = data.t - data.t[0] <= 2.0 * cycle.period_s
+        parts = {each.name: (each.recorded[shown], each.modelled[shown]) for each in known}  # type: ignore[index]
+        draw = partial(balance_figure, data.t[shown], parts, clock=data.clock)
+        report.figure(f"balance_{name}", draw, CAPTION)
+    note = COUNTERPARTS if any(np.isfinite(each.counterpart) for each in found.terms) else ""
+    title = "each term by its process, and left out" if found.processes else "each term left out"
+    report.table(f"terms_{name}", ResultTable(found.terms, TERMS), title=title, note=note)
 
 
 def model_balance(
@@ -176,13 +150,12 @@ def model_balance(
     zones: Zones,
     bounds: FreeRunBounds,
     *,
-    period_s: float | None,
     progress: Progress = SILENT,
 ) -> ModelBalance:
     """Compare a model with the balance of its zone, and leave out each of its terms in turn.
 
     held_to: what the model's coefficients obey; None if they are free. Models without a term are
-    refined on `train` and run over `held`. period_s: of the model's cycle, for the figure.
+    refined on `train` and run over `held`.
     """
     support = {state: list(model.terms(state)) for state in model.states}
     held_to = held_to or constraint(model.library, support)
@@ -196,7 +169,7 @@ def model_balance(
         _without(model, less, train, held, bounds, progress, window=window)
         for less in count_pieces(progress, lesser, "coefficient", "models without a term")
     ]
-    return ModelBalance(processes, _roles(model, held_to, processes, left_out), data, period_s)
+    return ModelBalance(processes, _roles(model, held_to, processes, left_out))
 
 
 def _roles(
@@ -218,8 +191,8 @@ def _roles(
     for each in processes:
         for term, coef in each.coef.items():
             k = by_process.get((each.ends, term))
-            run, beside = None if k is None else left_out[k], each.counterpart.get(term, np.nan)
-            found.append(TermRole(each.name, term, coef, k is None, run, beside, each.fit_r2))
+            run = None if k is None else left_out[k]
+            found.append(TermRole(each.name, term, coef, k is None, run, each))
     return found
 
 

@@ -20,7 +20,8 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import DiscoveryMethod, Finding
+from ep2sindy.discovery.method import Finding
+from ep2sindy.discovery.result import DiscoveryMethod
 from ep2sindy.figures.identified import (
     COUNTS,
     MERITS,

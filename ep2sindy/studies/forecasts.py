@@ -1,4 +1,4 @@
-"""Forecasts in studies: the sentence, the table, the figure and the summary of a skill."""
+"""Forecasts in studies: their section with its sentence, table and figure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.series import forecast_figure
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
+from ep2sindy.report.document import Table
+from ep2sindy.report.report import Report
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.studies.source import LEAST_SAMPLES, is_short
 
@@ -43,21 +44,18 @@ def skill_of(
     return forecast_skill(model, run, n_fitted=n_fitted, starts=starts, progress=progress)
 
 
-def forecast_section(
-    skill: ForecastSkill, name: str = "forecast", *, title: str = "Forecasts"
-) -> Section:
-    """How far ahead the model forecasts, beside baselines."""
-    blocks: list[Block] = [Text(f"forecasts: {skill.text}"), _table(skill)]
-    return Section(title, [*blocks, *pictures([name])])
+def add_forecasts(
+    report: Report, name: str, run: Trajectory, skill: ForecastSkill, *, title: str = "Forecasts"
+) -> None:
+    """Add how far ahead a model forecasts, beside baselines: a part of the section before.
 
-
-def forecast_picture(run: Trajectory, skill: ForecastSkill) -> Captioned:
-    return Captioned(partial(forecast_figure, run, skill), CAPTION)
-
-
-def forecast_errors(skill: ForecastSkill) -> pd.DataFrame:
-    """Every error by horizon, for a CSV."""
-    return pd.DataFrame({"horizon_s": skill.horizons_s, **skill.nrmse})
+    name: of the model, which names the files.
+    """
+    report.section(title, f"forecasts: {skill.text}", _table(skill), level=3)
+    report.figure(f"forecast_{name}", partial(forecast_figure, run, skill), CAPTION)
+    errors = pd.DataFrame({"horizon_s": skill.horizons_s, **skill.nrmse})
+    report.samples(f"forecast_{name}", errors)
+    report.summary.setdefault("forecasts", {})[name] = skill.summary()
 
 
 def _table(skill: ForecastSkill) -> Table:
@@ -67,15 +65,12 @@ def _table(skill: ForecastSkill) -> Table:
     last = float(skill.horizons_s[-1]) / unit_s
     asked = SHOWN_PERIODS if in_periods else (1.0, 2.0, 4.0, 8.0, 16.0)
     shown = [each for each in asked if each <= 1.02 * last] or [last]
-    rows = {
-        f"{each:g} {'period' if in_periods else 'sample'}{'s' if each > 1 else ''} ahead": {
-            name: f"{value:.3f}" for name, value in skill.at(each * unit_s).items()
-        }
-        for each in shown
-    }
-    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("horizon").reset_index()
+    rows = pd.DataFrame([skill.at(each * unit_s) for each in shown])
+    unit = "period" if in_periods else "sample"
+    ahead = [f"{each:g} {unit}{'s' if each > 1 else ''} ahead" for each in shown]
+    rows.insert(0, "horizon", ahead)
     return Table(
-        table,
+        rows,
         title="error of forecasts (standard deviations)",
         note=f"{skill.n_starts} starts, each fitted to the past alone; the bands of 90 % hold "
         f"{100.0 * skill.coverage_90:.0f} % of the samples.",

@@ -6,80 +6,64 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.quantities import KNOWN_UNITS
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression
-from ep2sindy.figures.fronts import front_figure
-from ep2sindy.forecasting.evaluation import Evaluation, evaluate
-from ep2sindy.forecasting.skill import ForecastSkill
+from ep2sindy.forecasting.evaluation import evaluate
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
 from ep2sindy.model.comparison import samples_in
-from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Block, Captioned, Result, Section, Table, Text, pictures
+from ep2sindy.report.document import Table, Text
+from ep2sindy.report.report import Report
 from ep2sindy.report.results import ResultTable
-from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
-from ep2sindy.signals.smoothers import Smoother
-from ep2sindy.studies.balance import ModelBalance, model_balance
-from ep2sindy.studies.fits import Terms, n_before, split_in_time
-from ep2sindy.studies.forecasts import (
-    forecast_errors,
-    forecast_picture,
-    forecast_section,
-    skill_of,
-    why_none,
+from ep2sindy.studies.balance import add_balance, model_balance
+from ep2sindy.studies.candidates import (
+    add_candidates,
+    add_estimate,
 )
+from ep2sindy.studies.forecasts import add_forecasts, skill_of, why_none
 from ep2sindy.studies.library_result import (
-    RECORDS,
     LibraryResult,
-    frequencies,
-    left_over_of_all,
+    add_records,
+    add_tables,
+    find_best,
     refit,
-    run_refitted,
-)  # fmt: skip
-from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
-from ep2sindy.studies.source import NO_ZONES, Sampling, Source, Zones, data_summary, zones_of
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts
+    refitted_model,
+)
+from ep2sindy.studies.living import LivingSearch, add_living, living_model
+from ep2sindy.studies.source import (
+    NO_ZONES,
+    Sampling,
+    Source,
+    Zones,
+    n_before,
+    split_in_time,
+    zones_of,
+)
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Terms, ZeroOrMore
 from ep2sindy.studies.views import (
+    EVALUATED,
+    EVALUATION,
     FROM_DERIVATIVES,
-    INTEGRATED,
     PlotRange,
-    best_run,
-    display_equation,
-    found_model,
-    interval_table,
-    rollout_tables,
-    run_figures,
-    trajectories,
-    worst_run,
+    add_figures,
+    add_samples,
 )
 from ep2sindy.trust.user_code import load_user_module
 
-FIGURES = ("data", "trajectories", "trajectories_thesis", "derivatives", "phase")
-THESIS = "The same with the thesis's terms, fitted to these data."
-FRONT = (
-    "Error against number of terms: every support that the search proposed, and the best of each "
-    "size; the star is selected. Carets at the upper edge: models far worse than none."
-)
-SCORED = (
-    "Score against number of terms, the best of each size; the star is selected. States and "
-    "coefficients were estimated together: there are no rows to have an error."
-)
+FIGURES = ("data", "trajectories", "derivatives", "phase")
 HELD_OUT = 0.25  # share of a record on which a model that lives is tested, unless a config says
-EVERY_RECORD = "the selected models, integrated from the first sample of every record"
 _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
 
@@ -147,7 +131,7 @@ class Study:
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: ShareOrNone = None
-    forecasts: Starts = 0
+    forecasts: ZeroOrMore = 0
     hidden: Sequence[str] = ()
     relations: Sequence[str] = ()
     exclude: Terms | None = None
@@ -165,40 +149,28 @@ class Study:
                 f"exclude={dict(self.exclude)} came; take +exp=discover"
             )
 
-    def compute(self, run: Run) -> Outcome:
-        with run.progress(None, "", "data"):
-            opened = self.source.fields()
-        chosen = self._served_by(opened[0], run)
-        methods = {name: case.method(self.method) for name, case in chosen.items()}
-        sampling = self.source.trajectory
-        seen = [case.library(opened[0], sampling) for case in chosen.values()]
-        runs = [self.source.sampled(field, seen, run) for field in opened]
-        libraries = {
-            name: case.library(opened[0], sampling, self.hidden) for name, case in chosen.items()
-        }
-        if len(runs) > 1:
-            run.say(f"{len(runs)} records in one search; figures show the first")
-        if not self.hidden and (hint := alone(runs[0])):
-            run.warn(hint)
-        n_fitted = n_before(runs[0], self.held_out or HELD_OUT)
-        if self.forecasts and (reason := why_none(runs[0], n_fitted)):
-            run.say(reason)
+    def run(self, report: Report) -> None:
+        with report.progress(None, "", "data"):
+            fields = self.source.fields()
+        cases = self._served_by(fields[0], report)
+        runs = self._records(fields, cases, report)
         # Each case has its own random stream, so that adding a case changes no other.
-        streams = np.random.default_rng(run.seed).spawn(len(libraries))
-        pairs = list(zip(libraries.items(), streams, strict=True))
-        zones = NO_ZONES if self.living is None else zones_of(self.source, opened[0], run)
-        watch = run.watch
-        results = {
-            name: self._result(runs, name, library, methods[name], zones, rng=rng, progress=watch)
-            for (name, library), rng in count_pieces(watch, pairs, "library")
-        }
-        files = [str(field.attrs.get("file", "")) for field in opened]
-        estimated = [result.discovery.estimate for result in results.values()]
-        with_hidden = [found.runs[0] for found in estimated if found and self.hidden]
-        data = (with_hidden or runs)[0]
-        return Outcome(data, results, self.figures, self.formulation.smoother, files)
+        streams = np.random.default_rng(report.seed).spawn(len(cases))
+        pairs = list(zip(cases.items(), streams, strict=True))
+        zones = NO_ZONES if self.living is None else zones_of(self.source, fields[0], report)
+        results = {}
+        for (name, case), rng in count_pieces(report.watch, pairs, "library"):
+            library = case.library(fields[0], self.source.trajectory, self.hidden)
+            results[name] = self._result(
+                runs, library, case.method(self.method), self.thesis.get(name, {}), zones,
+                rng=rng, progress=report.watch,
+            )  # fmt: skip
+        files = [str(field.attrs.get("file", "")) for field in fields]
+        estimates = [result.discovery.estimate for result in results.values()]
+        estimated = [found.runs[0] for found in estimates if found and self.hidden]
+        self._tell(report, [*estimated, runs[0]][0], results, files)
 
-    def _served_by(self, field: xr.Dataset, run: Run) -> dict[str, LibraryCase]:
+    def _served_by(self, field: xr.Dataset, report: Report) -> dict[str, LibraryCase]:
         """The libraries without those of quantities that a field lacks; all, if none is left.
 
         A name that is no known quantity stays, to be refused.
@@ -211,15 +183,34 @@ class Study:
             return dict(self.libraries)
         for name, variables in lacking.items():
             if variables:
-                run.say(f"the library {name} is left out: the data have no {', '.join(variables)}")
+                words = f"the library {name} is left out: the data have no {', '.join(variables)}"
+                report.say(words)
         return {name: case for name, case in self.libraries.items() if not lacking[name]}
+
+    def _records(
+        self, fields: Sequence[xr.Dataset], cases: Mapping[str, LibraryCase], report: Report
+    ) -> list[Trajectory]:
+        """The trajectory of every record, with what is to be said of them."""
+        seen = [case.library(fields[0], self.source.trajectory) for case in cases.values()]
+        runs = [self.source.sampled(field, seen, report) for field in fields]
+        if len(runs) > 1:
+            report.say(f"{len(runs)} records in one search; figures show the first")
+        if not self.hidden and (hint := alone(runs[0])):
+            report.warn(hint)
+        if self.forecasts and (reason := why_none(runs[0], self._n_fitted(runs[0]))):
+            report.say(reason)
+        return runs
+
+    def _n_fitted(self, run: Trajectory) -> int:
+        """Samples before the part that forecasts are tested on."""
+        return n_before(run, self.held_out or HELD_OUT)
 
     def _result(
         self,
         runs: Sequence[Trajectory],
-        name: str,
         library: Library,
         method: AnyMethod,
+        thesis: Coefficients,
         zones: Zones,
         *,
         rng: np.random.Generator,
@@ -227,65 +218,103 @@ class Study:
     ) -> LibraryResult:
         """Discovery of one library in all records; free runs of its model and the published one.
 
-        Both run over the first record, the discovered model over the others, too. A model that
-        lives is searched for in the first one.
+        The discovered model runs over all records. A model that lives is searched for in the first.
         """
-        s, measured = self.rollout_s, runs[0]
+        measured = runs[0]
         barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
-        found = discover(
-            list(runs), library, method, hidden=self.hidden, relations=self.relations,
-            exclude=barred, roles=self.roles, seed=rng, progress=progress,
-        )  # fmt: skip
+        known = library.exclude(barred).relate(*self.relations).with_roles(self.roles)
+        found = discover(list(runs), known, method, hidden=self.hidden, seed=rng, progress=progress)
         runs = runs if found.estimate is None else found.estimate.runs
-        first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
-        data, n_samples = first
-        published = self.thesis.get(name, {})
-        rows = Regression(self.formulation, bootstraps=self.bootstraps)
-        refitted = refit(found, published, rows, runs, rng)
+        s = self.rollout_s
+        n_samples = [run.n_samples if s is None else samples_in(run, s) for run in runs]
+        refitted = refit(found, thesis, self.formulation, runs, rng)
+        published = refitted_model(found, refitted)
         lives = beside = None
         if self.living is not None and not found.model.inputs:
-            lives, beside = self._lives(
-                data, library, rows, found.model, zones, rng=rng, progress=progress
+            rows = Regression(self.formulation, bootstraps=self.bootstraps)
+            parts = split_in_time(runs[0], self.held_out or HELD_OUT)
+            lives = living_model(
+                *parts, library, rows, self.living, found.model, zones, rng=rng, progress=progress
             )
+            beside = model_balance(
+                lives.model, lives.discovery.constraint, runs[0], *parts, zones,
+                self.living.bounds, progress=progress,
+            )  # fmt: skip
         skill = skill_of(
             found.model if lives is None else lives.model, measured, starts=self.forecasts,
-            n_fitted=n_before(measured, self.held_out or HELD_OUT), progress=progress,
+            n_fitted=self._n_fitted(measured), progress=progress,
         )  # fmt: skip
         with progress.stage(None, "", "free runs"):
+            pairs = zip(runs, n_samples, strict=True)
+            over = [partial(evaluate, run=run, n_samples=n) for run, n in pairs]
             return LibraryResult(
                 discovery=found,
-                selected=evaluate(found.model, data, n_samples=n_samples),
-                given=published,
+                runs=[run_over(found.model) for run_over in over],
+                thesis=thesis,
                 refitted=refitted,
-                published=run_refitted(found, refitted, data, n_samples),
+                published=None if published is None else over[0](published),
                 living=lives,
                 balance=beside,
-                elsewhere=[evaluate(found.model, run, n_samples=n) for run, n in others],
                 skill=skill,
             )
 
-    def _lives(
+    def _tell(
         self,
+        report: Report,
         data: Trajectory,
-        library: Library,
-        rows: Regression,
-        selected: SparseModel,
-        zones: Zones,
-        *,
-        rng: np.random.Generator,
-        progress: Progress,
-    ) -> tuple[Living, ModelBalance]:
-        """A model that lives, and the balance of its zones beside it."""
-        assert self.living is not None
-        parts = split_in_time(data, self.held_out or HELD_OUT)
-        lives = living_model(
-            *parts, library, rows, self.living, selected, zones, rng=rng, progress=progress
-        )
-        beside = model_balance(
-            lives.model, lives.discovery.constraint, data, *parts, zones, self.living.bounds,
-            period_s=None if lives.cycle is None else lives.cycle.period_s, progress=progress,
-        )  # fmt: skip
-        return lives, beside
+        results: Mapping[str, LibraryResult],
+        files: Sequence[str],
+    ) -> None:
+        """Models that live with what tells of them, then the selected models, then candidates."""
+        report.found(find_best(results, len(files)))
+        for name, result in results.items():
+            if result.living is not None and result.balance is not None:
+                add_living(report, name, result.living)
+                add_balance(report, name, result.balance, data, result.living.run.cycle)
+                self._add_forecasts(report, name, data, result)
+        self._add_selected(report, data, results)
+        if len(files) > 1:
+            add_records(report, results, files)
+        for name, result in results.items():
+            found = result.discovery
+            if result.living is None:
+                self._add_forecasts(report, name, data, result)
+            add_candidates(report, name, found, note=result.note, beside=result.beside)
+            if found.estimate is not None:
+                add_estimate(report, name, found)
+        add_tables(report, results)
+
+    def _add_forecasts(
+        self, report: Report, name: str, data: Trajectory, result: LibraryResult
+    ) -> None:
+        if result.skill is not None:
+            where = "that it has seen" if result.living is None else "held out"
+            title = f"{name}: forecasts over time {where}"
+            add_forecasts(report, name, data, result.skill, title=title)
+
+    def _add_selected(
+        self, report: Report, data: Trajectory, results: Mapping[str, LibraryResult]
+    ) -> None:
+        """The selected models of all libraries, and those of published terms, from the start."""
+        clock, figures = data.clock, partial(add_figures, report, data=data, shown=self.figures)
+        report.section("The selected model" if len(results) == 1 else "The selected models")
+        for name, result in results.items():
+            text = f"{name}: equations {result.how}; run freely: {result.runs[0].text}"
+            report.add(Text(text, page_only=True))
+            held = result.discovery.constraint
+            report.model(name, result.discovery.model, clock=clock, held=held)
+        selected = {name: result.runs[0] for name, result in results.items()}
+        published = {f"{n}_thesis_terms": r.published for n, r in results.items() if r.published}
+        is_living = any(result.living is not None for result in results.values())
+        note = f"{FROM_DERIVATIVES} {EVALUATED}" if is_living else EVALUATED
+        rows = ResultTable(selected | published, EVALUATION).screen("model", by_state=True)
+        report.section("Run freely from the first sample", Table(rows, note=note))
+        figures(FIGURES, runs=selected, smoother=self.formulation.smoother)
+        add_samples(report, data, selected | published)
+        for name, run in published.items():
+            report.model(name, run.model, clock=clock, shown=False)
+        if published:
+            figures(["trajectories"], runs=published, suffix="_thesis")
 
 
 def alone(data: Trajectory) -> str | None:
@@ -323,160 +352,3 @@ def registered(text: str) -> str:
             f"ep.register_function({name!r}, value, derivative): it has not"
         )
     return name + (found["argument"] or "")
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """The discoveries of all libraries in the same data.
-
-    files: names of all records; data is the first of them. smoother: gives the data's derivative.
-    """
-
-    data: Trajectory
-    results: Mapping[str, LibraryResult]
-    shown: PlotRange
-    smoother: Smoother | None
-    files: Sequence[str] = ()
-
-    @property
-    def published(self) -> dict[str, Evaluation]:
-        """Free runs of the models of published terms, if these could be fitted to our data."""
-        return {n: r.published for n, r in self.results.items() if r.published is not None}
-
-    @property
-    def selected(self) -> dict[str, Evaluation]:
-        return {name: result.selected for name, result in self.results.items()}
-
-    @property
-    def living(self) -> dict[str, Living]:
-        """The living models that were searched for, by library."""
-        return {n: r.living for n, r in self.results.items() if r.living is not None}
-
-    @property
-    def skills(self) -> dict[str, ForecastSkill]:
-        return {n: r.skill for n, r in self.results.items() if r.skill is not None}
-
-    def models(self) -> dict[str, SparseModel]:
-        found = {name: result.discovery.model for name, result in self.results.items()}
-        return found | {f"{name}_living": each.model for name, each in self.living.items()}
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        found: dict[str, pd.DataFrame] = {}
-        for name, result in self.results.items():
-            found |= result.front_tables(name)
-        published = {f"{name}_thesis_terms": each for name, each in self.published.items()}
-        found |= rollout_tables(self.data, self.selected | published)
-        for name, result in self.results.items():
-            if result.balance is not None:
-                found |= result.balance.tables(name)
-        for name, skill in self.skills.items():
-            found[f"forecast_{name}"] = forecast_errors(skill)
-        found |= living_tables(self.living) | {"comparison": self.comparison.csv("model")}
-        return found | ({"records": self.records.csv()} if len(self.files) > 1 else {})
-
-    @property
-    def comparison(self) -> ResultTable[Evaluation]:
-        """One row per model: frequencies, trajectory error, and the verdict on the trajectory."""
-        published = {f"{name}, thesis's terms": each for name, each in self.published.items()}
-        return ResultTable(self.selected | published, frequencies(self.data))
-
-    @property
-    def records(self) -> ResultTable[tuple[str, str, Evaluation]]:
-        """One row per model and record."""
-        runs = [
-            (name, file, each)
-            for name, result in self.results.items()
-            for file, each in zip(self.files, result.runs, strict=True)
-        ]
-        return ResultTable(runs, RECORDS)
-
-    def figures(self) -> dict[str, Captioned]:
-        drawn = run_figures(FIGURES, self.data, self.selected, self.shown, smoother=self.smoother)
-        if self.published:
-            drawn["trajectories_thesis"] = trajectories(
-                self.data, self.published, self.shown, THESIS
-            )
-        for name, result in self.results.items():
-            found = result.discovery
-            front = partial(front_figure, found.fronts, label=result.label)
-            has_rows = any(each.has_errors for each in found.fronts.values())
-            drawn[f"front_{name}"] = Captioned(front, FRONT if has_rows else SCORED)
-        for name, living in self.living.items():
-            drawn |= living.figures(name)
-        for name, result in self.results.items():
-            drawn |= result.balance.figures(name) if result.balance is not None else {}
-        skills = self.skills.items()
-        return drawn | {f"forecast_{name}": forecast_picture(self.data, s) for name, s in skills}
-
-    def in_short(self) -> Result:
-        """The living model, or the best of those that were run; and what its rows leave over."""
-        runs = {name: each.run for name, each in self.living.items()}
-        runs = runs or {name: worst_run(each.runs) for name, each in self.results.items()}
-        best = best_run(runs)
-        is_living = bool(self.living)
-        records = f"the worst of {len(self.files)} records" if len(self.files) > 1 else "the record"
-        shown = [f"free_run_{best}", "trajectories", *(drawn := self.figures())]
-        return found_model(
-            f"Found with the library {best}",
-            runs[best],
-            file=f"{best}_living" if is_living else best,
-            picture=next((name for name in shown if name in drawn), ""),
-            more=self._cautions(best) if is_living else [],
-            where="held-out time" if is_living else records,
-            seen=not is_living,
-            misfit="" if is_living else self.results[best].discovery.misfit,
-            held=self.living[best].discovery.constraint if is_living else None,
-        )
-
-    def _cautions(self, best: str) -> list[Block]:
-        """A neutral cycle of the living model, and what fits of derivatives leave beyond noise."""
-        tests = [result.discovery.noise_test for result in self.results.values()]
-        caution = self.living[best].run.caution
-        return [*([Text(caution, warning=True)] if caution else []), *left_over_of_all(tests)]
-
-    def sections(self) -> list[Section]:
-        found = [self._of_all()]
-        for name, result in self.results.items():
-            found += result.sections(name, self.data)
-        for name, result in self.results.items():
-            if result.living is not None:
-                found.append(result.living.section(name))
-            if result.balance is not None:
-                found.append(result.balance.section(name))
-            if result.skill is not None:
-                where = "that it has seen" if result.living is None else "held out"
-                title = f"{name}: forecasts over time {where}"
-                found.append(forecast_section(result.skill, f"forecast_{name}", title=title))
-        note = FROM_DERIVATIVES if self.living else ""
-        rows = self.comparison.screen("model", by_state=True)
-        compared: list[Block] = [Table(rows, title=INTEGRATED, note=note), *pictures(FIGURES)]
-        found.append(Section("Run freely from the first sample", compared))
-        if len(self.files) > 1:
-            found.append(Section("Every record", [Table(self.records.screen(), EVERY_RECORD)]))
-        return found
-
-    def _of_all(self) -> Section:
-        """The equations of all libraries and how they run, page only."""
-        blocks: list[Block] = []
-        for name, result in self.results.items():
-            living, clock = result.living, self.data.clock
-            run = result.selected if living is None else living.run
-            text = f"{name}: equations {result.how}; run freely: {run.text}"
-            blocks.append(Text(text, page_only=True))
-            held = None if living is None else living.discovery.constraint
-            shown = partial(display_equation, run.model, clock=clock, held=held, on_screen=False)
-            blocks += [shown(state) for state in run.model.states]
-            if living is None:
-                blocks += interval_table(run.model, clock=clock, page_only=True)
-        return Section("All libraries", blocks)
-
-    def summary(self) -> dict[str, Any]:
-        models = {name: result.summary() for name, result in self.results.items()}
-        return {"data": data_summary(self.data), "models": models}
-
-    def headline(self) -> dict[str, float]:
-        living = {f"{name}/living": each for name, each in self.living.items()}
-        scalars: dict[str, float] = {}
-        for name, result in self.results.items():
-            scalars |= result.headline(name)
-        return scalars | ResultTable(living, LIVING).headline()

@@ -98,7 +98,7 @@ class Study:
         factors = {name: variables_of(name) for name in map(str, self.terms)}
         terms = [name for name, variables in factors.items() if not {*lacking} & {*variables}]
         used = dict.fromkeys([*self.states, *(v for name in terms for v in factors[name])])
-        return named_terms(list(used), terms)
+        return named_terms(list(used), terms).relate(*self.relations)
 
     def search(self, library: Library, *, seed: int) -> PointSearch:
         if not isinstance(self.method, Regression):
@@ -106,8 +106,7 @@ class Study:
                 "a search of trajectories fits them whole, and a pointwise study searches rows: "
                 f"{self.method!r} came; use Regression(search=BestSubset()) (search=best_subset)"
             )
-        settings = self.method, self.least_variation, seed, self.relations
-        return PointSearch(self.states, library, *settings)
+        return PointSearch(self.states, library, self.method, self.least_variation, seed)
 
     def run(self, report: Report) -> None:
         with report.progress(None, "", "data"):

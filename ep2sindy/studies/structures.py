@@ -18,9 +18,8 @@ from ep2sindy.library.terms import variables_of
 from ep2sindy.model.model import SparseModel, model_of
 from ep2sindy.studies.processes import compared_processes, ends_of
 from ep2sindy.studies.source import Zones, told_roles
-from ep2sindy.studies.study import Check, Coefficients
+from ep2sindy.studies.study import Check, Coefficients, Terms
 
-Terms = Mapping[str, Sequence[int | str]]  # by state; the constant term 1 may be a number
 ROLES_DEGREE = 3  # of the products that roles are played by
 
 

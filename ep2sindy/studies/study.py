@@ -70,7 +70,9 @@ Count = Annotated[int, Check("a whole number, one or more", _is_count)]
 CountOrNone = Annotated[
     int | None, Check("a whole number, one or more, or null", lambda x: x is None or _is_count(x))
 ]
-Starts = Annotated[int, Check("zero or more starts", lambda x: type(x) is int and x >= 0)]
+ZeroOrMore = Annotated[
+    int, Check("a whole number, zero or more", lambda x: type(x) is int and x >= 0)
+]
 Share = Annotated[float, Check("a number between 0 and 1", lambda x: _is_positive(x) and x < 1)]
 ShareOrNone = Annotated[
     float | None,
@@ -107,4 +109,5 @@ NamesOrOne = Annotated[
 Counts = Annotated[Sequence[_Counts], A_LIST]
 Levels = Annotated[Sequence[_Levels], A_LIST]
 Positives = Annotated[Sequence[_Positives], A_LIST]
+Terms = Mapping[str, Sequence[int | str]]  # by state; the constant term 1 may be a number
 Coefficients = Mapping[str, Mapping[str, float]]  # state -> term -> SI coefficient

@@ -20,15 +20,15 @@ from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, View
 from ep2sindy.signals.smoothers import Smoother
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.study import PositiveOrAll
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
 FROM_DERIVATIVES = (
-    "These are the equations that fits of the derivatives select; the models that live, which are "
-    "selected by free runs, stand above."
+    "These are the equations that fits of the derivatives select; those that free runs select, "
+    "which are sustained if any is, stand above."
 )
 MARKS = "Carets: the model leaves the panel; cross: a run that diverged stops."
 CAPTIONS = {
@@ -205,16 +205,12 @@ def run_words(run: Evaluation) -> str:
     return "; ".join(found) or run.text
 
 
-def _rest(run: Evaluation) -> dict[str, float] | None:
-    """Where the model rests inside its cycle, by state; None if it does not."""
-    if run.rest is None:
-        return None
-    return dict(zip(run.model.states, run.rest.state.tolist(), strict=True))
-
-
 COMPARED = View.FILES | View.HEADLINE
 # How a model runs beside a record: of every model, in every study.
 EVALUATION: Metrics[Evaluation] = [
+    Metric("from_s", lambda run: float(run.record.t[0])),
+    Metric("to_s", lambda run: float(run.record.t[-1])),
+    Metric("record_frequency_Hz", lambda run: _record_frequency_Hz(run)),
     Metric("frequency", frequency_words, View.SCREEN),
     Metric("frequency_Hz", lambda run: run.frequency_Hz),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.HEADLINE),
@@ -230,7 +226,7 @@ CYCLE: Metrics[Evaluation] = [
     Metric("stability", lambda run: run.cycle and run.cycle.stability),
     Metric("multiplier", lambda run: run.multiplier, COMPARED),
     Metric("share_reaching", lambda run: run.share_reaching, COMPARED),
-    Metric("rest", _rest),
+    Metric("rest", lambda run: _rest(run)),
     Metric("rest_growth_per_s", lambda run: run.rest and run.rest.growth_per_s),
     Metric("rest_frequency_Hz", lambda run: run.rest and run.rest.frequency_Hz),
 ]
@@ -239,3 +235,21 @@ EVALUATED = (
     "standard deviations. nrmse: RMS error of the trajectory, in standard deviations; 1 is no "
     "better than a constant. Periods in phase: until it is a quarter of a period off."
 )
+
+
+def largest(values: Mapping[str, float]) -> float:
+    """The largest of the values by state; NaN if one is not known."""
+    return float(np.max(list(values.values())))
+
+
+def _record_frequency_Hz(run: Evaluation) -> dict[str, float]:
+    columns = run.record.columns(run.model.states).T
+    found = [dominant_frequency(run.record.t, column) for column in columns]
+    return dict(zip(run.model.states, found, strict=True))
+
+
+def _rest(run: Evaluation) -> dict[str, float] | None:
+    """Where the model rests inside its cycle, by state; None if it does not."""
+    if run.rest is None:
+        return None
+    return dict(zip(run.model.states, run.rest.state.tolist(), strict=True))

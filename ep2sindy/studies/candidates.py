@@ -1,0 +1,256 @@
+"""Candidates of a discovery in a report: the fronts, and what the samples say of its model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import compress
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from ep2sindy.discovery.choice import NoiseTest
+from ep2sindy.discovery.result import Discovery
+from ep2sindy.estimation.estimate import Estimate, Rival
+from ep2sindy.figures.fronts import front_figure
+from ep2sindy.library.equations import equation_text
+from ep2sindy.library.units import Clock
+from ep2sindy.regression.front import Candidate, LeftOver, ParetoFront
+from ep2sindy.report.document import Equation, Table, Text
+from ep2sindy.report.report import Report
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View
+
+# What the columns of a front mean; RULES explains the labels of the selection rules.
+COLUMNS = (
+    "R2: of the derivative, on rows held out from the fit where there are any; share: of the "
+    "bootstraps that proposed these terms."
+)
+RULES = {
+    "d_pareto": "d_pareto: distance to the corner of no error and no terms",
+    "deviance": "deviance: -2 log likelihood of the trajectories plus the prices of all terms, "
+    "above the least",
+}
+FRONT = (
+    "Error against number of terms: every support that the search proposed, and the best of each "
+    "size; the star is selected. Carets at the upper edge: models far worse than none."
+)
+SCORED = (
+    "Score against number of terms, the best of each size; the star is selected. States and "
+    "coefficients were estimated together: there are no rows to have an error."
+)
+NOISE = (
+    "Noise: standard deviation of what the model leaves of the samples. Memory: its correlation "
+    "from one sample to the next, 0 for white noise. Grows: how much of its variance grows with "
+    "the square of the state. Kurtosis: 3 where it is normal, more with outliers."
+)
+FITS = (
+    "The model explains the samples as far as their noise: what is left looks like noise, and "
+    "an exact trajectory is likelier than one that leaves the model."
+)
+REPLACED = (
+    "This section is about the likeliest model of the search. The rule chose another one, which "
+    "was not tested against the noise."
+)
+# Nobody measured a simulation: what its samples show beside their smooth course is numerical.
+THE_NOISE = "the noise of the samples (of a simulation: its numerical noise)"
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateRow:
+    """A candidate of a front, or another fit of its equation beside them.
+
+    left: statistics of the residuals of the model's terms relative to the noise; None if the noise
+    is not known. lead: what another fit is, such as `thesis`.
+    """
+
+    candidate: Candidate
+    is_selected: bool = False
+    left: LeftOver | None = None
+    lead: str = ""
+
+    @property
+    def inclusion(self) -> dict[str, float]:
+        return dict(zip(self.candidate.terms, self.candidate.inclusion.tolist(), strict=True))
+
+    def equation(self, clock: Clock) -> Equation:
+        terms = {name: clock.seconds * coef for name, coef in self.candidate.coef_by_term.items()}
+        mark = "  <- selected" if self.is_selected else ""
+        return Equation(self.candidate.equation, terms, lead=self.lead, mark=mark)
+
+
+def candidate_metrics(label: str) -> Metrics[CandidateRow]:
+    """Columns of a front. label: the name of the scores."""
+    return [
+        Metric("equation", lambda row: row.candidate.equation),
+        Metric("n_terms", lambda row: row.candidate.n_terms, View.ALL, "terms", "{}"),
+        Metric("r2_test", lambda row: row.candidate.r2_test, View.ALL, "R2 test", "{:.3f}"),
+        Metric("r2_train", lambda row: row.candidate.r2_train, View.SHOWN, "R2 train", "{:.3f}"),
+        Metric(label, lambda row: row.candidate.score, View.ALL, label, "{:.3f}"),
+        Metric("share", lambda row: row.candidate.share, View.SHOWN, format="{:.2f}"),
+        Metric("selected", lambda row: row.is_selected),
+        Metric(
+            "text", lambda row: equation_text(row.candidate.equation, row.candidate.coef_by_term)
+        ),
+    ]
+
+
+def selected_metrics(label: str) -> Metrics[CandidateRow]:
+    """Facts on a selected candidate. label: the name of the scores."""
+    return [
+        *candidate_metrics(label),
+        Metric("chi_squared", lambda row: row.left and row.left.chi_squared),
+        Metric("residual_autocorrelation", lambda row: row.left and row.left.autocorrelation),
+        Metric("inclusion", lambda row: row.inclusion),
+    ]
+
+
+def candidate_rows(front: ParetoFront) -> list[CandidateRow]:
+    return [CandidateRow(each, each is front.best) for each in front.candidates]
+
+
+def add_candidates(
+    report: Report,
+    name: str,
+    found: Discovery,
+    *,
+    note: str = "",
+    beside: Mapping[str, Sequence[CandidateRow]] | None = None,
+) -> None:
+    """Add the candidates of every state, their front, and terms that the data cannot tell apart.
+
+    name: of the library. note: how the rule decided. beside: other fits of the equations, by state.
+    """
+    library, label = found.model.library, found.method.selection.label
+    words = f"{len(library)} terms in {', '.join(library.variables)}; selection: "
+    report.section(f"{name}: candidates", f"{words}{found.method.selection}")
+    report.summary.setdefault("notes", {})[name] = note
+    report.add(*([f"selected: {note}"] if note else []), *(f"note: {n}" for n in found.remarks))
+    report.add(*(f"note: {each.message}" for each in found.ambiguities if each.exact))
+    if n_alike := sum(not each.exact for each in found.ambiguities):
+        file = f"tables/ambiguities_{name}.csv"
+        report.add(f"note: nearly proportional terms: {n_alike}, see {file}")
+    for state in found.fronts:
+        report.add(_front_table(found, state, (beside or {}).get(state, ())))
+        if (left := found.noise_test.left.get(state)) is not None:
+            report.add(
+                f"left over of {state}': {left.chi_squared:.3g} times {THE_NOISE}, autocorrelation "
+                f"{left.autocorrelation:.2f} (1 and 0 where noise alone is left)"
+            )
+    report.add(Text(column_note(label), page_only=True))
+    caption = FRONT if any(front.has_errors for front in found.fronts.values()) else SCORED
+    report.figure(f"front_{name}", partial(front_figure, found.fronts, label=label), caption)
+    rows = [row for front in found.fronts.values() for row in candidate_rows(front)]
+    report.samples(f"front_{name}", ResultTable(rows, candidate_metrics(label)).csv())
+    alike = [(each.exact, " ".join(each.terms), each.message) for each in found.ambiguities]
+    columns = ["exact", "terms", "message"]
+    report.samples(f"ambiguities_{name}", pd.DataFrame(alike, columns=columns))
+
+
+def _front_table(found: Discovery, state: str, beside: Sequence[CandidateRow]) -> Table:
+    """Table of the candidates, the selected one in bold; below, the final and other fits."""
+    clock, label, terms = found.model.clock, found.method.selection.label, found.model.terms(state)
+    own = candidate_rows(found.fronts[state])
+    if terms not in [row.candidate.coef_by_term for row in own if row.is_selected]:
+        own.append(CandidateRow(Candidate.of(state, terms), lead="weighted"))
+    shown = Metric[CandidateRow]("model", lambda row: row.equation(clock), View.SCREEN)
+    rows = [*own, *beside]
+    return Table(
+        ResultTable(rows, [*candidate_metrics(label), shown]).screen(),
+        title=f"candidates for {state}' [{clock.rate_unit(found.model.units[state])}]",
+        bold=[k for k, row in enumerate(rows) if row.is_selected],
+        italic=range(len(own), len(rows)),
+    )
+
+
+def column_note(label: str) -> str:
+    """Explanation of the columns of the fronts."""
+    rule = RULES.get(label, f"{label}: the score of the selection, least selected")
+    # Candidates scored by trajectories have neither rows nor bootstraps.
+    return f"{rule}." if label == "deviance" else f"{rule}. {COLUMNS}"
+
+
+def left_over_of_all(tests: Sequence[NoiseTest]) -> list[Text]:
+    """What fits of derivatives leave beyond noise; nothing if they leave no more."""
+    if not any(test.misfit for test in tests):
+        return []
+    left = [each for test in tests for each in test.left.values() if not each.leaves_noise]
+    ratios = sorted(each.chi_squared for each in left)
+    size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {THE_NOISE}" if left else "more than noise"
+    text = (
+        f"The equations fitted to derivatives leave {size}: a state or a term is missing there, so "
+        "they have no intervals; the free run above is what judges."
+    )
+    return [Text(text)]
+
+
+RIVALS: Metrics[Rival] = [
+    Metric("state", lambda rival: rival.state, View.SHOWN, "equation", "{}'"),
+    Metric(
+        "terms", lambda rival: ", ".join(rival.terms), View.SHOWN,
+        format=lambda terms: terms.replace("*", " "),
+    ),
+    Metric(
+        "odds", lambda rival: rival.odds, View.SHOWN, "odds against the chosen",
+        lambda odds: f"1:{1.0 / odds:.3g}",
+    ),
+]  # fmt: skip
+ESTIMATE: Metrics[Estimate] = [
+    Metric(
+        "noise_std", lambda found: by_state(found, found.noise_std), View.SHOWN, "noise (std)",
+    ),
+    Metric(
+        "noise_share",
+        lambda found: by_state(found, found.noise_std / _spread(found)),
+        View.SHOWN, "of the state's std", lambda value: f"{100.0 * value:.2g} %",
+    ),
+    Metric("memory", lambda found: by_state(found, found.memory), View.SHOWN, format="{:.2f}"),
+    Metric(
+        "noise_growth", lambda found: by_state(found, found.growth), View.SHOWN, "grows",
+        lambda value: f"{100.0 * value:.3g} %",
+    ),
+    Metric(
+        "noise_kurtosis", lambda found: by_state(found, found.kurtosis), View.SHOWN, "kurtosis",
+        lambda value: f"{value:.3g}".replace("nan", ""),
+    ),
+    Metric("delays_s", lambda found: by_state(found, found.delays_s)),
+    Metric("remarks", lambda found: list(found.remarks)),
+    Metric("flow_error", lambda found: found.flow_error),
+    Metric("misfit", lambda found: found.misfit or None),
+    Metric("too_few_samples", lambda found: found.too_few_samples or None),
+]  # fmt: skip
+
+
+def add_estimate(report: Report, name: str, found: Discovery) -> None:
+    """Add the noise of the samples, the misfit of the model, and other possible supports.
+
+    name: of the library or signal. found: by a search that estimates states and coefficients.
+    """
+    estimate = found.estimate
+    assert estimate is not None
+    report.section(f"{name}: what the samples say", level=3)
+    if not found.noise_test.tested:
+        report.add(Text(REPLACED, warning=True))
+    rows = ResultTable([estimate], ESTIMATE)
+    noise = Table(rows.screen(by_state=True), title="noise of the samples", note=NOISE)
+    report.table(f"samples_{name}", rows, by_state=True, shown=noise)
+    report.add(Text(estimate.misfit or FITS, warning=bool(estimate.misfit)))
+    if estimate.too_few_samples:
+        report.add(Text(estimate.too_few_samples, warning=True))
+    rivals, title = ResultTable(estimate.rivals, RIVALS), "other supports that may be"
+    report.table(f"other_supports_{name}", rivals, title=title)
+    if not estimate.rivals and not estimate.misfit:
+        report.add("No other support of an equation has odds above 1:1000.")
+
+
+def by_state(found: Estimate, values: np.ndarray) -> dict[str, float]:
+    """Values of the states that were measured."""
+    pairs = zip(found.model.states, np.asarray(values).tolist(), strict=True)
+    return dict(compress(pairs, np.isfinite(found.noise_std)))
+
+
+def _spread(found: Estimate) -> Float[np.ndarray, " n_states"]:
+    """Standard deviation of every state in the first record."""
+    spread: np.ndarray = found.runs[0].columns(found.model.states).std(axis=0)
+    return spread
