@@ -57,14 +57,6 @@ def test_of_several_states_the_first_row_alone_has_what_they_share() -> None:
     }
 
 
-def test_a_few_records_stand_upright() -> None:
-    table = ResultTable({"value": FITS["free"]}, METRICS).upright()
-    assert table.to_dict("list") == {
-        "quantity": ["status", "its error", "R2 of x", "R2 of y"],
-        "value": ["converged", "1.2 %", "0.50", "0.25"],
-    }
-
-
 def test_json_keeps_states_together_and_headlines_part_them() -> None:
     assert TABLE.json()["free"] == {
         "status": "converged",
