@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from ep2sindy.report.results import Metric, ResultTable, View, facts, percent
+from ep2sindy.report.results import Metric, ResultTable, View, percent
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ def test_a_metric_is_taken_of_a_part_of_a_larger_record() -> None:
     metrics: list[Metric[Mapping[str, Fit]]] = [
         m.of(lambda p: p["second"], "{}_second") for m in METRICS[:3]
     ]
-    table = ResultTable({"both": pair}, metrics).csv()
-    assert table["r2_second_x"].tolist() == [1.0]
-    assert list(facts(pair, metrics)) == ["status_second", "f_error_second", "r2_second"]
+    table = ResultTable({"both": pair}, metrics)
+    assert table.csv()["r2_second_x"].tolist() == [1.0]
+    assert list(table.json()["both"]) == ["status_second", "f_error_second", "r2_second"]
 
 
 @pytest.mark.parametrize(
