@@ -118,7 +118,7 @@ class Study:
         _add_signal(report, signal, states, attempts, best)
         add_candidates(report, NAME, best.found)
         if best.found.estimate is not None:
-            add_estimate(report, signal.name, best.found, states)
+            add_estimate(report, signal.name, best.found)
 
     def _prepared(self, data: Trajectory, once: Once, report: Report) -> Trace:
         """The signal, with its fitted offset if one is asked for."""
