@@ -46,8 +46,7 @@ def discovered(states, *, degree, max_terms):
         ep.Differential(ep.signals.KalmanSmoother()), ep.BestSubset(max_terms=max_terms)
     )
     library = ep.polynomial(states.run.state_names, degree=degree)
-    known = {"relations": states.relations, "terms": states.terms}
-    return ep.discover(states.run, library, recipe, **known).model
+    return ep.discover(states.run, states.known_in(library), recipe).model
 
 
 def test_the_growth_rate_is_that_of_the_signal():
