@@ -10,9 +10,10 @@ from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy as ep
 from ep2sindy.app import main as program
-from ep2sindy.app.runner import hparams_of, list_studies, run_config, study_class
+from ep2sindy.app.runner import list_studies, run_config, study_class
 from ep2sindy.app.schema import Configured, keys_of, study_of, value_of
 from ep2sindy.discovery.method import AnyMethod
+from ep2sindy.report.about import by_places
 from ep2sindy.runtime.files import read_json
 from ep2sindy.selection.criteria import Selection
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
@@ -171,7 +172,7 @@ def test_studies_are_found_by_name() -> None:
 
 def test_runs_are_compared_by_plain_settings() -> None:
     settings: Any = OmegaConf.to_container(config(), resolve=True)
-    found = hparams_of(settings, keys_of(Toy))
+    found = by_places(settings, keys_of(Toy))
     assert found["n"] == 3
     assert found["names"] == "['a', 'b']"
     assert found["search"] == "BestSubset"

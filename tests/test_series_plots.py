@@ -1,5 +1,7 @@
 """Figures of models beside the data: what every panel must hold."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,8 @@ from ep2sindy.figures.series import (
     trajectory_figure,
 )
 from ep2sindy.figures.style import OFF_SCALE, find_exits, frame_limits
-from ep2sindy.studies.views import PlotRange, run_figures
+from ep2sindy.report.report import Report
+from ep2sindy.studies.views import PlotRange, add_figures
 
 
 @pytest.fixture(scope="module")
@@ -127,5 +130,6 @@ def test_one_state_has_no_phase_portrait(oscillation: ep.Trajectory) -> None:
     one = ep.Trajectory(oscillation.t, oscillation.states[:, :1], ("x",))
     model = ep.SparseModel(ep.named_terms(("x",), ("x",)), ("x",), np.array([[-1.0]]))
     integrated = {"model": ep.evaluate(model, one)}
-    figures = run_figures(("phase", "spectra"), one, integrated, PlotRange(20.0, None))
-    assert list(figures) == ["spectra"]
+    report = Mock(Report)
+    add_figures(report, ("phase", "spectra"), one, integrated, PlotRange(20.0, None))
+    assert [call.args[0] for call in report.figure.mock_calls] == ["spectra"]

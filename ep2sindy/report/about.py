@@ -100,3 +100,11 @@ def by_place(place: str, value: Any) -> dict[str, Any]:
     if isinstance(value, list):
         return {place: str(value)} if value else {}
     return {place: value} if isinstance(value, int | float | str | bool) else {}
+
+
+def by_places(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
+    """The settings of these keys, each by its dotted key, groups by their name."""
+    found: dict[str, Any] = {}
+    for key in sorted({*keys} & {*settings}):
+        found |= by_place(key, settings[key])
+    return found

@@ -13,7 +13,7 @@ import pandas as pd
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.units import Clock
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.about import About, by_place, settings_used
+from ep2sindy.report.about import About, by_places, settings_used
 from ep2sindy.report.document import Block, Captioned, Picture, Result, Section, Table, Text
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.models import coefficients, model_blocks, model_facts
@@ -187,9 +187,7 @@ class Report:
         self.screen.show(self.sections, on_terminal=bool(self.settings.get("verbose")))
         drawn = self._drawn(formats) if formats else {}
         self.board.equations({name: model.text() for name, model in self.models.items()})
-        hparams = {"seed": self.seed}
-        for key in sorted({*keys} & {*self.settings}):
-            hparams |= by_place(key, self.settings[key])
+        hparams = {"seed": self.seed} | by_places(self.settings, keys)
         self.board.settings(hparams, self.headline)
         about = self._about(purpose, keys)
         page = page_html(self.title, self.sections, drawn, about, result=self.result)
