@@ -43,7 +43,7 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
             ["models.predator_prey.relations=['n_i: n_n == 1']"],
             "'n_n' is not in the support of 'n_i'",
         ),
-        ("ils", ["models.predator_prey.fits=[ils]"], "fits must name some of ['base', 'weak', "),
+        ("ils", ["+models.predator_prey.fits=[ils]"], "fits must name some of ['base', 'weak', "),
         (
             "ils",
             ["+figures.colour=1"],
@@ -80,8 +80,8 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
         ("simulate", ["scan={n_cells:[30,30]}"], "each value once"),
         ("weak", ["fits.boxes.form=box"], "fits.boxes.form must be null, balance or one of ['boxe"),
         ("weak", ["models.predator_prey.terms.n_n=[q]"], "unknown variables ['q']"),
-        ("weak", ["fits.boxes.n_points=[1201]"], "n_points=1201 was asked of 1200 samples; lower"),
-        ("weak_windows", ["fits.boxes.n_points=[3001]"], "n_points=3001 was asked of 3000 samples"),
+        ("weak", ["fits.boxes.n_points=[1201]"], "1201 samples were asked of 1200; lower n_points"),
+        ("weak_windows", ["fits.boxes.n_points=[3001]"], "3001 samples were asked of 3000; lower n_points"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(

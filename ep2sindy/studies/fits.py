@@ -60,6 +60,7 @@ from ep2sindy.studies.study import (
     ZeroOrMore,
 )
 from ep2sindy.studies.views import (
+    EVALUATION,
     PlotRange,
     add_figures,
     add_samples,
@@ -314,6 +315,8 @@ class Study:
             seeds = count_pieces(report.watch, range(self.n_draws), "draw", name)
             refinements = [self._refine(each.first, record, report, seed=seed) for seed in seeds]
             draws[name] = [self._evaluate(found.model, record) for found in refinements]
+        rows = {f"{name}, {k}": run for name, runs in draws.items() for k, run in enumerate(runs)}
+        report.samples("draws", ResultTable(rows, EVALUATION).csv("draw"))
         report.section(f"Over {self.n_draws} draws of windows")
         report.table(
             "spread",
