@@ -88,7 +88,7 @@ def show(name: str, found: Traced | str, horizons: dict[str, float]) -> None:
         print(f"    {state}' = " + " ".join(f"{c:+.3g} {term}" for term, c in terms.items()))
     for words, horizon in horizons.items():
         print(f"  {words} ahead: {found.at(horizon)}")
-    if forecast:
+    if forecast := found.summary.get("forecasts", {}).get("trace"):
         print(f"  bands of 90 % hold {100 * forecast['coverage_90']:.0f} %", flush=True)
 
 
@@ -130,8 +130,8 @@ def pendulum() -> None:
     held_out = f"held_out={1.0 - 3.6 / 5.5}"
     for words, more in {
         "as it comes": [],
-        "dry friction, its width fitted": ["functions=['sign(?*v)']", "degree=1", "n_states=2"],
-        "dry friction, its width given": ["functions=['sign(200*v)']", "degree=1", "n_states=2"],
+        "dry friction, its width fitted": ["tried=[{how: auto, degree: 1, functions: ['sign(?*v)']}]"],
+        "dry friction, its width given": ["tried=[{how: auto, degree: 1, functions: ['sign(200*v)']}]"],
     }.items():
         found = trace(run.t, run.states[:, 0], held_out, *more)
         show(f"pendulum, {words}", found, {"0.1 s": 0.1, "0.4 s": 0.4})

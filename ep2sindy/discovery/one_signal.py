@@ -44,6 +44,8 @@ DEPTH_OF_BOTH = 2
 
 MAX_FITTED = 3000  # samples from the end of the fitted part that a search for hidden states sees
 
+EXPLAINED = "their equations explain the signal to its noise"
+
 MIN_FITTED = 4.0  # periods that a fitted part must have
 MIN_JUDGED = 1.5  # periods that a held-out part must have
 
@@ -185,16 +187,17 @@ def try_in_turn(
     """
     if past.cycle is not None and past.cycle.share >= REPEATS:
         tried = [each for each in tried if each.n_states == 2] or tried
-    attempts, last = [], None
+    attempts, left_out = [], []
     for each in tried:
         states, found = each.search(past, method, seed=seed, progress=progress, once=once)
         if not states.hidden:
             attempts.append(Attempt.of(each, states, found, progress))
         elif explains(found, past.name):
+            states = replace(states, reason=EXPLAINED)
             return [Attempt.of(each, states, found, progress)]
         else:
-            last = each, states, found
-    return attempts or [Attempt.of(*last, progress)]
+            left_out.append((each, states, found))
+    return attempts or [Attempt.of(*left_out[-1], progress)]
 
 
 def best_of(attempts: Sequence[Attempt]) -> Attempt:
