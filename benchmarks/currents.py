@@ -84,14 +84,14 @@ def measure(name: str, signals: Sequence[Signal], folder: Path) -> str:
     if run.returncode:
         return f"{name}: {run.stderr.strip() or run.stdout.strip()}"
     (path,) = folder.glob("predict/*/summary.json")
-    law = json.loads(path.read_text())["law"]
-    left_out = law["left_out"]
-    (searched,) = [terms for terms in law["terms"].values() if len(terms) > 1]
+    summary = json.loads(path.read_text())
+    (chosen,) = [trial for trial in summary["trials"] if trial["chosen"]]
+    errors = summary["headline"]
     return (
-        f"{name}: {', '.join(searched)} by {', '.join(law['functions'])}; "
-        f"{left_out['n_lives']} of {left_out['n']} live, frequency "
-        f"{left_out['f_median']:.2%} in the median, {left_out['f_90']:.2%} for nine in ten, "
-        f"amplitude {left_out['amplitude_median']:.1%}"
+        f"{name}: {chosen['terms']} by {chosen['functions']}; "
+        f"{errors['n_lives']} of {errors['n']} live, frequency "
+        f"{errors['f_median']:.2%} in the median, {errors['f_90']:.2%} for nine in ten, "
+        f"amplitude {errors['amplitude_median']:.1%}"
     )
 
 

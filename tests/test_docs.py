@@ -12,6 +12,7 @@ from pathlib import Path
 from shutil import which
 
 import numpy as np
+import pandas as pd
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -131,10 +132,31 @@ def test_the_config_of_a_study_of_ones_own_runs(here: Path) -> None:
     assert [point["status"] for point in found.summary["points"]] == ["oscillating"] * 4
     assert found.summary["control_laws"]
     assert found.summary["law"]["fit"] in found.summary["law"]["errors"]
-    assert len(found.outcome.tables()["map"]) == 2
+    assert len(found.report.tables["map"]) == 2
 
 
-DATA = {"my_spread": ("data=recognised", "data.path=run.csv", "trajectory.states=[x,y]")}
+def test_the_experiment_of_the_page_on_architecture_runs(here: Path) -> None:
+    """On oscillations that decay and grow at known rates; the window is three of their periods."""
+    t = 0.1 * np.arange(2000.0)
+    turns = 2.0 * np.pi * t / 5.0
+    record = {
+        "t_s": t,
+        "x": np.exp(-0.01 * t) * np.cos(turns),
+        "y": np.exp(0.02 * t) * np.sin(turns),
+    }
+    pd.DataFrame(record).to_csv("run.csv", index=False)
+    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    (config,) = (b.text for b in blocks(ROOT / "docs" / "architecture.md") if b.language == "yaml")
+    write_modules(page)
+    given = [*DATA["my_growth"], "window_s=15.0", "output=outputs"]
+    found = computed(composed_with("exp", "my_growth", config, "+exp=my_growth", *given))
+    rates = {"x": pytest.approx(-0.01, abs=1e-5), "y": pytest.approx(0.02, abs=1e-5)}
+    assert found.summary["growth"]["record"]["growth_per_s"] == rates
+    assert found.summary["headline"]["record/y/growth_per_s"] == rates["y"]
+    found.check_figures("sizes")
+
+
+DATA = {"my_growth": ("data=recognised", "data.path=run.csv", "trajectory.states=[x,y]")}
 
 
 def composed_with(group: str, name: str, config: str, *overrides: str) -> DictConfig:
@@ -217,7 +239,7 @@ def test_choices_and_modules_that_a_page_names_are_there() -> None:
 def lost_names(text: str) -> Iterator[str]:
     """Experiments, choices of groups, benchmarks and files that a page names and nobody has."""
     groups = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir())
-    for name in set(re.findall(r"\+exp=(\w+)", text)) - {"my_study", "my_spread", *EXPERIMENTS}:
+    for name in set(re.findall(r"\+exp=(\w+)", text)) - {"my_study", "my_growth", *EXPERIMENTS}:
         yield f"+exp={name}"
     for group, name in re.findall(rf"`(?:[^`\n]* )?({'|'.join(groups)})=(\w+)(?=[` ])", text):
         if not (CONF / group / f"{name}.yaml").is_file() and name not in ("NAME", "mine"):

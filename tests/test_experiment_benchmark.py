@@ -63,6 +63,7 @@ def test_terminal_and_page_show_both(toy_run: Path) -> None:
     page = (toy_run / "report.html").read_text()
     for name in ("benchmark", "attractors", "trajectories"):
         assert f'id="figure-{name}"' in page
+    assert "Identified by ours" in page  # the last variant that makes models
     assert log.count("ALASSO, thesis") == 3
     italic = next(row for row in page.split("<tr ") if ">100/92</td>" in row)
     assert italic.startswith('class="italic"><td>ALASSO, thesis</td>')

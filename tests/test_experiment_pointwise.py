@@ -59,7 +59,7 @@ def test_the_summary_counts_the_points(toy_run: Path) -> None:
     assert found["n_points"] == found["n_valid"] == 30
     assert found["status"] == {"fitted": 30}
     assert found["points_per_s"] == pytest.approx(30 / found["wall_s"])
-    assert 1 <= found["regimes"] == len(found["equations"]) <= 3
+    assert 1 <= found["n_regimes"] == len(found["equations"]) <= 3
 
 
 def test_the_file_holds_every_map(toy_run: Path) -> None:
@@ -70,7 +70,7 @@ def test_the_file_holds_every_map(toy_run: Path) -> None:
         for name in ("r2_test", "n_terms"):
             assert result[name].dims == ("equation", "z", "r")
         assert result["status"].attrs["flag_meanings"].split()[0] == "fitted"
-        assert int(result["regime"].max()) + 1 == summary_of(toy_run)["regimes"]
+        assert int(result["regime"].max()) + 1 == summary_of(toy_run)["n_regimes"]
         assert ((result["confidence"] >= 0) & (result["confidence"] <= 1)).all()
 
 
@@ -145,7 +145,7 @@ def test_a_study_that_selects_nothing_is_a_result(tmp_path: Path) -> None:
     found = programs.computed(composed(*overrides, "terms=[n_i*u_iz]", "selection=ebic"))
     assert found.summary["n_valid"] == 3
     assert found.summary["equations"] == [{"n_i": {}, "n_n": {}}]
-    assert set(found.outcome.figures()) == {"regimes", "quality"}
+    assert set(found.report.figures) == {"regimes", "quality"}
     found.check_figures("regimes", "quality")
 
 

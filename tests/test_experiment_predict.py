@@ -2,6 +2,7 @@ import re
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,11 +11,12 @@ from omegaconf import DictConfig
 
 from benchmarks import known_laws
 from ep2sindy.app.runner import run_config
+from ep2sindy.app.schema import study_of
+from ep2sindy.model.comparison import Status
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import map_points
-from ep2sindy.report.document import Text
-from ep2sindy.studies.point_sources import expand
-from ep2sindy.studies.points import Outcome
+from ep2sindy.studies import points as studied
+from ep2sindy.studies.law_tables import FoundLaw, find_law
 from tests import programs
 from tests.models import lienard
 from tests.programs import summary_of
@@ -43,25 +45,37 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_run_leaves_a_law_tables_figures_and_a_summary(folder: Path) -> None:
     summary = summary_of(folder)
-    law = summary["law"]
-    assert law["fit"] == min(law["errors"], key=lambda fit: law["errors"][fit])
-    assert set(law["errors"]) == {"conserving", "conserving_refined"}
+    law, headline = summary["law"], summary["headline"]
+    trials = {trial["fit"]: trial for trial in summary["trials"]}
+    assert set(trials) == {"conserving", "conserving_refined"}
+    assert law["fit"] == min(trials, key=lambda fit: trials[fit]["error"])
+    chosen = trials[law["fit"]]
+    assert chosen["chosen"]
     assert law["cycle"] == "all"
-    assert law["terms"]["n_i"] == ["n_i", "n_n", "n_i*n_n", "n_i^2*n_n"]
+    assert chosen["terms"].startswith("n_i: n_i, n_n, n_i*n_n, n_i^2*n_n; n_n: 1, ")
     assert law["exact"][0] == "n_i: n_n == -1 * n_n: n_n"
     assert law["exact"][3] == "n_n: 1 == 4.58e+22 * mdot_mg_s"
-    assert law["functions"] == ["1", "V_D_V", "mdot_mg_s"]
-    assert law["n_numbers"] == 15
+    assert (chosen["functions"], chosen["numbers"]) == ("1, V_D_V, mdot_mg_s", 15)
+    assert set(summary["models"]) == {
+        *(f"point_{k}_{fit}" for k in range(4) for fit in (*trials, "law"))
+    }
     quiet = [p for p in summary["points"] if p["status"] != "oscillating"]
     assert [(p["V_D_V"], p["mdot_mg_s"]) for p in quiet] == [(150.0, 2.0)]
-    assert law["oscillating_or_not"]["points"] == 5
     tables = {path.stem: pd.read_csv(path) for path in (folder / "tables").glob("*.csv")}
     assert len(tables["laws"]) == 27
     assert len(tables["left_out"]) == 4
     assert len(tables["map"]) == 4
     assert {p.stem for p in (folder / "figures").glob("*.png")} >= {"left_out", "laws"}
-    assert law["left_out"]["n_lives"] == (tables["left_out"]["status"] == "sustained").sum()
-    assert law["left_out"]["window_error"] == pytest.approx(law["errors"][law["fit"]])
+    assert headline["n_lives"] == (tables["left_out"]["status"] == "sustained").sum()
+    assert headline["window_error"] == pytest.approx(chosen["error"])
+    points = tables["points"]
+    right = (points["status"] == "oscillating") == (points["law"] == "sustained")
+    assert headline["map_right"] == right.mean()
+    alone = tables["coefficients"].set_index(["model", "state", "term"])["coef"]
+    both = tables["law_coefficients"].set_index(["V_D_V", "mdot_mg_s", "state", "term"])
+    at = (*points.loc[1, ["V_D_V", "mdot_mg_s"]], "n_i", "n_n")
+    assert both["law"][at] == alone["point_1_law", "n_i", "n_n"]
+    assert both["alone"][at] == alone[f"point_1_{law['fit']}", "n_i", "n_n"]
     page = (folder / "report.html").read_text()
     assert "9 coefficients of 3 functions each, 15 numbers, from 4 records" in page
 
@@ -86,13 +100,13 @@ def test_the_law_of_a_run_gives_models_in_python(folder: Path) -> None:
 
 
 def test_ranges_of_points_are_every_combination_once() -> None:
-    blocks = [{"a": [1.0, 2.0], "b": [3.0, 4.0]}, {"a": 2.0, "b": [4.0, 5.0]}]
-    found = expand(blocks, ["a", "b"])
-    assert [(p["a"], p["b"]) for p in found] == [(1, 3), (1, 4), (2, 3), (2, 4), (2, 5)]
-    whole = expand([{"a": 300, "b": 5.0}, {"b": [5], "a": 300.0}], ["a", "b"])
-    assert whole == [{"a": 300, "b": 5.0}]
-    (own,) = expand([{"a": 1.0, "data": {"path": "a.nc"}}], ["a"])
-    assert own == {"a": 1.0, "data": {"path": "a.nc"}}
+    given = "{V_D_V: [280, 320.0], mdot_mg_s: [5, 6]}, {mdot_mg_s: [6.0, 7], V_D_V: 320}"
+    sources = study_of(studied.Study, composed("law=1", f"points=[{given}]"))._given.sources
+    found = [tuple(source.parameters.values()) for source in sources]
+    assert found == [(280, 5), (280, 6), (320, 5), (320, 6), (320, 7)]
+    again = "{V_D_V: 280, mdot_mg_s: 5, data: {duration_s: 1.0e-3}}"
+    with pytest.raises(ValueError, match="once: V_D_V=280, mdot_mg_s=5 comes again"):
+        study_of(studied.Study, composed("law=1", f"points=[{given}, {again}]"))
 
 
 def test_a_map_encloses_the_points_and_has_two_parameters_at_most() -> None:
@@ -130,41 +144,41 @@ def test_points_that_are_quiet_have_no_law(tmp_path: Path) -> None:
 def test_own_records_make_a_law_of_the_model_that_is_chosen_and_its_line(tmp_path: Path) -> None:
     held = "+models.held={terms: {n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}, known: {n_n: {n_i: {1: 1}}}}"
     found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2), held))
-    assert found.log.count("<- chosen") == 1
-    assert re.search(r"held( \(refined\))?  <- chosen", found.log)
-    table = found.outcome.tables()["trials"]
+    table = found.report.tables["trials"]
+    assert table["fit"][table["chosen"]].item().startswith("held")
     assert table["fit"].tolist() == ["own", "own_refined", "held", "held_refined"]
     assert table["numbers"].tolist() == [8, 8, 6, 6]
     law = OperatingLaw.load(found.folder / "law.json")
     np.testing.assert_allclose(law.at(a=1.0).terms("n_i")["n_i"], 1.0, atol=1e-3)
-    assert set(found.outcome.figures()) == {"laws", "left_out", "map"}
-    found.check_figures(*found.outcome.figures())
+    assert set(found.report.figures) == {"laws", "left_out", "map"}
+    found.check_figures(*found.report.figures)
     log = " ".join(found.log.split())
-    assert "Found: a law over a, by held" in log
-    assert "left out one at a time, 3 of 3 points live" in log
-    assert "f (mHz)" in log
-    said_by_the_empty(found.outcome)
+    assert re.search("Found: a law of held.* over a, by which 3 of 3 points left out live", log)
+    assert re.search(r"\d mHz", log)
 
 
-def said_by_the_empty(outcome: Outcome) -> None:
-    """A map on which nothing oscillates is no figure; the page says so instead."""
-    assert outcome.law is not None
-    still = [replace(point, status=Status.DECAYS, frequency_Hz=np.nan) for point in outcome.law.map]
-    quiet = replace(outcome, law=replace(outcome.law, map=still))
-    assert set(quiet.figures()) == {"laws", "left_out"}
-    assert quiet.in_short().picture == "left_out"
-    (last,) = (section for section in quiet.sections() if section.title == "Where it oscillates")
-    said = [block.text for block in last.blocks if isinstance(block, Text)]
-    assert said[1] == "Nowhere on the map does the law's model oscillate."
+def test_a_map_on_which_nothing_oscillates_is_no_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def still(*given: Any, **more: Any) -> FoundLaw:
+        found = find_law(*given, **more)
+        rest = [replace(point, status=Status.DECAYS, frequency_Hz=np.nan) for point in found.map]
+        return replace(found, map=rest)
+
+    monkeypatch.setattr(studied, "find_law", still)
+    found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2)))
+    assert set(found.report.figures) == {"laws", "left_out"}
+    assert found.report.result.picture == "left_out"
+    assert "Nowhere on the map does the law's model oscillate." in found.log
 
 
 def test_without_a_model_the_terms_are_searched_for(tmp_path: Path) -> None:
     records = own_records(tmp_path, 0.6, 0.9, 1.2)
-    found = programs.computed(composed(*records, "models=null", "degree=3", "map_points=1"))
-    assert [trial.name for trial in found.outcome.law.trials] == [
-        "found_1", "found_1_refined", "found_2", "found_2_refined",
-    ]  # fmt: skip
-    terms = found.summary["law"]["terms"]  # x' = y is the best of few terms, and of all
+    found = programs.computed(composed(*records, "models=null", "+degree=3", "map_points=1"))
+    names = [trial["fit"] for trial in found.summary["trials"]]
+    assert names == ["found_1", "found_1_refined", "found_2", "found_2_refined"]
+    terms = found.summary["models"]["point_0_law"]["equations"]
+    # x' = y is the best of few terms, and of all.
     assert {state: set(own) for state, own in terms.items()} == {
         "n_i": {"n_i", "n_n", "n_i^3"}, "n_n": {"n_i"},
     }  # fmt: skip
@@ -181,7 +195,7 @@ def test_of_two_cycles_the_law_is_that_of_the_one_with_most_records(tmp_path: Pa
     (said,) = [each for each in found.warnings if "two cycles coexist" in each]
     assert "the law is that of the 5 points on the strong one" in said
     assert said.endswith("on the other are a=0.7, a=0.8")
-    points = found.outcome.tables()["points"].set_index("a")["branch"]
+    points = found.report.tables["points"].set_index("a")["branch"]
     assert points.to_dict() == {a: "weak" if a in values[2:4] else "strong" for a in values}
     law = OperatingLaw.load(found.folder / "law.json")
     assert law.points[:, 0].tolist() == [0.5, 0.6, 0.9, 1.0, 1.1]

@@ -15,9 +15,7 @@ from ep2sindy.figures import breathing
 from ep2sindy.figures.breathing import curves_figure, stability_figure
 from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies import points as studied
-from ep2sindy.studies.point_sources import point_sources
 from ep2sindy.studies.scan import scan_points
-from ep2sindy.studies.simulate import Outcome
 from ep2sindy.studies.source import DivergedError, amiss, check_recorded, compile_kernels, doubts
 from tests import programs
 from tests.programs import summary_of
@@ -72,16 +70,21 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_keeps_its_field_and_says_what_it_did(one: Path, field: xr.Dataset) -> None:
     summary = summary_of(one)
-    assert summary["status"] == field.attrs["status"] == "oscillating"
-    assert summary["I_d_mean"] == pytest.approx(float(field["I_d"].mean()))
-    assert summary["thrust_N"] == pytest.approx(float(field["thrust"].mean()))
-    assert summary["initial"] == "guessed profiles"
-    power = summary["power_W"]
+    run = summary["performance"]["run"]
+    assert run["status"] == field.attrs["status"] == "oscillating"
+    assert (
+        run["I_d_mean"]
+        == summary["headline"]["run/I_d_mean"]
+        == pytest.approx(float(field["I_d"].mean()))
+    )
+    assert run["thrust_N"] == pytest.approx(float(field["thrust"].mean()))
+    assert run["initial"] == "guessed profiles"
+    power = {name: row["power_W"] for name, row in summary["power"].items()}
     parts = sum(value for name, value in power.items() if name != "P_in")
     assert parts == pytest.approx(power["P_in"])
     assert power["stored"] == pytest.approx(0.0, abs=0.02 * power["P_in"])  # nothing is lost
     log = log_of(one)
-    assert f"oscillating, {summary['cycle']} cycle, from guessed profiles" in log
+    assert f"oscillating, {run['cycle']} cycle, from guessed profiles" in log
     assert "out/in mass 1.0000, energy 1.0000" in log
 
 
@@ -113,11 +116,10 @@ def test_fields_over_r_are_averaged_by_area(field: xr.Dataset) -> None:
     both.attrs = field.attrs
     expected = (0.04 + 2.0 * 0.05) / 0.09 * field["n_i"].values
     np.testing.assert_allclose(breathing.along_z(both["n_i"]), expected, rtol=1e-5)
-    outcome = Outcome(both, periods=3.0, f_max_Hz=None)
-    for name, figure in outcome.figures().items():
-        assert all(ax.has_data() for ax in figure.draw().axes)
-        assert ("Averaged over r" in figure.caption) == (name in ("profiles", "maps"))
-    assert outcome.tables()["profiles"]["n_i_mean"].to_numpy() == pytest.approx(
+    window = slice(0, 100)
+    for figure in (breathing.profile_figure(both), breathing.space_time_figure(both, window)):
+        assert all(ax.has_data() for ax in figure.axes)
+    assert breathing.profile_table(both)["n_i_mean"].to_numpy() == pytest.approx(
         expected.mean(axis=0), rel=1e-5
     )
 
@@ -187,7 +189,8 @@ def test_data_that_are_no_simulation_are_refused(predator_prey: Path, tmp_path: 
 def test_a_run_that_breaks_at_once_is_reported(tmp_path: Path) -> None:
     folder = run_config(composed(*toy(tmp_path), "data.operating_point.voltage=5000.0"))
     summary = summary_of(folder)
-    assert (summary["status"], summary["n_samples"]) == ("diverged", 0)
+    run = summary["performance"]["run"]
+    assert (run["status"], run["n_samples"], run["thrust_N"]) == ("diverged", 0, None)
     assert summary["warnings"] == ["the simulation diverged: the end of its record is no physics"]
     assert 'class="warning">the simulation diverged' in (folder / "report.html").read_text()
 
@@ -196,7 +199,7 @@ def test_an_operating_point_that_broke_has_a_row_of_its_own(tmp_path: Path) -> N
     point = "points=[{V_D_V: 5000.0, mdot_mg_s: 5.0}]"
     config = programs.composed("+exp=parametric", *toy(tmp_path), point)
     study = study_of(studied.Study, config)
-    (source,) = point_sources(study.source, study.parameters, study.points)
+    (source,) = study._given.sources
     opened = source.open([])
     assert (opened.status, opened.run) == ("diverged", None)
 

@@ -11,6 +11,7 @@ import pytest
 from ep2sindy.app.arguments import mend
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.run_files import FilePattern, propose_pattern
+from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.studies.points import Study
 from tests.models import lienard
 from tests.programs import Computed, composed, computed, ended
@@ -145,12 +146,12 @@ def test_files_make_a_law_over_the_quantity_of_their_names(here: Path) -> None:
     found = predicted(
         here, "{n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}", "+models.own.known={n_n:{n_i:{1:1.0}}}"
     )
-    assert found.outcome.tables()["points"]["a"].tolist() == [0.6, 0.9, 1.2]
-    law = found.outcome.law.law
+    assert found.report.tables["points"]["a"].tolist() == [0.6, 0.9, 1.2]
+    law = OperatingLaw.load(found.folder / "law.json")
     assert law.at(a=1.0).terms("n_i")["n_i"] == pytest.approx(1.0, abs=1e-3)
     assert "left out, for their names hold no number there: aold.csv" in found.log
     assert not [text for text in found.warnings if "lives by the law" in text]
-    said = "models hold a known inflow, models.own.known.n_n.n_i.1=1, which as shipped is"
+    said = "models hold known coefficients, models.own.known={'n_n': {'n_i': {'1': 1.0}}}, which as"
     assert said in " ".join(found.log.split())
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from ep2sindy.library.equations import equation_html
 from ep2sindy.report.folder import RunFolder
-from ep2sindy.runtime.files import WriteError, fingerprint, replacing, write_text
+from ep2sindy.runtime.files import WriteError, fingerprint, replacing, write_json, write_text
 
 NOW = datetime(2026, 1, 2, 3, 4, 5)
 
@@ -93,9 +93,8 @@ def test_a_folder_that_cannot_be_written_is_an_error_with_a_way_out(tmp_path: Pa
 
 
 def test_json_has_null_for_what_is_not_a_number(tmp_path: Path) -> None:
-    folder = RunFolder.create(tmp_path, "x", now=NOW)
-    folder.write_json("summary.json", {"a": [1.0, float("nan")], "b": {"c": float("inf")}})
-    content = json.loads((folder.path / "summary.json").read_text())
+    write_json(tmp_path / "a.json", {"a": [1.0, float("nan")], "b": {"c": float("inf")}})
+    content = json.loads((tmp_path / "a.json").read_text())
     assert content == {"a": [1.0, None], "b": {"c": None}}
 
 

@@ -95,8 +95,9 @@ def left_out(scale: float, states: Sequence[str]) -> pd.DataFrame:
     f = scale * np.array([10.0, 11.0, 12.0])
     shapes = {}
     for state in states:
-        shapes |= {f"amplitude_{state}": [1.0, 1.1, 9.0], f"waveform_{state}": [0.1, 0.2, 3.0]}
-    known = {"enclosed": [False, True, False], "f_kHz": f, "f_model_kHz": 1.01 * f}
+        shapes[f"amplitude_ratio_{state}"] = [1.0, 1.1, 9.0]
+        shapes[f"waveform_error_{state}"] = [0.1, 0.2, 3.0]
+    known = {"enclosed": [False, True, False], "f_kHz": f, "f_error": 0.01}
     return pd.DataFrame({"branch": "all", **known, **shapes})
 
 

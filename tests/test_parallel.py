@@ -131,11 +131,11 @@ def test_a_study_of_points_finds_the_same_numbers_on_dask(address: str, tmp_path
     ]  # fmt: skip
     dask = ["parallel=dask", f"parallel.address='{address}'", f"parallel.timeout_s={PATIENCE_S}"]
     apart, alone = (computed(composed(*given, *own)) for own in (dask, ["parallel=serial"]))
-    assert {name for name, table in apart.outcome.tables().items() if len(table)} >= {
+    assert {name for name, table in apart.report.tables.items() if len(table)} >= {
         "fits", "trials", "left_out", "map",
     }  # fmt: skip
-    for name, table in apart.outcome.tables().items():
-        pd.testing.assert_frame_equal(table, alone.outcome.tables()[name], check_exact=True)
+    for name, table in apart.report.tables.items():
+        pd.testing.assert_frame_equal(table, alone.report.tables[name], check_exact=True)
 
 
 def test_the_error_of_a_piece_arrives(workers: Workers) -> None:

@@ -4,14 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from matplotlib.figure import Figure
+from omegaconf import OmegaConf
 
+from ep2sindy.app.runner import start_run
 from ep2sindy.discovery.regimes import find_regimes
-from ep2sindy.report.page import page_html
-from ep2sindy.report.picture import draw
-from ep2sindy.report.screen import Screen
-from ep2sindy.studies.pointwise import Outcome
+from ep2sindy.studies.pointwise import add_result
 from tests.models import point_study
+from tests.programs import summary_of
 
 TERMS = {"1": "m^-3 s^-1", "n_n": "s^-1", "n_i*u_iz": "m^-1"}
 
@@ -36,39 +35,37 @@ def study() -> xr.Dataset:
     return point_study(coef, weight, lost, terms=TERMS, share=np.abs(weight), draws=draws)
 
 
-def outcome(result: xr.Dataset, *, max_regimes: int = 4) -> Outcome:
-    found = find_regimes(result, rng=np.random.default_rng(0), max_regimes=max_regimes)
-    return Outcome(result, found, None, wall_s=1.0)
+def written(result: xr.Dataset, folder: Path) -> Path:
+    """The folder of a run with this result."""
+    config = OmegaConf.create({"experiment": "toy", "seed": 0, "output": str(folder)})
+    with start_run(config) as report:
+        found = find_regimes(result, rng=np.random.default_rng(0), max_regimes=4)
+        add_result(report, result, found, wall_s=1.0)
+        report.finish(formats=())
+    return report.folder.path
 
 
 @pytest.fixture(scope="module")
-def found() -> Outcome:
-    return outcome(study())
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(study(), tmp_path_factory.mktemp("outputs"))
 
 
-def printed(found: Outcome, folder: Path) -> str:
-    screen = Screen(folder / "run.log")
-    screen.show(found.sections())
-    screen.close()
-    return (folder / "run.log").read_text()
+def said(folder: Path) -> tuple[str, str]:
+    """The log in one line, and the page."""
+    log = " ".join((folder / "run.log").read_text().split())
+    return log, unescape((folder / "report.html").read_text())
 
 
-def page(found: Outcome) -> str:
-    figures = {name: draw(Figure(), b"", each.caption) for name, each in found.figures().items()}
-    return unescape(page_html("a study", found.sections(), figures))
-
-
-def test_equations_without_terms_are_counted(found: Outcome, tmp_path: Path) -> None:
-    assert found.summary()["no_terms"] == {"n_i": 2}
-    for text in (printed(found, tmp_path), page(found)):
+def test_equations_without_terms_are_counted(folder: Path) -> None:
+    assert summary_of(folder)["no_terms"] == {"n_i": 2}
+    for text in said(folder):
         assert "11 fitted, 1 no plasma; no term in n_i' at 2" in text
 
 
-def test_medians_come_with_their_spread_and_the_share_of_points(
-    found: Outcome, tmp_path: Path
-) -> None:
-    text, html = printed(found, tmp_path), page(found)
-    rows = [[cell.strip() for cell in line.split("│")] for line in text.splitlines()]
+def test_medians_come_with_their_spread_and_the_share_of_points(folder: Path) -> None:
+    html = said(folder)[1]
+    lines = (folder / "run.log").read_text().splitlines()
+    rows = [[cell.strip() for cell in line.split("│")] for line in lines]
     for acts, cells in (
         ("bold", ["n_n'", "1", "100%", "1e+22", "1e+22", "7.12e+22", "m^-3 s^-1"]),
         # Two of seven points have it, and it does not act.
@@ -78,20 +75,18 @@ def test_medians_come_with_their_spread_and_the_share_of_points(
         state, term, share = cells[:3]
         row = f'<td>{state}</td><td>{term}</td><td class="number">{share}</td>'
         assert f'<tr class="{acts}">{row}' in html
-    for said in (" ".join(text.split()), html):
-        assert "terms that act, with medians over the regime's points that have them" in said
 
 
-def test_points_of_low_confidence_are_counted(found: Outcome, tmp_path: Path) -> None:
-    for said in (printed(found, tmp_path), page(found)):
-        assert "3 regimes; confidence below 0.5 at 9% of points" in said
-        assert "Regime 1: 3 points, confidence 0.67, below 0.5 at 33%" in said
+def test_points_of_low_confidence_are_counted(folder: Path) -> None:
+    for text in said(folder):
+        assert "3 regimes; confidence below 0.5 at 9% of points" in text
+        assert "Regime 1: 3 points, confidence 0.67, below 0.5 at 33%" in text
 
 
-def test_a_study_without_any_term_has_no_table_of_them() -> None:
+def test_a_study_without_any_term_has_no_table_of_them(tmp_path: Path) -> None:
     result = study()
     for name in ("coef", "weight", "weight_draws", "n_terms"):
         result[name] *= 0.0
-    found = outcome(result)
-    assert found.summary()["no_terms"] == {"n_i": 11, "n_n": 11}
-    assert "points that have it</th>" not in page(found)
+    folder = written(result, tmp_path)
+    assert summary_of(folder)["no_terms"] == {"n_i": 11, "n_n": 11}
+    assert "points that have it</th>" not in said(folder)[1]

@@ -1,5 +1,6 @@
-"""What a study says, on the terminal, the page and in TensorBoard."""
+"""What a study reports: in its folder, on the terminal, the page and in TensorBoard."""
 
+from collections.abc import Callable
 from io import StringIO
 from pathlib import Path
 
@@ -7,16 +8,22 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import ep2sindy as ep
+from ep2sindy.app.runner import start_run
 from ep2sindy.figures.style import hover
 from ep2sindy.report.about import settings_used
-from ep2sindy.report.document import Equation, Picture, Section, Table, Text
+from ep2sindy.report.document import Equation, Picture, Result, Section, Table, Text
 from ep2sindy.report.page import page_html, powers_html
 from ep2sindy.report.picture import draw
+from ep2sindy.report.report import Report
+from ep2sindy.report.results import Metric, ResultTable, View
 from ep2sindy.report.screen import WIDTH, Screen, rich_table
 from ep2sindy.report.tensorboard import Board
+from tests.programs import summary_of
 
 ROWS = pd.DataFrame({"n_terms": [1, 2], "r2": [0.5, float("nan")], "text": ["a < b", "[c]"]})
 SECTIONS = [
@@ -163,11 +170,103 @@ def test_a_page_shows_the_figures_there_are() -> None:
     assert "absent" not in page
 
 
-def test_tensorboard_reads_what_a_run_tells_it(tmp_path: Path) -> None:
-    png = tmp_path / "figure.png"
+MODEL = ep.lotka_volterra().model
+SIZES = ResultTable({"one": 2.5, "two": 0.5}, [Metric("size", float, View.ALL, format="{:.1f} m")])
+FOUND = Result("Found: a model", [Text("it is right")], 'ep.read("{}")', picture="line")
+
+
+@pytest.fixture
+def toy(tmp_path: Path) -> DictConfig:
+    return OmegaConf.create({"experiment": "toy", "seed": 3, "output": str(tmp_path)})
+
+
+def line() -> Figure:
     figure = Figure(figsize=(3.0, 2.0))
     figure.subplots().plot(np.arange(3))
-    figure.savefig(png, dpi=100)
+    return figure
+
+
+def test_a_report_that_is_finished_is_whole(toy: DictConfig) -> None:
+    with start_run(toy) as report:
+        report.found(FOUND)
+        report.model("mine", MODEL)
+        report.section("How large")
+        report.table("sizes", SIZES, heading="name")
+        report.table("rows", ROWS, shown=False)
+        report.add(Table(ROWS.iloc[:0], title="nothing"))
+        report.figure("line", line, "A line.")
+        report.warn("amiss")
+        report.when_written(lambda: report.write("end.txt", Path.touch))
+        report.finish(purpose="To try.")
+    folder, summary = report.folder.path, summary_of(report.folder.path)
+    assert [section.title for section in report.sections] == ["Results", "How large"]
+    assert (summary["seed"], summary["warnings"]) == (3, ["amiss"])
+    assert summary["models"]["mine"]["equations"]["x"] == MODEL.terms("x")
+    assert summary["sizes"] == {"one": {"size": 2.5}, "two": {"size": 0.5}}
+    assert summary["rows"][1] == {"n_terms": 2, "r2": None, "text": "[c]"}
+    assert summary["headline"] == {"one/size": 2.5, "two/size": 0.5}
+    coefficients = pd.read_csv(folder / "tables" / "coefficients.csv")
+    assert coefficients["term"].tolist() == ["x", "x*y", "y", "x*y"]
+    assert (folder / "figures" / "line.png").is_file()
+    assert (folder / "end.txt").is_file()
+    page = (folder / "report.html").read_text()
+    place = [page.index(each) for each in ("it is right", "To try.", "amiss", "How large", "2.5 m")]
+    assert place == sorted(place)
+    assert page.count("A line.") == 1  # in the result alone
+    assert "nothing" not in page
+    events = EventAccumulator(str(folder / "tensorboard")).Reload()
+    assert events.Scalars("one/size")[0].value == 2.5
+    assert "line" in events.Tags()["images"]
+
+
+def half_a_study(config: DictConfig) -> None:
+    with start_run(config) as report:
+        report.model("mine", MODEL)
+        report.table("sizes", SIZES, heading="name")
+        report.figure("line", line, "Never drawn.")
+        raise RuntimeError("halfway")
+
+
+def test_what_was_written_outlives_a_later_error(toy: DictConfig) -> None:
+    with pytest.raises(RuntimeError):
+        half_a_study(toy)
+    (folder,) = Path(toy.output, "toy").iterdir()
+    assert ep.SparseModel.load(folder / "models" / "mine.json").text() == MODEL.text()
+    assert pd.read_csv(folder / "tables" / "sizes.csv")["size"].tolist() == [2.5, 0.5]
+    assert "ended early: RuntimeError: halfway" in (folder / "run.log").read_text()
+    assert not {"summary.json", "report.html", "figures"} & {path.name for path in folder.iterdir()}
+
+
+def test_a_study_must_say_what_it_found(toy: DictConfig) -> None:
+    with start_run(toy) as report, pytest.raises(ValueError, match="must say what it found"):
+        report.finish()
+
+
+@pytest.mark.parametrize(
+    ("kind", "add"),
+    [
+        ("model", lambda report: report.model("a", MODEL)),
+        ("table", lambda report: report.table("a", ROWS)),
+        ("table", lambda report: report.samples("a", ROWS)),
+        ("figure", lambda report: report.figure("a", line, "")),
+    ],
+)
+def test_two_of_one_name_are_an_error(
+    kind: str, add: Callable[[Report], None], toy: DictConfig
+) -> None:
+    with start_run(toy) as report:
+        add(report)
+        with pytest.raises(ValueError, match=f"every {kind} .* a name of its own: 'a' came twice"):
+            add(report)
+        if kind == "table":
+            with pytest.raises(ValueError, match="'a' came twice"):
+                report.table("a", SIZES)
+            assert report.tables["a"] is ROWS
+
+
+def test_tensorboard_reads_what_a_run_tells_it(tmp_path: Path) -> None:
+    png = tmp_path / "figure.png"
+    line().savefig(png, dpi=100)
     board = Board(tmp_path / "run" / "tensorboard")
     board.scalars({"loss": 0.5}, step=1)
     board.scalars({"loss": 0.25}, step=2)

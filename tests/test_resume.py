@@ -115,12 +115,12 @@ def check_same(whole: Computed, rest: Computed) -> None:
     times = ["cpu_s", "cpu_s_per_search"]
     assert "going on with the pieces that a broken run had finished" in rest.log
     assert "going on with" not in whole.log
-    for name, table in whole.outcome.tables().items():
-        pair = table, rest.outcome.tables()[name]
+    for name, table in whole.report.tables.items():
+        pair = table, rest.report.tables[name]
         tables = [each.drop(columns=times, errors="ignore") for each in pair]
         pd.testing.assert_frame_equal(*tables, check_exact=True)
-    for name, model in whole.outcome.models().items():
-        assert model.coef.tobytes() == rest.outcome.models()[name].coef.tobytes()
+    for name, model in whole.report.models.items():
+        assert model.coef.tobytes() == rest.report.models[name].coef.tobytes()
 
 
 def test_a_benchmark_goes_on(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

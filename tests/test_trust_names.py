@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -11,15 +10,15 @@ import pandas as pd
 import pytest
 import xarray as xr
 from matplotlib.figure import Figure
+from omegaconf import OmegaConf
 from programs import composed
 
 import ep2sindy as ep
-from ep2sindy.app.runner import run_config
+from ep2sindy.app.runner import run_config, start_run
 from ep2sindy.app.schema import value_of
 from ep2sindy.figures.style import hover
 from ep2sindy.report.about import About
 from ep2sindy.report.document import Equation, Link, Picture, Section, Table, Text
-from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import draw
 from ep2sindy.report.screen import Screen
@@ -55,19 +54,18 @@ def test_variables_are_words(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["../../x", "/tmp/x", "a/b", "a\\b", "a\nb"])
 def test_a_run_writes_nowhere_but_in_its_folder(name: str, tmp_path: Path) -> None:
-    folder = RunFolder.create(tmp_path, "toy", now=datetime(2020, 1, 1))
-    before = sorted(tmp_path.rglob("*"))
-    model = ep.lorenz().model
-    for write in (
-        lambda: folder.write_text(name, ""),
-        lambda: folder.write_json(name, {}),
-        lambda: folder.write_model(name, model),
-        lambda: folder.write_table(name, pd.DataFrame()),
-        lambda: folder.write_figure(name, Figure()),
-    ):
-        with pytest.raises(ValueError, match="must be that of a file, and no path"):
-            write()
-    assert sorted(tmp_path.rglob("*")) == before
+    config = OmegaConf.create({"experiment": "toy", "seed": 0, "output": str(tmp_path)})
+    with start_run(config) as report:
+        before = sorted(tmp_path.rglob("*"))
+        for write in (
+            lambda: report.model(name, ep.lorenz().model),
+            lambda: report.table(name, pd.DataFrame()),
+            lambda: report.write(name, Path.touch),
+            lambda: report.folder.write_figure(name, Figure()),
+        ):
+            with pytest.raises(ValueError, match="must be that of a file, and no path"):
+                write()
+        assert sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.parametrize("name", ["../../x", "<b>x</b>"])

@@ -24,13 +24,13 @@ from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import by_place
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text, cell_text
+from ep2sindy.report.models import equations
 from ep2sindy.report.page import TEMPLATES, page_html
 from ep2sindy.report.picture import read_png
 from ep2sindy.report.results import in_words, value_text
 from ep2sindy.report.screen import Screen
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import say
-from ep2sindy.studies.views import display_equation
 
 ABOUT = """Compares runs: settings that differ, headline figures, equations with their intervals.
 A run is the folder that it printed last, such as outputs/breathing/2025-01-31_101500. Of a sweep,
@@ -170,7 +170,9 @@ def compare_runs(runs: Sequence[ReadRun], figures: Sequence[str], *, beside: Pat
     ]
     versions = _differing({run.label: run.provenance["versions"] for run in runs}, "package")
     settings = _differing({run.label: run.settings for run in runs}, "setting")
-    pictures = {name: [Picture(f"{run.label}-{name}") for run in runs] for name in figures}
+    pictures: dict[str, list[Block]] = {
+        name: [Picture(f"{run.label}-{name}") for run in runs] for name in figures
+    }
     return [
         Section("Runs", [Table(pd.DataFrame(rows)), *versions]),
         Section("Settings that differ", settings or [Text("None: they are the same.")]),
@@ -220,9 +222,9 @@ def _models(runs: Sequence[ReadRun]) -> list[Section]:
     for name in dict.fromkeys(name for run in runs for name in run.models):
         models = {run.label: run.models[name] for run in runs if name in run.models}
         blocks: list[Block] = [
-            display_equation(model, state, clock, lead=label)
+            equation
             for label, model in models.items()
-            for state in model.states
+            for equation in equations(model, clock, lead=label)
         ]
         if len(models) < len(runs):
             blocks.append(Text(f"Only in {', '.join(models)}."))

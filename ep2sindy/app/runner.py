@@ -23,6 +23,7 @@ from ep2sindy.report.folder import FORMATS, RunFolder
 from ep2sindy.report.report import Report
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
+from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.progress import Bars
 from ep2sindy.studies.study import Experiment
 from ep2sindy.trust.user_code import load_user_module
@@ -120,7 +121,7 @@ def formats_of(config: DictConfig) -> list[str]:
 def start_run(config: DictConfig) -> Iterator[Report]:
     """A new run folder that already holds its config and provenance."""
     folder = RunFolder.create(Path(config.output), config.experiment, now=datetime.now())
-    folder.write_text("config.yaml", OmegaConf.to_yaml(config, resolve=True))
+    write_text(folder.file("config.yaml"), OmegaConf.to_yaml(config, resolve=True))
     provenance = folder.write_provenance(seed=config.seed, command=["ep2sindy", *sys.argv[1:]])
     screen = Screen(folder.path / "run.log")
     board = Board(folder.path / "tensorboard")

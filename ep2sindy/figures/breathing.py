@@ -37,6 +37,7 @@ from ep2sindy.signals.spectrum import power_spectrum
 
 PROFILES = ("n_i", "n_n", "u_iz", "T_e_eV", "E_z", "ionization")
 MAPS = {"n_n": "viridis", "n_i": "magma"}  # legible with any colour vision, and in grey
+ENDS = ("mean", "low", "high", "min", "max")  # of a profile
 BAND_PERCENT = (5, 95)  # inner band of a profile, in percentiles
 READABLE = {"m/s": (1e-3, "km/s"), "V/m": (1e-3, "kV/m")}
 MS, KHZ = 1e3, 1e-3
@@ -92,27 +93,27 @@ def current_spectrum_figure(
     return figure
 
 
-def profile_table(field: xr.Dataset) -> dict[str, Float[np.ndarray, "5 cells"]]:
-    """Mean, 5 %, 95 %, minimum and maximum in time of each variable along the axis."""
-    found = {}
+def profile_table(field: xr.Dataset) -> pd.DataFrame:
+    """Along the axis z (m), of each variable: mean in time, 5 %, 95 %, minimum and maximum."""
+    columns = {"z": field["z"].values}
     for name in (name for name in PROFILES if name in field):
         values = along_z(field[name])
         low, high = np.percentile(values, BAND_PERCENT, axis=0)
-        found[name] = np.stack(
-            [values.mean(axis=0), low, high, values.min(axis=0), values.max(axis=0)]
-        )
-    return found
+        profiles = (values.mean(axis=0), low, high, values.min(axis=0), values.max(axis=0))
+        columns |= {f"{name}_{end}": x for end, x in zip(ENDS, profiles, strict=True)}
+    return pd.DataFrame(columns)
 
 
 def profile_figure(field: xr.Dataset) -> Figure:
     """Mean profiles with bands of 5 to 95 % and of the full range; the channel's exit is dashed."""
-    profiles = profile_table(field)
+    table, names = profile_table(field), [name for name in PROFILES if name in field]
     figure, axes = make_grid(
-        len(profiles), width=3.0, height=2.5, extra=0.4, sharex=True,
+        len(names), width=3.0, height=2.5, extra=0.4, sharex=True,
         x_label="distance from the anode (cm)",
     )  # fmt: skip
     z = CM * field["z"].values
-    for ax, (name, values) in zip(axes, profiles.items(), strict=True):
+    for ax, name in zip(axes, names, strict=True):
+        values = table[[f"{name}_{end}" for end in ENDS]].to_numpy().T
         (mean, low, high, least, most), unit = scale_to_prefix(values, field[name].attrs["units"])
         ax.fill_between(z, least, most, color=COLOURS[5], alpha=0.3, lw=0, label="whole range")
         label = f"{BAND_PERCENT[0]} to {BAND_PERCENT[1]} % of the time"

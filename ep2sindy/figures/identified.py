@@ -102,6 +102,7 @@ def frontier_figure(points: pd.DataFrame) -> Figure:
         ax.set_xlabel("duration (s)")
     axes[0].set_xscale("log")
     axes[0].set_yscale("log")
+    axes[0].xaxis.set_minor_formatter("")  # decades alone: others overlap
     axes[0].set_ylabel("sampling rate (Hz)")
     legend_above(figure, [Line2D([], [], **marker) for marker in _MARKERS.values()])
     return figure

@@ -36,7 +36,7 @@ MAX_LINES = 5  # number of the other parameters' values that are drawn
 FADED = 0.35  # opacity of a map's colours beyond the points that the law was fitted to
 WRONG = "#d00000"  # marks where the law says otherwise than the record; no colour of the map
 MARKERS = "os^Dv<>"  # seven, of eight colours: a pair recurs after 56
-PUBLISHED = "published"  # the kind of estimate that comes from a publication
+PUBLISHED = "thesis"  # the kind of estimate that comes from a publication
 
 FILLED: dict[str, Any] = {"marker": "o", "ms": 3.5}
 OPEN: dict[str, Any] = {"marker": "o", "ms": 6.0, "mfc": "none"}
@@ -156,7 +156,8 @@ def left_out_figure(rows: pd.DataFrame) -> Figure:
 def _draw_frequencies(ax: Axes, rows: pd.DataFrame) -> None:
     """Draw frequencies of the free runs against those of the records."""
     factor, unit = frequency_scale(rows["f_kHz"])
-    known = factor * rows[["f_kHz", "f_model_kHz"]].to_numpy(float)
+    f, ratio = factor * rows["f_kHz"], 1.0 + rows["f_error"]
+    known = np.stack([f, f * ratio], axis=1)
     for enclosed, words in ((True, "enclosed by the others"), (False, "outside them")):
         face = COLOURS[0] if enclosed else "white"
         mark: dict[str, Any] = {"color": COLOURS[0], "mfc": face, "ms": 6, "label": words}
@@ -172,9 +173,10 @@ def _draw_frequencies(ax: Axes, rows: pd.DataFrame) -> None:
 def _draw_shapes(ax: Axes, rows: pd.DataFrame) -> None:
     """Draw waveform errors against amplitude errors."""
     names = [str(name) for name in rows]
-    states = [name.removeprefix("amplitude_") for name in names if name.startswith("amplitude_")]
+    of = "amplitude_ratio_"
+    states = [name.removeprefix(of) for name in names if name.startswith(of)]
     for state, marker, colour in zip(states, cycle(MARKERS), cycle(MORE_COLOURS), strict=False):
-        off, error = 100.0 * (rows[f"amplitude_{state}"] - 1.0), rows[f"waveform_{state}"]
+        off, error = 100.0 * (rows[f"{of}{state}"] - 1.0), rows[f"waveform_error_{state}"]
         near = (off.abs() <= FAR_PERCENT) & (error <= FAR_WAVEFORM)
         mark: dict[str, Any] = {"ls": "none", "marker": marker, "color": colour, "ms": 6}
         ax.plot(off[near], error[near], mfc="none", label=f"${latex_name(state)}$", **mark)
@@ -310,8 +312,8 @@ def trends_figure(
     estimates: a column per parameter, then kind, quantity, value, low, high; a column of panels per
     quantity, in several blocks if they are many. The first kind is drawn filled, the others open.
     laws: by quantity, of the first kind, drawn as lines between its points. trends: one row of
-    panels each, (parameter, values of the others). labels: names of parameters, quantities and
-    kinds on axes and in the legend; by default their own.
+    panels each, (parameter, values of the others). labels: names of parameters and quantities on
+    axes; by default their own.
     """
     marks: dict[str, dict[str, Any]] = {
         kind: {"color": colour, "marker": marker, "ms": 5, "mfc": "none" if k else colour}
@@ -332,7 +334,7 @@ def trends_figure(
             if at and ax.get_subplotspec().is_first_col():
                 ax.set_ylabel(f"at {style.held_label(at, labels)}".replace(", ", ",\n"))
     entries = [
-        Line2D([], [], ls="none", label=labels.get(kind, kind), **mark)
+        Line2D([], [], ls="none", label=kind, **mark)
         for kind, mark in marks.items()
     ]
     if laws:

@@ -63,15 +63,9 @@ def settings_used(settings: Mapping[str, Any], keys: Collection[str]) -> dict[st
     shown = [key for key in settings if key in keys and key not in ASIDE]
     rank = {key: k for k, key in enumerate(ASKED)}
     ordered = sorted(shown, key=lambda key: rank.get(key, len(rank)))
-    found = {ASKED.get(key, key.replace("_", " ")): _bare(settings[key]) for key in ordered}
-    return {name: text for name, text in found.items() if text}
-
-
-def _bare(value: Any) -> str:
-    """Text of a setting, without the parentheses of a nested mapping."""
-    text = setting_text(value)
-    nameless = isinstance(value, Mapping) and "_target_" not in value
-    return text[1:-1] if nameless else text
+    found = {ASKED.get(key, key.replace("_", " ")): setting_text(settings[key]) for key in ordered}
+    bare = {n: text[1:-1] if text.startswith("(") else text for n, text in found.items()}
+    return {name: text for name, text in bare.items() if text}
 
 
 def setting_text(value: Any) -> str:
@@ -84,12 +78,10 @@ def setting_text(value: Any) -> str:
     if isinstance(value, Mapping):
         parts = {str(k): setting_text(v) for k, v in value.items() if k != "_target_"}
         inner = ", ".join(f"{k} {text}" for k, text in parts.items() if text)
-        if target := value.get("_target_"):
-            name = str(target).rpartition(".")[2]
-            if not inner and parts:  # none of its parts is set
-                return ""
-            return f"{name} ({inner})" if inner else name
-        return f"({inner})" if inner else ""
+        name = str(value.get("_target_", "")).rpartition(".")[2]
+        if inner:
+            return f"{name} ({inner})".lstrip()
+        return "" if parts else name  # none of its parts is set
     if isinstance(value, Sequence) and not isinstance(value, str):
         return ", ".join(map(setting_text, value))
     return f"{value:.6g}" if isinstance(value, float) else str(value)

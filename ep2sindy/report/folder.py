@@ -16,11 +16,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pandas as pd
-
-from ep2sindy.model.model import SparseModel
 from ep2sindy.report.picture import DPI
-from ep2sindy.runtime.files import sweep, write_bytes, write_json, write_text
+from ep2sindy.runtime.files import sweep, write_bytes, write_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,18 +66,6 @@ class RunFolder:
             raise ValueError(f"a result's name must be that of a file, and no path: {name!r} came")
         return self.path / folder / name
 
-    def write_text(self, name: str, text: str) -> None:
-        write_text(self.file(name), text)
-
-    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        write_json(self.file(name), content)
-
-    def write_model(self, name: str, model: SparseModel) -> None:
-        model.save(self.file(f"{name}.json", "models"))
-
-    def write_table(self, name: str, table: pd.DataFrame) -> None:
-        write_text(self.file(f"{name}.csv", "tables"), table.to_csv(index=False))
-
     def write_figure(self, name: str, figure: Figure, formats: Sequence[str] = ("png",)) -> bytes:
         """Write a figure in several formats with the same layout; returns the content of the PNG.
 
@@ -103,7 +88,7 @@ class RunFolder:
             "command": list(command),
             "versions": {"python": platform.python_version(), **versions()},
         }
-        self.write_json("provenance.json", found)
+        write_json(self.file("provenance.json"), found)
         return found
 
 

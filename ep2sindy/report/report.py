@@ -22,7 +22,7 @@ from ep2sindy.report.picture import Drawn, draw
 from ep2sindy.report.results import ResultTable, json_rows
 from ep2sindy.report.screen import PAGE, Screen, renderables
 from ep2sindy.report.tensorboard import Board
-from ep2sindy.runtime.files import replacing
+from ep2sindy.runtime.files import replacing, write_json, write_text
 from ep2sindy.runtime.progress import Advance, Bars, Progress, count_pieces
 
 if TYPE_CHECKING:
@@ -69,12 +69,13 @@ class Report:
         self.add(*blocks)
 
     def add(self, *blocks: Block | str) -> None:
-        """Add texts, equations and tables to the section."""
+        """Add texts, equations and tables to the section; a table without rows is left out."""
         shown = [Text(each) if isinstance(each, str) else each for each in blocks]
-        if shown and not self.sections:
+        if blocks and not self.sections:
             self.section("Results")
-        if shown:
-            self.sections[-1].blocks.extend(shown)
+        for block in shown:
+            if not isinstance(block, Table) or len(block.rows):
+                self.sections[-1].blocks.append(block)
 
     def model(
         self,
@@ -90,7 +91,8 @@ class Report:
         clock: in whose time unit it is shown, by default the model's own. held: what its
         coefficients obey, for equations by process. shown: False leaves it out of the page.
         """
-        self.folder.write_model(name, model)
+        _once("model", name, self.models)
+        model.save(self.folder.file(f"{name}.json", "models"))
         self.models[name] = model
         self.summary.setdefault("models", {})[name] = model_facts(model, held)
         if shown:
@@ -115,6 +117,7 @@ class Report:
         heading, by_state: see `ResultTable.csv`. shown: False leaves it out of screen and page; or
         another form of it for these. title, note, bold, page_only: of the table as it is shown.
         """
+        _once("table", name, [*self.tables, *self.summary])
         if isinstance(rows, ResultTable):
             frame, self.summary[name] = rows.csv(heading, by_state=by_state), rows.json()
             self.headline |= rows.headline()
@@ -122,18 +125,19 @@ class Report:
         else:
             frame, self.summary[name], seen = rows, json_rows(rows), rows
         self.samples(name, frame)
-        if isinstance(shown, Table):
-            self.add(shown)
-        elif shown and len(seen):
-            self.add(Table(seen, title=title, note=note, bold=bold, page_only=page_only))
+        if shown:
+            drawn = Table(seen, title=title, note=note, bold=bold, page_only=page_only)
+            self.add(shown if isinstance(shown, Table) else drawn)
 
     def samples(self, name: str, frame: pd.DataFrame) -> None:
         """Add samples, such as those that a figure draws: tables/NAME.csv alone."""
-        self.folder.write_table(name, frame)
+        _once("table", name, self.tables)
+        write_text(self.folder.file(f"{name}.csv", "tables"), frame.to_csv(index=False))
         self.tables[name] = frame
 
     def figure(self, name: str, draw: Callable[[], Figure], caption: str) -> None:
         """Add a figure, figures/NAME.png, which is drawn once all else is written."""
+        _once("figure", name, self.figures)
         self.figures[name] = Captioned(draw, caption)
         self.add(Picture(name))
 
@@ -188,12 +192,12 @@ class Report:
             hparams |= by_place(key, self.settings[key])
         self.board.settings(hparams, self.headline)
         about = self._about(purpose, keys)
-        self.folder.write_text(
-            PAGE, page_html(self.title, self.sections, drawn, about, result=self.result)
-        )
+        page = page_html(self.title, self.sections, drawn, about, result=self.result)
+        write_text(self.folder.file(PAGE), page)
         named = {"experiment": self.title, "seed": self.seed}
         named |= {"warnings": self.warnings} if self.warnings else {}
-        self.folder.write_json("summary.json", named | self.summary | {"headline": self.headline})
+        found = named | self.summary | {"headline": self.headline}
+        write_json(self.folder.file("summary.json"), found)
         for end in self.ends:
             end()
         self.screen.conclude(self.result, self.folder.path)
@@ -217,3 +221,9 @@ class Report:
             provenance=self.provenance,
             config=(self.folder.path / "config.yaml").read_text("utf-8"),
         )
+
+
+def _once(kind: str, name: str, known: Collection[str]) -> None:
+    """Raise ValueError if there is one of this name: the first would be overwritten."""
+    if name in known:
+        raise ValueError(f"every {kind} of a report needs a name of its own: {name!r} came twice")

@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Flag, auto
-from functools import reduce
 from math import isfinite
-from operator import or_
 from typing import Any, Generic, TypeVar
 
 import pandas as pd
@@ -28,18 +26,8 @@ LABELS = {
     "periods": "periods in phase",
     "r2": "R2",
     "r2_test": "R2 on held-out rows",
-    "n_terms": "number of terms",
-    "d_pareto": "distance to the corner of the front",
-    "deviance": "deviance",
     "identified_percent": "identified (%)",
-    "mean_correct_terms": "correct terms (mean)",
-    "multiplier": "Floquet multiplier",
-    "share_reaching": "share of starts that reach the cycle",
-    "cpu_s": "CPU time (s)",
-    "cpu_ms": "CPU time (ms)",
-    "n_points": "number of points",
-    "map_right": "share of the map that is right",
-    "living": "the model that lives",
+    "d_pareto": "distance to the corner of the front",
 }
 
 
@@ -60,6 +48,7 @@ class View(Flag):
 Record = TypeVar("Record")
 Outer = TypeVar("Outer")
 Metrics = Sequence["Metric[Record]"]
+Values = Sequence[tuple["Metric[Any]", Any]]
 
 
 @dataclass(frozen=True)
@@ -124,17 +113,11 @@ class ResultTable(Generic[Record]):
 
         by_state: a row per record and state instead, in which a metric without states is repeated.
         """
-        rows: list[dict[str, Any]] = []
-        for name, record in self._named():
-            first = {heading: name} if heading else {}
-            values = [(m, m.value(record)) for m in self._in(View.FILES)]
-            if by_state:
-                for state in _states(values):
-                    of_state = {m.key: _of_state(value, state) for m, value in values}
-                    rows.append(first | {"state": state} | of_state)
-            else:
-                columns = [metric.columns(value) for metric, value in values]
-                rows.append(reduce(or_, columns, first))
+        rows = [
+            first | part
+            for first, values in self._rows(heading, View.FILES)
+            for part in _parts(values, Metric.columns, by_state=by_state)
+        ]
         known = None if rows else [*filter(None, [heading]), *(m.key for m in self._in(View.FILES))]
         return pd.DataFrame(rows, columns=known)
 
@@ -145,23 +128,20 @@ class ResultTable(Generic[Record]):
         shown only in a record's first row. Columns in which no cell has a value are left out.
         """
         rows: list[dict[str, object]] = []
-        for name, record in self._named():
-            first: dict[str, object] = {heading: name} if heading else {}
-            if by_state:
-                values = [(m, m.value(record)) for m in self._in(View.SCREEN)]
-                rows += _rows_of_states(first, values)
-            else:
-                rows.append(first | self._cells(record))
+        for first, values in self._rows(heading, View.SCREEN):
+            again = {h for m, v in values if not isinstance(v, Mapping) for h in m.cells(v)}
+            for k, part in enumerate(_parts(values, Metric.cells, by_state=by_state)):
+                blank = dict.fromkeys([*first, *again] if k else [], "")
+                rows.append(first | part | blank)
         table = pd.DataFrame(rows)
         empty = [n for n in table if all(cell_text(cell) in ("", "-") for cell in table[n])]
         return table.drop(columns=empty)
 
     def upright(self, heading: str = "quantity") -> pd.DataFrame:
         """A row per metric, and a column of formatted cells per record."""
-        cells = {name: self._cells(record) for name, record in self._named()}
-        headings = list(next(iter(cells.values())))
-        columns = {name: [of[h] for h in headings] for name, of in cells.items()}
-        return pd.DataFrame({heading: headings, **columns})
+        cells = self.screen("").T
+        cells.columns = [name for name, _ in self._named()]
+        return cells.rename_axis(heading).reset_index()
 
     def json(self) -> dict[str, dict[str, Any]] | list[dict[str, Any]]:
         """Metrics by key, of every record by its name or in turn; values by state stay mappings."""
@@ -180,9 +160,11 @@ class ResultTable(Generic[Record]):
                     found["/".join(filter(None, (name, part, metric.key)))] = float(each)
         return found
 
-    def _cells(self, record: Record) -> dict[str, object]:
-        found: dict[str, object] = {}
-        return reduce(or_, (m.cells(m.value(record)) for m in self._in(View.SCREEN)), found)
+    def _rows(self, heading: str, view: View) -> Iterator[tuple[dict[str, Any], Values]]:
+        """The cell of the name, if there is a heading, and the values of every record."""
+        for name, record in self._named():
+            values = [(metric, metric.value(record)) for metric in self._in(view)]
+            yield {heading: name} if heading else {}, values
 
     def _named(self) -> Iterator[tuple[str, Record]]:
         if isinstance(self.records, Mapping):
@@ -231,23 +213,17 @@ def value_text(name: str, value: float, clock: Clock = SECONDS) -> str:
     return cell_text(value)
 
 
-def _states(values: Sequence[tuple[Metric[Any], Any]]) -> list[str]:
-    """States of the first metric that has values by state."""
-    return list(next(value for _, value in values if isinstance(value, Mapping)))
-
-
-def _of_state(value: Any, state: str) -> Any:
-    return value[state] if isinstance(value, Mapping) else value
-
-
-def _rows_of_states(
-    first: dict[str, object], values: Sequence[tuple[Metric[Any], Any]]
-) -> Iterator[dict[str, object]]:
-    """Rows of cells by state; metrics without states are blank after the first row."""
-    for k, state in enumerate(_states(values)):
-        row = {name: "" if k else text for name, text in first.items()} | {"state": state}
+def _parts(
+    values: Values, cells: Callable[[Metric[Any], Any], dict[str, Any]], *, by_state: bool
+) -> Iterator[dict[str, Any]]:
+    """Cells of one record: in one row, or in a row per state of the first metric that has some."""
+    if not by_state:
+        yield {
+            name: cell for metric, value in values for name, cell in cells(metric, value).items()
+        }
+        return
+    for state in next(value for _, value in values if isinstance(value, Mapping)):
+        row = {"state": state}
         for metric, value in values:
-            repeats = k and not isinstance(value, Mapping)
-            cells = metric.cells(_of_state(value, state))
-            row |= {heading: "" if repeats else cell for heading, cell in cells.items()}
+            row |= cells(metric, value[state] if isinstance(value, Mapping) else value)
         yield row

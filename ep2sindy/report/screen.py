@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
@@ -43,28 +44,23 @@ class Screen:
     def __init__(self, log: Path | None = None) -> None:
         self._path = log or Path()
         with writing(self._path):
-            self._log = None if log is None else log.open("a", encoding="utf-8")
-        terminal = Terminal()
-        if not terminal.is_terminal:
-            terminal.width = WIDTH
-        self._consoles: list[Console] = [terminal]
-        if self._log is not None:
-            log_file = Console(file=self._log, width=WIDTH, no_color=True, force_terminal=False)
-            self._consoles.append(log_file)
+            self._file = StringIO() if log is None else log.open("a", encoding="utf-8")
+        self._terminal = Terminal()
+        if not self._terminal.is_terminal:
+            self._terminal.width = WIDTH
+        self._log = Console(file=self._file, width=WIDTH, no_color=True, force_terminal=False)
 
     def print(self, *renderables: RenderableType) -> None:
         """Print text literally, without markup and emoji codes."""
         with on_screen(sys.stdout):
-            _print(self._consoles[0], *renderables)
+            _print(self._terminal, *renderables)
         self._write(*renderables)
 
     def _write(self, *renderables: RenderableType) -> None:
         """Write to run.log only."""
         with writing(self._path):
-            for console in self._consoles[1:]:
-                _print(console, *renderables)
-            if self._log is not None:
-                self._log.flush()
+            _print(self._log, *renderables)
+            self._file.flush()
 
     def log(self, text: str) -> None:
         """Write text to run.log only."""
@@ -90,9 +86,8 @@ class Screen:
         self.print(_text(f"open: {folder / PAGE}"))
 
     def close(self) -> None:
-        if self._log is not None:
-            with writing(self._path):
-                self._log.close()
+        with writing(self._path):
+            self._file.close()
 
 
 def renderables(block: Block) -> Iterator[RenderableType]:

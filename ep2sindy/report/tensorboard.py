@@ -33,20 +33,17 @@ class Board:
 
     def equations(self, texts: Mapping[str, str]) -> None:
         """The equations of all models, by name, as one block of lines in a fixed-width font."""
-        parts = (f"{name}\n{indent(text, '  ')}" for name, text in texts.items())
-        if texts:
-            self.text("equations", "\n\n".join(parts))
-
-    def text(self, name: str, text: str) -> None:
-        """Lines of text unchanged, in a fixed-width font."""
+        if not texts:
+            return
         from tensorboard.compat.proto.summary_pb2 import Summary
         from tensorboard.compat.proto.tensor_pb2 import TensorProto
         from tensorboard.plugins.text.metadata import create_summary_metadata
 
-        lines = "\n".join(f"    {line}" for line in text.splitlines())  # a block of code
+        parts = (f"{name}\n{indent(text, '  ')}" for name, text in texts.items())
+        lines = indent("\n\n".join(parts), "    ", lambda line: True)  # a block of code
         tensor = TensorProto(dtype="DT_STRING", string_val=[lines.encode()])
-        kind = create_summary_metadata(display_name=name, description="")
-        self._add(Summary(value=[Summary.Value(tag=name, metadata=kind, tensor=tensor)]))
+        kind = create_summary_metadata(display_name="equations", description="")
+        self._add(Summary(value=[Summary.Value(tag="equations", metadata=kind, tensor=tensor)]))
 
     def image(self, name: str, png: bytes) -> None:
         """A figure, as the PNG drawn for the folder."""

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.living import balance_figure
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
-from ep2sindy.library.relations import Constraint, Process, constraint
-from ep2sindy.library.roles import constraint_of, process_amounts
+from ep2sindy.library.relations import Constraint, constraint
+from ep2sindy.library.roles import constraint_of
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LimitCycle
@@ -22,15 +20,8 @@ from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
-from ep2sindy.studies.source import (
-    IONS,
-    NEUTRALS,
-    FittedRate,
-    Zones,
-    fitted_rate,
-    rate_r2,
-    recorded_rates,
-)
+from ep2sindy.studies.processes import ComparedProcess, compared_processes, ends_of
+from ep2sindy.studies.source import IONS, NEUTRALS, Zones
 from ep2sindy.studies.views import largest
 
 CAPTION = (
@@ -45,36 +36,6 @@ COUNTERPARTS = (
     "By the record: the coefficients of the same terms by least squares of the recorded process on "
     "them, with its R2 at each instant."
 )
-
-
-@dataclass(frozen=True, eq=False)
-class ComparedProcess:
-    """A process of the zone: in the record and by the model's terms, in m^-3/s at every sample.
-
-    ends: the state that gives, and the one that takes; "" is the outside. recorded: None if the
-    record does not give it. coef: of the model's terms. counterpart: of the same terms, by least
-    squares on the record; empty if it does not give the process. fit_r2: of these, at each instant.
-    """
-
-    name: str
-    ends: tuple[str, str]
-    recorded: Float[np.ndarray, " samples"] | None
-    modelled: Float[np.ndarray, " samples"]
-    coef: Mapping[str, float]
-    counterpart: Mapping[str, float] = field(default_factory=dict)
-    fit_r2: float = float("nan")
-
-    @property
-    def ratio(self) -> float:
-        """Mean rate of the model over that of the record; NaN if the record does not give it."""
-        if self.recorded is None:
-            return float("nan")
-        return float(self.modelled.mean() / self.recorded.mean())
-
-    @property
-    def r2(self) -> float:
-        """R2 at each instant; NaN for a rate that is constant or not recorded."""
-        return float("nan") if self.recorded is None else rate_r2(self.recorded, self.modelled)
 
 
 PROCESSES: Metrics[ComparedProcess] = [
@@ -93,102 +54,6 @@ PROCESSES: Metrics[ComparedProcess] = [
 ]  # fmt: skip
 
 
-def compared_processes(
-    model: SparseModel,
-    held_to: Constraint,
-    data: Trajectory,
-    zones: Zones,
-) -> list[ComparedProcess]:
-    """The processes of ions and neutrals, in zones and between them, in record and model.
-
-    held_to: the model's constraint, from a search under `Roles`. Rates are those of the zone that
-    gives, or takes from outside. Where ions give back by a process of their own, ionization is the
-    whole of it; else what is given back is subtracted, as the model's terms are net of it.
-    """
-    theta = model.library.evaluate(data.columns(model.library.variables))
-    found: dict[tuple[str, str], dict[str, float]] = {}
-    for process, amount in process_amounts(held_to, {s: model.terms(s) for s in model.states}):
-        found.setdefault(ends_of(process), {})[process.term] = amount
-    known = {zone: recorded_rates(balance, data) for zone, balance in zones.balances.items()}
-    gone = _through_ends(known, zones.sizes or dict.fromkeys(known, 1.0))
-    compared = []
-    # What enters comes first, what leaves last.
-    for ends, terms in sorted(found.items(), key=lambda each: (bool(each[0][0]), not each[0][1])):
-        columns = theta[:, [model.library.index(term) for term in terms]]
-        gross = ends[::-1] in found
-        rate = _zone_rate(*ends, known, gone, gross=gross)
-        modelled = columns @ np.array([*terms.values()])
-        beside = fitted_rate(rate, columns, list(terms)) if rate is not None else FittedRate({})
-        words = _zone_words(*ends, gross=gross)
-        compared.append(
-            ComparedProcess(words, ends, rate, modelled, terms, beside.terms, beside.r2)
-        )
-    return compared
-
-
-def ends_of(process: Process) -> tuple[str, str]:
-    """The state that a process takes from, and the one that it gives to; "" is the outside."""
-    giver, taker = (
-        next((state for (state, _), f in process.factors.items() if sign * f > 0.0), "")
-        for sign in (-1.0, 1.0)
-    )
-    return giver, taker
-
-
-def _through_ends(
-    known: Mapping[str, Mapping[str, np.ndarray]], sizes: Mapping[str, float]
-) -> dict[tuple[str, str], np.ndarray]:
-    """(state, zone) -> what passes the far end of each zone, by the zone's length, in m^-3/s."""
-    found = {}
-    for state, key in ((IONS, "exit_i"), (NEUTRALS, "exit_n")):
-        passed: Any = 0.0
-        for zone, size in sizes.items():
-            if key not in known[zone]:
-                break
-            passed = passed + size * known[zone][key]
-            found[state, zone] = passed / size
-    return found
-
-
-def _zone_words(giver: str, taker: str, *, gross: bool) -> str:
-    (state, _, zone), (other, _, beyond) = giver.partition("@"), taker.partition("@")
-    names = {IONS: "ions", NEUTRALS: "neutrals"}
-    if not giver:
-        return f"{names[other]} that enter"
-    if not taker:
-        return f"{names[state]} that leave"
-    if zone != beyond:
-        return f"{names[state]} from {zone} to {beyond}"
-    place = f"{zone}: " if zone else ""
-    if gross:
-        back = "" if state == NEUTRALS else ", back from walls and anode"
-        return f"{place}{names[state]} that become {names[other]}{back}"
-    given_back = "those given back" if zone else "those that walls and anode give back"
-    return f"{place}{names[state]} that become {names[other]}, less {given_back}"
-
-
-def _zone_rate(
-    giver: str,
-    taker: str,
-    known: Mapping[str, Mapping[str, np.ndarray]],
-    gone: Mapping[tuple[str, str], np.ndarray],
-    *,
-    gross: bool,
-) -> np.ndarray | None:
-    """The rate of a process in the record; None if it does not give it."""
-    (state, _, zone), (_, _, beyond) = giver.partition("@"), taker.partition("@")
-    if not giver:
-        return known[beyond].get("supply")
-    if not taker or zone != beyond:  # to the outside, or to the next zone
-        return gone.get((state, zone))
-    if gross:
-        return known[zone].get("ionization" if state == NEUTRALS else "returned")
-    if not {"ionization", "returned"} <= set(known[zone]):
-        return None
-    exchanged = known[zone]["ionization"] - known[zone]["returned"]
-    return exchanged if state == NEUTRALS else -exchanged
-
-
 @dataclass(frozen=True, eq=False)
 class TermRole:
     """One term of the model.
@@ -196,8 +61,7 @@ class TermRole:
     part: what it is a term of: a process in words, or the state whose equation holds it. is_known:
     whether nothing was fitted, so that it is not left out. without: free run of the model refined
     without the process, or without the coefficient in all of its equations; None if it is known or
-    cannot be refined. counterpart: the coefficient by least squares of the recorded process on all
-    of the model's terms for it, with fit_r2; NaN if the record does not give it.
+    cannot be refined. process: of the term, whose counterpart the record may give.
     """
 
     part: str
@@ -205,12 +69,16 @@ class TermRole:
     coef: float
     is_known: bool
     without: Evaluation | None
-    counterpart: float = float("nan")
-    fit_r2: float = float("nan")
+    process: ComparedProcess | None = None
+
+    @property
+    def counterpart(self) -> float:
+        """The coefficient by least squares of the recorded process on all of its terms, or NaN."""
+        return np.nan if self.process is None else self.process.counterpart.get(self.term, np.nan)
 
     @property
     def ratio(self) -> float:
-        return self.coef / self.counterpart if self.counterpart else float("nan")
+        return self.coef / (self.counterpart or np.nan)
 
     @property
     def status(self) -> str:
@@ -226,12 +94,12 @@ TERMS: Metrics[TermRole] = [
     Metric("coefficient", lambda role: role.coef, View.SHOWN),
     Metric("counterpart", lambda role: role.counterpart, View.SHOWN, "by the record"),
     Metric("ratio", lambda role: role.ratio, View.SHOWN, format="{:.2f}"),
-    Metric("fit_r2", lambda role: role.fit_r2, View.SHOWN, "its R2", "{:.3f}"),
+    Metric("fit_r2", lambda r: r.process and r.process.fit_r2, View.SHOWN, "its R2", "{:.3f}"),
     Metric("without_status", lambda role: role.status, View.SHOWN, "without it"),
-    Metric("without_f_error", lambda role: role.without.f_error if role.without else np.nan),
+    Metric("without_f_error", lambda role: role.without and role.without.f_error),
     Metric(
         "without_waveform_error",
-        lambda role: largest(role.without.waveform_error) if role.without else np.nan,
+        lambda role: role.without and largest(role.without.waveform_error),
         View.SHOWN, "waveform", "{:.3f}",
     ),
 ]  # fmt: skip
@@ -323,8 +191,8 @@ def _roles(
     for each in processes:
         for term, coef in each.coef.items():
             k = by_process.get((each.ends, term))
-            run, beside = None if k is None else left_out[k], each.counterpart.get(term, np.nan)
-            found.append(TermRole(each.name, term, coef, k is None, run, beside, each.fit_r2))
+            run = None if k is None else left_out[k]
+            found.append(TermRole(each.name, term, coef, k is None, run, each))
     return found
 
 

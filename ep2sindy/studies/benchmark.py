@@ -31,20 +31,8 @@ from ep2sindy.figures.identified import (
     merit_table,
 )
 from ep2sindy.library.library import Library
-from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import (
-    Block,
-    Captioned,
-    Picture,
-    Result,
-    Section,
-    Table,
-    Text,
-    pictures,
-    places,
-)
-from ep2sindy.report.results import json_rows
-from ep2sindy.report.run import Run
+from ep2sindy.report.document import Result, Table, Text, places
+from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.resume import resumed
@@ -56,7 +44,6 @@ FIGURE = (
     "Realizations in which all true equations are among the candidates (left), and are the ones "
     "selected (right), in %. A dash: the variant selects nothing, or N/A in the thesis."
 )
-EXAMPLE_FIGURES = {"attractors": False, "trajectories": True}  # name -> drawn over time
 EXAMPLES = (
     "The first realization of every system and noise level: samples, truth, and the model that "
     "{variant} selects, integrated from where the truth starts. True terms need not follow a "
@@ -75,6 +62,8 @@ COLLECTED = (
     "samples each, starts anywhere on the attractor, and the library holds all products of the "
     "states up to the degree of the equations. They are counted together."
 )
+SELECTED = {"selected": "selected exactly right", "on_front": "right on the front"}
+Draw = Callable[[str, float, int], tuple[System, list[Trajectory]]]  # `realization`, with settings
 MAX_EXAMPLES = 4  # systems of the collection whose first realizations are drawn
 TITLES = {
     "on_front": "True equations on the front, % of realizations",
@@ -146,26 +135,47 @@ class Study:
     parallel: Workers
     keep: bool = True
 
-    def compute(self, run: Run) -> Outcome:
+    def run(self, report: Report) -> None:
         published = published_cells(self.thesis)
         variants = build_variants(self.variants, self.definitions)
-        names = self._names
-        n_pieces = len(names) * len(self.noises) * self.n_realizations
-        with resumed(self.keep, run, self.parallel) as workers:
-            with run.progress(n_pieces, "realization") as progress:
+        n_pieces = len(self._names) * len(self.noises) * self.n_realizations
+        with resumed(self.keep, report, self.parallel) as workers:
+            with report.progress(n_pieces, "realization") as progress:
                 outcomes = replace(self, parallel=workers).outcomes(
-                    variants, seed=run.seed, progress=progress
+                    variants, seed=report.seed, progress=progress
                 )
-            first = first_realizations(
-                variants,
-                [name for name in names if name in DRAWS] or names[:MAX_EXAMPLES],
-                self.noises,
-                n_trajectories=self.n_trajectories,
-                degree=self.degree,
-                seed=run.seed,
-                progress=run.watch,
+            counted = cells(outcomes)
+            report.section(
+                "Realizations",
+                f"Realizations of every system and noise level: {self.n_realizations}.",
+                Text(INTRODUCTION, page_only=True),
             )
-        return Outcome(variants, outcomes, cells(outcomes), published, first)
+            if COLLECTION in set(outcomes["group"]):
+                report.add(Text(COLLECTED, page_only=True))
+            draw = partial(benchmark_figure, counted, thesis=published)
+            report.figure("benchmark", draw, FIGURE)
+            self._add_examples(variants, report)
+        add_tables(report, outcomes, counted, published)
+        report.section("Variants")
+        report.add(*(Text(f"{name}: {each}", page_only=True) for name, each in variants.items()))
+        report.headline |= means(counted)
+        report.found(best_variant(counted))
+
+    def _add_examples(self, variants: Mapping[str, Variant], report: Report) -> None:
+        """Draw what the last variant that makes models, if there is one, finds first."""
+        methods = {n: each for n, each in variants.items() if isinstance(each, DiscoveryMethod)}
+        if not methods:
+            return
+        variant, method = methods.popitem()
+        systems = [name for name in self._names if name in DRAWS] or self._names[:MAX_EXAMPLES]
+        pairs = [*product(systems, sorted(self.noises))]
+        seed = [report.seed, 0, *variant.encode()]  # as in `_outcomes`
+        draw = self._draw(report.seed)
+        found = first_realizations(method, pairs, draw, seed=seed, progress=report.watch)
+        report.section(f"Identified by {variant}")
+        for name, over_time in (("attractors", False), ("trajectories", True)):
+            figure = partial(attractor_figure, found, over_time=over_time)
+            report.figure(name, figure, EXAMPLES.format(variant=variant))
 
     def outcomes(
         self,
@@ -183,14 +193,12 @@ class Study:
         nothing. Raises ValueError for an unknown system, or if there is nothing to run.
         """
         tasks = list(product(self._names, sorted(self.noises), range(self.n_realizations)))
-        judge = partial(
-            _outcomes,
-            variants,
-            n_trajectories=self.n_trajectories,
-            degree=self.degree,
-            seed=seed,
-        )
+        judge = partial(_outcomes, variants, self._draw(seed), seed=seed)
         return pd.DataFrame(rows_in_order(self.parallel, judge, tasks, progress))
+
+    def _draw(self, seed: int) -> Draw:
+        count = self.n_trajectories
+        return partial(realization, n_trajectories=count, degree=self.degree, seed=seed)
 
     @property
     def _names(self) -> tuple[str, ...]:
@@ -198,17 +206,10 @@ class Study:
 
 
 def _outcomes(
-    variants: Mapping[str, Variant],
-    task: tuple[str, float, int],
-    *,
-    n_trajectories: int,
-    degree: int | None,
-    seed: int,
+    variants: Mapping[str, Variant], draw: Draw, task: tuple[str, float, int], *, seed: int
 ) -> list[dict[str, object]]:
     name, noise, number = task
-    system, runs = realization(
-        name, noise, number, n_trajectories=n_trajectories, degree=degree, seed=seed
-    )
+    system, runs = draw(name, noise, number)
     rows: list[dict[str, object]] = []
     for label, variant in variants.items():
         # Each variant has its own random stream, so that leaving one out changes no other.
@@ -243,45 +244,26 @@ def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
     return counts.rename(columns={"group": "system"})
 
 
-@dataclass(frozen=True, eq=False)
-class FirstRealizations:
-    """First realizations of every system and noise level, with the models a variant found."""
-
-    variant: str
-    found: Sequence[Identified]
-
-
 def first_realizations(
-    variants: Mapping[str, Variant],
-    systems: Sequence[str],
-    noises: Sequence[float],
+    method: DiscoveryMethod,
+    pairs: Sequence[tuple[str, float]],
+    draw: Draw,
     *,
-    n_trajectories: int,
-    degree: int | None = None,
-    seed: int,
+    seed: Sequence[int],
     progress: Progress = SILENT,
-) -> FirstRealizations | None:
-    """Models found in the first realizations by the last variant that makes models.
+) -> list[Identified]:
+    """Models found in the first realizations of some systems and noise levels.
 
-    The search is the same as in the benchmark. Other variants give supports only; the result is
-    None if no variant makes models.
+    The search is the same as in the benchmark.
     """
-    methods = [(name, each) for name, each in variants.items() if isinstance(each, DiscoveryMethod)]
-    if not methods:
-        return None
-    name, method = methods[-1]
     found = []
-    pairs = list(product(systems, sorted(noises)))
     for label, noise in count_pieces(progress, pairs, "model", "first realizations"):
-        (system, runs), (_, (truth, *_)) = (
-            realization(label, level, 0, n_trajectories=n_trajectories, degree=degree, seed=seed)
-            for level in (noise, 0.0)
-        )
-        rng = np.random.default_rng([seed, 0, *name.encode()])
+        (system, runs), (_, (truth, *_)) = (draw(label, level, 0) for level in (noise, 0.0))
+        rng = np.random.default_rng(seed)
         model = discover(runs, system.model.library, method, seed=rng, progress=progress).model
         right = np.array_equal(model.coef != 0.0, system.model.coef != 0.0)
         found.append(Identified(label, noise, runs[0], truth, model.rollout(truth), right))
-    return FirstRealizations(name, found)
+    return found
 
 
 def published_cells(thesis: Mapping[str, Any]) -> pd.DataFrame:
@@ -302,123 +284,73 @@ def published_cells(thesis: Mapping[str, Any]) -> pd.DataFrame:
     return table.assign(n=thesis["n"])
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """All outcomes of the benchmark, and counts of them.
+def add_tables(
+    report: Report, outcomes: pd.DataFrame, cells: pd.DataFrame, published: pd.DataFrame
+) -> None:
+    """Add all outcomes, and our cells beside the thesis's: as a whole, and by figure of merit."""
+    keys, columns = ["system", "noise", "variant"], {merit: f"thesis_{merit}" for merit in MERITS}
+    beside = published.rename(columns=columns)[[*keys, *columns.values()]]
+    beside = cells.astype(dict.fromkeys(COUNTS, "Int64")).merge(beside, how="left", on=keys)
+    report.samples("outcomes", outcomes)
+    report.table("cells", beside, shown=False)
+    levels = "/".join(f"{100 * noise:g}" for noise in cells["noise"].unique())
+    report.section(f"By system; noise {levels} %")
+    report.add(*(_readable(cells, published, merit) for merit in MERITS))
+    collected = outcomes[outcomes["group"] == COLLECTION]
+    if len(collected):
+        report.section("Systems that are not selected")
+        report.add(_not_selected(collected))
 
-    published: the thesis's cells, in the format of `cells` without the time. first: the first
-    realizations, which are drawn; None if no variant makes models.
-    """
 
-    variants: Mapping[str, Variant]
-    outcomes: pd.DataFrame
-    cells: pd.DataFrame
-    published: pd.DataFrame
-    first: FirstRealizations | None
+def means(cells: pd.DataFrame) -> dict[str, float]:
+    """Means over systems and noises; a variant that selects nothing has 0 %, and NaN terms."""
+    found = {}
+    for name, rows in cells.groupby("variant", sort=False):
+        for merit in COUNTS:
+            found[f"{name}/{merit}_percent"] = 100.0 * rows[merit].sum() / rows["n"].sum()
+        found[f"{name}/mean_correct_terms"] = rows["mean_correct_terms"].mean()
+        found[f"{name}/cpu_ms"] = 1e3 * rows["cpu_s_per_search"].mean()
+    return {name: float(value) for name, value in found.items()}
 
-    def models(self) -> dict[str, SparseModel]:
-        return {}
 
-    def tables(self) -> dict[str, pd.DataFrame]:
-        """All outcomes, and our cells beside the thesis's values for the same cells."""
-        columns = {merit: f"thesis_{merit}" for merit in MERITS}
-        keys = ["system", "noise", "variant"]
-        beside = self.published.rename(columns=columns)[[*keys, *columns.values()]]
-        return {"outcomes": self.outcomes, "cells": self.cells.merge(beside, how="left", on=keys)}
-
-    def figures(self) -> dict[str, Captioned]:
-        draw = partial(benchmark_figure, self.cells, thesis=self.published)
-        found = {"benchmark": Captioned(draw, FIGURE)}
-        if self.first:
-            caption = EXAMPLES.format(variant=self.first.variant)
-            for name, over_time in EXAMPLE_FIGURES.items():
-                draw = partial(attractor_figure, self.first.found, over_time=over_time)
-                found[name] = Captioned(draw, caption)
-        return found
-
-    def in_short(self) -> Result:
-        """The variant that selects, or has on its front, the right equations most often."""
-        cells = self.cells
-        merit = "selected" if cells["selected"].notna().any() else "on_front"
-        counts = cells.dropna(subset=[merit]).groupby("variant", sort=False)[[merit, "n"]].sum()
-        share = counts[merit] / counts["n"]
-        words = {"selected": "selected exactly right", "on_front": "right on the front"}[merit]
-        lines = "; ".join(f"{name} {100 * value:.0f} %" for name, value in share.items())
-        best = str(share.idxmax())
-        return Result(
-            f"Found: {best}, {words} in {100 * share[best]:.0f} % of {int(counts['n'][best])} "
-            "realizations",
-            [Text(f"{words}: {lines}")],
-            load='pandas.read_csv("{}/tables/cells.csv")',
-            picture="benchmark",
-        )
-
-    def sections(self) -> list[Section]:
-        collected = (self.outcomes["group"] == COLLECTION).any()
-        n = int(self.outcomes["number"].nunique())
-        levels = "/".join(f"{100 * noise:g}" for noise in self.cells["noise"].unique())
-        counted = f"{n} realizations of every system and noise level."
-        about: list[Block] = [Text(counted), Text(INTRODUCTION, page_only=True)]
-        if collected:
-            about.append(Text(COLLECTED, page_only=True))
-        drawn = []
-        if self.first:
-            drawn = [
-                Section(f"Identified by {self.first.variant}", pictures(list(EXAMPLE_FIGURES)))
-            ]
-        tables = [
-            Section(f"{TITLES[m]}; noise {levels} %", [_readable(self.cells, self.published, m)])
-            for m in MERITS
-        ]
-        if collected:
-            tables.append(Section("Systems that are not selected", [_not_selected(self.outcomes)]))
-        variants = [Text(f"{n}: {v}", page_only=True) for n, v in self.variants.items()]
-        return [
-            Section("Realizations", [*about, Picture("benchmark")]),
-            *drawn,
-            *tables,
-            Section("Variants", variants),
-        ]
-
-    def summary(self) -> dict[str, Any]:
-        """The counts as whole numbers; `selected` is null for a variant that selects nothing."""
-        return {"cells": json_rows(self.cells.astype(dict.fromkeys(COUNTS, "Int64")))}
-
-    def headline(self) -> dict[str, float]:
-        """Means over systems and noises; a variant that selects nothing has 0 %, and NaN terms."""
-        scalars = {}
-        for name, rows in self.cells.groupby("variant", sort=False):
-            for merit in COUNTS:
-                percent = 100.0 * rows[merit].sum() / rows["n"].sum()
-                scalars[f"{name}/{merit}_percent"] = float(percent)
-            scalars[f"{name}/mean_correct_terms"] = float(rows["mean_correct_terms"].mean())
-            scalars[f"{name}/cpu_ms"] = float(1e3 * rows["cpu_s_per_search"].mean())
-        return scalars
+def best_variant(cells: pd.DataFrame) -> Result:
+    """The variant that selects, or has on its front, the right equations most often."""
+    merit = "selected" if cells["selected"].notna().any() else "on_front"
+    counts = cells.dropna(subset=[merit]).groupby("variant", sort=False)[[merit, "n"]].sum()
+    percent = 100 * counts[merit] / counts["n"]
+    best = str(percent.idxmax())
+    shares = "; ".join(f"{name} {value:.0f} %" for name, value in percent.items())
+    return Result(
+        f"Found: {best}, {SELECTED[merit]} in {percent[best]:.0f} % of {int(counts['n'][best])} "
+        "realizations",
+        [Text(f"{SELECTED[merit]}: {shares}")],
+        load='pandas.read_csv("{}/tables/cells.csv")',
+        picture="benchmark",
+    )
 
 
 def _readable(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> Table:
     """One row per variant or published one, one column per system; noise levels share a cell."""
     table = merit_table(cells, published, merit)
+    old = table.index.get_level_values(1).to_numpy()
+    table = table[
+        old | table.notna().any(axis=1).to_numpy()
+    ]  # others leave the selection to the user
     digits = 2 if merit == "mean_correct_terms" else 0
+    shown = table.map(partial(places, n=digits)).T.groupby(level=0, sort=False).agg("/".join).T
+    shown.columns = [_heading(str(system), merit) for system in shown]
+    names = [f"{name}, thesis" if is_old else name for name, is_old in table.index]
     cpu_ms = 1e3 * cells.groupby("variant")["cpu_s_per_search"].mean()
-    rows: list[dict[str, str]] = []
-    italic: list[int] = []
-    for name, is_published in table.index:
-        values = table.loc[(name, is_published)]
-        if is_published:
-            italic.append(len(rows))
-        elif values.isna().all():
-            continue  # this variant leaves the selection to the user
-        row = {"variant": f"{name}, thesis" if is_published else name}
-        for system in cells["system"].unique():
-            row[_heading(system, merit)] = "/".join(places(v, digits) for v in values[system])
-        rows.append(row | {"CPU (ms)": "" if is_published else f"{cpu_ms[name]:.1f}"})
-    return Table(pd.DataFrame(rows), italic=italic)
+    times = ["" if is_old else f"{cpu_ms[name]:.1f}" for name, is_old in table.index]
+    shown = shown.assign(**{"CPU (ms)": times}).reset_index(drop=True)
+    shown.insert(0, "variant", names)
+    return Table(
+        shown, TITLES[merit], italic=[k for k, (_, is_old) in enumerate(table.index) if is_old]
+    )
 
 
-def _not_selected(outcomes: pd.DataFrame) -> Table:
+def _not_selected(collected: pd.DataFrame) -> Table:
     """Systems of the collection that the variant with most successes does not select, by noise."""
-    collected = outcomes[outcomes["group"] == COLLECTION]
     best = str(collected.groupby("variant", sort=False)["selected"].sum().idxmax())
     missed = collected[(collected["variant"] == best) & (collected["selected"] != 1.0)]
     rows = []

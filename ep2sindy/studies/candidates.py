@@ -9,8 +9,8 @@ from itertools import compress
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
-from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.estimate import Estimate, Rival
@@ -110,12 +110,6 @@ def candidate_rows(front: ParetoFront) -> list[CandidateRow]:
     return [CandidateRow(each, each is front.best) for each in front.candidates]
 
 
-def selected_rows(found: Discovery) -> dict[str, CandidateRow]:
-    """The selected candidate of every state, with the coefficients that it has in the model."""
-    left = found.noise_test.left
-    return {s: CandidateRow(each, True, left.get(s)) for s, each in found.chosen.items()}
-
-
 def add_candidates(
     report: Report,
     name: str,
@@ -131,6 +125,7 @@ def add_candidates(
     library, label = found.model.library, found.method.selection.label
     words = f"{len(library)} terms in {', '.join(library.variables)}; selection: "
     report.section(f"{name}: candidates", f"{words}{found.method.selection}")
+    report.summary.setdefault("notes", {})[name] = note
     report.add(*([f"selected: {note}"] if note else []), *(f"note: {n}" for n in found.remarks))
     report.add(*(f"note: {each.message}" for each in found.ambiguities if each.exact))
     if n_alike := sum(not each.exact for each in found.ambiguities):
@@ -202,7 +197,14 @@ RIVALS: Metrics[Rival] = [
     ),
 ]  # fmt: skip
 ESTIMATE: Metrics[Estimate] = [
-    Metric("noise_std", lambda found: by_state(found, found.noise_std)),
+    Metric(
+        "noise_std", lambda found: by_state(found, found.noise_std), View.SHOWN, "noise (std)",
+    ),
+    Metric(
+        "noise_share",
+        lambda found: by_state(found, found.noise_std / _spread(found)),
+        View.SHOWN, "of the state's std", lambda value: f"{100.0 * value:.2g} %",
+    ),
     Metric("memory", lambda found: by_state(found, found.memory), View.SHOWN, format="{:.2f}"),
     Metric(
         "noise_growth", lambda found: by_state(found, found.growth), View.SHOWN, "grows",
@@ -220,7 +222,7 @@ ESTIMATE: Metrics[Estimate] = [
 ]  # fmt: skip
 
 
-def add_estimate(report: Report, name: str, found: Discovery, data: Trajectory) -> None:
+def add_estimate(report: Report, name: str, found: Discovery) -> None:
     """Add the noise of the samples, the misfit of the model, and other possible supports.
 
     name: of the library or signal. found: by a search that estimates states and coefficients.
@@ -230,7 +232,7 @@ def add_estimate(report: Report, name: str, found: Discovery, data: Trajectory) 
     report.section(f"{name}: what the samples say", level=3)
     if not found.noise_test.tested:
         report.add(Text(REPLACED, warning=True))
-    rows = ResultTable([estimate], [*noise_sizes(data), *ESTIMATE])
+    rows = ResultTable([estimate], ESTIMATE)
     noise = Table(rows.screen(by_state=True), title="noise of the samples", note=NOISE)
     report.table(f"samples_{name}", rows, by_state=True, shown=noise)
     report.add(Text(estimate.misfit or FITS, warning=bool(estimate.misfit)))
@@ -242,24 +244,13 @@ def add_estimate(report: Report, name: str, found: Discovery, data: Trajectory) 
         report.add("No other support of an equation has odds above 1:1000.")
 
 
-def noise_sizes(data: Trajectory) -> Metrics[Estimate]:
-    """The noise in SI, and relative to the state's spread."""
-
-    def size(found: Estimate) -> dict[str, str]:
-        sizes = by_state(found, found.noise_std)
-        return {s: f"{v:.3g} {data.units[s]}".removesuffix(" 1") for s, v in sizes.items()}
-
-    def share(found: Estimate) -> dict[str, str]:
-        sizes = by_state(found, found.noise_std)
-        return {s: f"{100.0 * v / data.columns([s]).std():.2g} %" for s, v in sizes.items()}
-
-    return [
-        Metric("noise (std)", size, View.SCREEN),
-        Metric("of the state's std", share, View.SCREEN),
-    ]
-
-
 def by_state(found: Estimate, values: np.ndarray) -> dict[str, float]:
     """Values of the states that were measured."""
     pairs = zip(found.model.states, np.asarray(values).tolist(), strict=True)
     return dict(compress(pairs, np.isfinite(found.noise_std)))
+
+
+def _spread(found: Estimate) -> Float[np.ndarray, " n_states"]:
+    """Standard deviation of every state in the first record."""
+    spread: np.ndarray = found.runs[0].columns(found.model.states).std(axis=0)
+    return spread

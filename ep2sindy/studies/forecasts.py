@@ -65,15 +65,12 @@ def _table(skill: ForecastSkill) -> Table:
     last = float(skill.horizons_s[-1]) / unit_s
     asked = SHOWN_PERIODS if in_periods else (1.0, 2.0, 4.0, 8.0, 16.0)
     shown = [each for each in asked if each <= 1.02 * last] or [last]
-    rows = {
-        f"{each:g} {'period' if in_periods else 'sample'}{'s' if each > 1 else ''} ahead": {
-            name: f"{value:.3f}" for name, value in skill.at(each * unit_s).items()
-        }
-        for each in shown
-    }
-    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("horizon").reset_index()
+    rows = pd.DataFrame([skill.at(each * unit_s) for each in shown])
+    unit = "period" if in_periods else "sample"
+    ahead = [f"{each:g} {unit}{'s' if each > 1 else ''} ahead" for each in shown]
+    rows.insert(0, "horizon", ahead)
     return Table(
-        table,
+        rows,
         title="error of forecasts (standard deviations)",
         note=f"{skill.n_starts} starts, each fitted to the past alone; the bands of 90 % hold "
         f"{100.0 * skill.coverage_90:.0f} % of the samples.",

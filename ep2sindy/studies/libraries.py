@@ -51,12 +51,11 @@ from ep2sindy.studies.source import (
     split_in_time,
     zones_of,
 )
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Starts, Terms
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Terms, ZeroOrMore
 from ep2sindy.studies.views import (
     EVALUATED,
     EVALUATION,
     FROM_DERIVATIVES,
-    INTEGRATED,
     PlotRange,
     add_figures,
     add_samples,
@@ -132,7 +131,7 @@ class Study:
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: ShareOrNone = None
-    forecasts: Starts = 0
+    forecasts: ZeroOrMore = 0
     hidden: Sequence[str] = ()
     relations: Sequence[str] = ()
     exclude: Terms | None = None
@@ -226,12 +225,13 @@ class Study:
         known = library.exclude(barred).relate(*self.relations).with_roles(self.roles)
         found = discover(list(runs), known, method, hidden=self.hidden, seed=rng, progress=progress)
         runs = runs if found.estimate is None else found.estimate.runs
-        s, rows = self.rollout_s, Regression(self.formulation, bootstraps=self.bootstraps)
+        s = self.rollout_s
         n_samples = [run.n_samples if s is None else samples_in(run, s) for run in runs]
-        refitted = refit(found, thesis, rows, runs, rng)
+        refitted = refit(found, thesis, self.formulation, runs, rng)
         published = refitted_model(found, refitted)
         lives = beside = None
         if self.living is not None and not found.model.inputs:
+            rows = Regression(self.formulation, bootstraps=self.bootstraps)
             parts = split_in_time(runs[0], self.held_out or HELD_OUT)
             lives = living_model(
                 *parts, library, rows, self.living, found.model, zones, rng=rng, progress=progress
@@ -281,7 +281,7 @@ class Study:
                 self._add_forecasts(report, name, data, result)
             add_candidates(report, name, found, note=result.note, beside=result.beside)
             if found.estimate is not None:
-                add_estimate(report, name, found, data)
+                add_estimate(report, name, found)
         add_tables(report, results)
 
     def _add_forecasts(
@@ -297,7 +297,7 @@ class Study:
     ) -> None:
         """The selected models of all libraries, and those of published terms, from the start."""
         clock, figures = data.clock, partial(add_figures, report, data=data, shown=self.figures)
-        report.section("The selected model of every library")
+        report.section("The selected model" if len(results) == 1 else "The selected models")
         for name, result in results.items():
             text = f"{name}: equations {result.how}; run freely: {result.runs[0].text}"
             report.add(Text(text, page_only=True))
@@ -308,7 +308,7 @@ class Study:
         is_living = any(result.living is not None for result in results.values())
         note = f"{FROM_DERIVATIVES} {EVALUATED}" if is_living else EVALUATED
         rows = ResultTable(selected | published, EVALUATION).screen("model", by_state=True)
-        report.section("Run freely from the first sample", Table(rows, INTEGRATED, note=note))
+        report.section("Run freely from the first sample", Table(rows, note=note))
         figures(FIGURES, runs=selected, smoother=self.formulation.smoother)
         add_samples(report, data, selected | published)
         for name, run in published.items():

@@ -10,23 +10,18 @@ from itertools import compress
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.model.model import SparseModel, model_of
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.regression.front import Candidate, fit_support
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Result, Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.studies.balance import ModelBalance
-from ep2sindy.studies.candidates import (
-    CandidateRow,
-    left_over_of_all,
-    selected_metrics,
-    selected_rows,
-)
+from ep2sindy.studies.candidates import CandidateRow, left_over_of_all, selected_metrics
 from ep2sindy.studies.living import LIVING, Living
 from ep2sindy.studies.study import Coefficients
 from ep2sindy.studies.views import EVALUATED, EVALUATION, best_run, found_model, worst_run
@@ -87,16 +82,6 @@ class LibraryResult:
         }
 
 
-LIBRARIES: Metrics[LibraryResult] = [
-    Metric("how", lambda result: result.how),
-    Metric("note", lambda result: result.note),
-    Metric("misfit", lambda result: result.discovery.misfit),
-]
-THESIS_TERMS: Metrics[Candidate] = [
-    Metric("r2_test", lambda fit: fit.r2_test),
-    Metric("r2_train", lambda fit: fit.r2_train),
-    Metric("terms", lambda fit: fit.coef_by_term),
-]
 RECORDS: Metrics[tuple[str, str, Evaluation]] = [
     Metric("model", lambda row: row[0], View.SHOWN),
     Metric("record", lambda row: row[1], View.SHOWN),
@@ -118,29 +103,23 @@ def add_records(report: Report, results: Mapping[str, LibraryResult], files: Seq
 def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
     """Add tables of all libraries whose facts stand in the sections: for files and headline."""
     add = partial(report.table, shown=False)
-    label = next(iter(results.values())).discovery.method.selection.label
     living = {name: each.living for name, each in results.items() if each.living is not None}
     runs: dict[str, Evaluation] = {}
+    rows: dict[str, CandidateRow] = {}
     for name, result in results.items():
         if result.living is not None:
             runs |= {f"{name}_living": result.living.run, f"{name}_refined": result.living.refined}
         runs |= {name: result.runs[0]}
         runs |= {f"{name}_thesis_terms": result.published} if result.published else {}
-    selected = {
-        f"{name}/{state}": row
-        for name, result in results.items()
-        for state, row in selected_rows(result.discovery).items()
-    }
-    thesis = {
-        f"{name}/{state}": fit
-        for name, result in results.items()
-        for state, fit in result.refitted.items()
-    }
+        chosen, refitted = result.discovery.chosen.items(), result.refitted.items()
+        left = result.discovery.noise_test.left
+        rows |= {f"{name}/{s}": CandidateRow(each, True, left.get(s)) for s, each in chosen}
+        rows |= {f"{name}_thesis_terms/{s}": CandidateRow(each) for s, each in refitted}
+    label = next(iter(results.values())).discovery.method.selection.label
     add("evaluations", ResultTable(runs, EVALUATION), heading="model")
-    add("libraries", ResultTable(results, LIBRARIES), heading="library")
-    add("selected", ResultTable(selected, selected_metrics(label)), heading="of")
-    add("thesis_terms", ResultTable(thesis, THESIS_TERMS), heading="of")
-    add("living", ResultTable(living, LIVING), heading="library")
+    add("equations", ResultTable(rows, selected_metrics(label)), heading="of")
+    if living:
+        add("living", ResultTable(living, LIVING), heading="library")
 
 
 def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
@@ -177,7 +156,7 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
 def refit(
     found: Discovery,
     published: Coefficients,
-    rows: Regression,
+    formulation: Formulation,
     runs: Sequence[Trajectory],
     rng: np.random.Generator,
 ) -> dict[str, Candidate]:
@@ -190,14 +169,13 @@ def refit(
     fronts = found.fronts.values()
     problems = {front.equation: front.problem for front in fronts if front.problem is not None}
     if not problems:
-        assembled = rows.formulation.assemble(runs, found.model.library, rng=rng)
+        assembled = formulation.assemble(runs, found.model.library, rng=rng)
         problems = {state: problem for problem in assembled for state in problem.equations}
     fits = {}
     for state, terms in published.items():
-        if state in found.fronts:
-            problem = problems[state]
-            if set(terms) <= set(compress(problem.library.names, usable_terms(problem))):
-                fits[state] = fit_support(problem, state, list(terms))
+        problem = problems.get(state)
+        if problem and set(terms) <= set(compress(problem.library.names, usable_terms(problem))):
+            fits[state] = fit_support(problem, state, list(terms))
     return fits
 
 

@@ -39,32 +39,17 @@ Functions = Annotated[
 ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GivenPoints:
     """Operating points as they were given.
 
-    places: parameter -> its place in the data group; None if it has none. points: values of all
-    parameters, and `data` for other differences from the data group. left_out: files that a pattern
+    names: of the parameters. sources: of the data of every point. left_out: files that a pattern
     nearly fits.
     """
 
-    places: Mapping[str, str | None]
-    points: Sequence[Mapping[str, Any]]
+    names: list[str]
+    sources: Sequence[PointSource]
     left_out: Sequence[str] = ()
-
-    @property
-    def names(self) -> list[str]:
-        return list(self.places)
-
-    def sources(self, source: Source) -> list[PointSource]:
-        return point_sources(source, self.places, self.points)
-
-    def tell(self, report: Report) -> None:
-        """Report the files that are no points."""
-        if self.left_out:
-            report.say(
-                f"left out, for their names hold no number there: {', '.join(self.left_out)}"
-            )
 
 
 def given_points(
@@ -72,20 +57,23 @@ def given_points(
 ) -> GivenPoints:
     """Operating points of a config: a list, or the files of a pattern, which names the parameters.
 
+    parameters: the place of each in the data group; None if it has none.
     Raises ValueError for a pattern beside data that are not read from files, or that no file fits.
     """
     if not isinstance(points, str):
-        return GivenPoints(parameters, expand(points, list(parameters)))
+        names = list(parameters)
+        return GivenPoints(names, point_sources(source, parameters, expand(points, names)))
     if "path" not in source.data.settings:
         raise ValueError(
             "points of files need data that are read from files: "
-            f"{source.data.settings['_target_']} came with {points!r}; add data=recognised, or "
+            f"got {source.data.settings['_target_']} with {points!r}; add data=recognised, or "
             "data=NAME for a config that ep2sindy inspect --write made of them"
         )
     pattern = FilePattern(points)
     found, others = pattern.points()
     given = [{**values, "data": {"path": file}} for file, values in found.items()]
-    return GivenPoints(dict.fromkeys(pattern.names), given, others)
+    sources = point_sources(source, dict.fromkeys(pattern.names), given)
+    return GivenPoints(list(pattern.names), sources, others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,21 +132,13 @@ class OpenedPoint:
 
 
 def expand(blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]) -> list[dict[str, Any]]:
-    """Every combination of the values in each block; repeated points count once.
-
-    Points are repeated if they have the same values and the same data. 300 and 300.0 are equal, and
-    the order of parameters in a block does not matter.
-    """
-    found: dict[str, dict[str, Any]] = {}
+    """Every combination of the values of each block, with what else it holds."""
+    found: list[dict[str, Any]] = []
     for block in blocks:
         names = [name for name in parameters if name in block]
-        lists = {n: block[n] if isinstance(block[n], list) else [block[n]] for n in names}
-        rest = {name: value for name, value in block.items() if name not in names}
-        for values in product(*lists.values()):
-            point = {**dict(zip(names, values, strict=True)), **rest}
-            same = {name: float(v) if type(v) is int else v for name, v in point.items()}
-            found.setdefault(str(same), point)
-    return list(found.values())
+        lists = [block[n] if isinstance(block[n], list) else [block[n]] for n in names]
+        found += [{**block, **dict(zip(names, at, strict=True))} for at in product(*lists)]
+    return found
 
 
 def point_sources(
@@ -166,21 +146,25 @@ def point_sources(
 ) -> list[PointSource]:
     """The source once per operating point, with its parameters and data in the data group.
 
-    places: parameter -> its place in the data group; None if it has none.
-    Raises ValueError for points without all parameters, or that would open the same data twice.
+    places: parameter -> its place in the data group; None if it has none. A point that comes again
+    with the same data counts once.
+    Raises ValueError for points without all parameters, one that comes with other data, or two that
+    would open the same data.
     """
     names = list(places)
     if not points:
-        raise ValueError(f"points must be a list with all of {names} each: {points!r} came")
+        raise ValueError(f"points must be a list with all of {names} each: got {points!r}")
     found, seen = [], dict[str, str]()
     for given in points:
         parameters = _parameters(given, names)
         changes = {place: parameters[name] for name, place in places.items() if place is not None}
         data = _changed(source.data, changes, given.get("data", {}))
-        point = PointSource(parameters, replace(source, data=data))
+        point, same = PointSource(parameters, replace(source, data=data)), str(data)
+        if seen.get(same) == point.label:
+            continue
         if point.label in seen.values():
             raise ValueError(f"an operating point may come once: {point.label} comes again")
-        if (same := str(data)) in seen:
+        if same in seen:
             raise ValueError(
                 f"operating points must differ in their data: {point.label} has that of "
                 f"{seen[same]}; say in parameters where the data group takes them, or give each "
@@ -222,10 +206,10 @@ def nothing_moves(statuses: Sequence[str]) -> str:
 
 def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:
     if set(given) - {"data"} != set(names) or not isinstance(given.get("data", {}), Mapping):
-        raise ValueError(f"a point must have {names}, and data where they differ: {given!r} came")
+        raise ValueError(f"a point must have {names}, and data where they differ: got {given!r}")
     for name in names:
         if type(given[name]) not in (int, float):
-            raise ValueError(f"points must give {name} as a number: {given[name]!r} came")
+            raise ValueError(f"points must give {name} as a number: got {given[name]!r}")
     return {name: float(given[name]) for name in names}
 
 

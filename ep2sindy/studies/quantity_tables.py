@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import Any
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -22,20 +20,10 @@ from ep2sindy.operating.quantities import (
     fit_trend,
     lines_of,
 )
-from ep2sindy.operating.records import read_points
-from ep2sindy.report.document import (
-    Block,
-    Captioned,
-    Equation,
-    Result,
-    Section,
-    Table,
-    Text,
-    pictures,
-)
+from ep2sindy.report.document import Equation, Result, Table
+from ep2sindy.report.models import with_error
+from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
-from ep2sindy.studies.law_tables import spoken
-from ep2sindy.studies.views import with_error
 
 MOST_LAWS = 3  # on the screen
 LEAST_POINTS = 3  # of a control law
@@ -59,279 +47,208 @@ CONTROL = (
 )
 CAPTION = (
     "Quantities of the fit {}, against one parameter with the others held, with 95 % intervals, "
-    "which are smaller than the marks where no bars show"
+    "which are smaller than the marks where no bars show{}{}."
 )
-WORDS = {
-    "n_points": "points",
-    "r2": "R2",
-    "loo_error": "error, same terms",
-    "search_error": "error, searched",
-}
+
+Published = Mapping[str, Mapping[str, Sequence[float]]]  # fit -> parameter or quantity -> values
+Laws = Mapping[tuple[str, str], ControlLaw]  # by fit and quantity
 
 # A control law with its fit and quantity. Its errors are those at points left out.
 CONTROL_LAW: Metrics[tuple[str, str, ControlLaw]] = [
-    Metric("fit", lambda row: row[0], View.CSV),
-    Metric("quantity", lambda row: row[1], View.CSV),
-    Metric("law", lambda row: Equation(row[1], row[2].coef_by_term, rate=False), View.CSV),
-    Metric("r2", lambda row: row[2].r2, View.CSV),
-    Metric("loo_error", lambda row: row[2].loo_error, View.CSV),
-    Metric("search_error", lambda row: row[2].search_error, View.CSV),
+    Metric("fit", lambda row: row[0], View.SHOWN),
+    Metric("quantity", lambda row: row[1], View.SHOWN),
+    Metric("law", lambda row: str(_equation(*row[1:]))),
+    Metric("law", lambda row: _equation(*row[1:]), View.SCREEN),
+    Metric("r2", lambda row: row[2].r2, View.SHOWN, "R2", "{:.3f}"),
+    Metric("loo_error", lambda row: row[2].loo_error, View.ALL, "error, same terms", percent(1)),
+    Metric("search_error", lambda row: row[2].search_error, View.ALL, "searched", percent(1)),
 ]
 
 
-@dataclass(frozen=True, eq=False)
-class FoundQuantities:
-    """Quantities of every model at every point, by least squares and refined.
+def add_quantities(
+    report: Report,
+    library: Library,
+    models: Mapping[str, GivenModel],
+    results: Sequence[PointResult],
+    errors: Mapping[str, float],
+    published: pd.DataFrame,
+    labels: Mapping[str, str],
+) -> Result:
+    """Add control laws, trends and figures of quantities, and their values at every point.
 
-    models: by name. errors: for each fit, the mean error of its law at points left out; empty if
-    the points do not suffice for laws. published: values by fit -> points with their parameters and
-    quantities. labels: of parameters, quantities and publications on axes and in legends.
+    errors: for each fit, the mean error of its law at points left out; empty if the points do not
+    suffice for laws. published: see `read_published`. labels: of parameters and quantities on axes.
+    Returns the control laws of the fit that does best at points left out.
     """
+    known = next((each.model.units for r in results for each in r.fits.values()), None)
+    units = {
+        (model + end, name): quantity.unit(library, known) if known else ""
+        for model, given in models.items()
+        for end in ("", REFINED)
+        for name, quantity in given.quantities.items()
+    }
+    estimates = estimates_of(results, published)
+    laws = control_laws(estimates, list(results[0].parameters))
+    best = min((fit for fit, _ in laws), key=lambda fit: errors.get(fit, np.inf), default="")
+    report.summary["best_fit"] = best or None
+    missing = f"a law needs {LEAST_POINTS} points, and all parameters to vary over them"
+    report.section("Control laws", *([] if laws else [f"None: {missing}."]))
+    for key in ("loo_error", "search_error"):  # also of laws that are not found
+        report.headline |= {f"{fit}/{name}/{key}": np.nan for fit, name in units}
+    rows = {f"{fit}/{name}": (fit, name, law) for (fit, name), law in laws.items()}
+    bold = [k for k, (fit, _) in enumerate(laws) if fit == best]
+    report.table("control_laws", ResultTable(rows, CONTROL_LAW), note=CONTROL, bold=bold)
+    lines = lines_of([result.parameters for result in results if result.fits] or [{}])
+    report.section("Trends")
+    _add_figures(report, estimates, laws, published, lines, errors, labels)
+    report.table("trends", trends(estimates, published, lines), note=TRENDS)
+    _add_values(report, estimates, units)
+    shown = [
+        _equation(name, law, units[fit, name], percent(2)(law.search_error))
+        for (fit, name), law in laws.items()
+        if fit == best
+    ]
+    n_fitted = sum(bool(result.fits) for result in results)
+    picture = f"trends_{best.removesuffix(REFINED)}"
+    return Result(
+        f"Found: {len(shown) or 'no'} control laws over {n_fitted} operating points that "
+        f"oscillate{best and f', by the fit {best}'}",
+        shown[:MOST_LAWS],
+        load='pandas.read_csv("{}/tables/control_laws.csv")',
+        picture=picture if picture in report.figures else "",
+    )
 
-    library: Library
-    models: Mapping[str, GivenModel]
-    results: Sequence[PointResult]
-    errors: Mapping[str, float]
-    published: Mapping[str, Sequence[Mapping[str, float]]]
-    labels: Mapping[str, str]
 
-    @property
-    def parameters(self) -> list[str]:
-        return list(self.results[0].parameters)
+def read_published(published: Published, parameters: Sequence[str]) -> pd.DataFrame:
+    """Published values: one row per fit, point and quantity.
 
-    @property
-    def fits(self) -> dict[str, GivenModel]:
-        """All fits of a point by name: every model with quantities, and its refinement."""
-        return {
-            name + end: model
-            for name, model in self.models.items()
-            for end in ("", REFINED)
-            if model.quantities
-        }
+    published: columns of equal length by fit. Raises ValueError if a parameter has none, or nothing
+    else has.
+    """
+    rows: list[tuple[object, ...]] = []
+    for fit, columns in published.items():
+        if not set(parameters) < set(columns) or len({*map(len, columns.values())}) > 1:
+            raise ValueError(
+                f"thesis must give {list(parameters)} and quantities at every point, or be null: "
+                f"{dict(columns)} came for {fit}"
+            )
+        for name in columns:
+            if name not in parameters:
+                used = [columns[key] for key in (*parameters, name)]
+                rows += [(fit, name, *point) for point in zip(*used, strict=True)]
+    numbers = [*parameters, "value"]
+    table = pd.DataFrame(rows, columns=["fit", "quantity", *numbers])
+    return table.astype(dict.fromkeys(numbers, float))
 
-    @cached_property
-    def laws(self) -> dict[str, dict[str, ControlLaw]]:
-        """A control law per fit and quantity, from the points at which the fit finished."""
-        found = {}
-        for fit, model in self.fits.items():
-            used = [result for result in self.results if result.is_usable(fit)]
-            points = read_points([each.parameters for each in used], self.parameters)
-            if len(used) < LEAST_POINTS or not np.ptp(points, axis=0).all():
-                continue
-            functions = control_functions(self.parameters, points)
-            found[fit] = {
-                name: fit_control_law(_values(used, fit, name), points, functions)
-                for name in model.quantities
-            }
-        return found
 
-    @property
-    def best(self) -> str | None:
-        """The fit of least error at points left out, of those that have control laws."""
-        return min(self.laws, key=lambda fit: self.errors.get(fit, np.inf), default=None)
+def estimates_of(results: Sequence[PointResult], published: pd.DataFrame) -> pd.DataFrame:
+    """One row per point, fit and quantity, with the published value."""
+    rows = [
+        {**result.parameters, "fit": fit, "usable": fitted.is_usable, "quantity": name,
+         "value": each.value, "low": each.low, "high": each.high}
+        for result in results
+        for fit, fitted in result.fits.items()
+        for name, each in fitted.estimates.items()
+    ]  # fmt: skip
+    parameters = list(results[0].parameters)
+    columns = [*parameters, "fit", "usable", "quantity", "value", "low", "high"]
+    table = pd.DataFrame(rows, columns=columns).astype(dict.fromkeys(parameters, float))
+    known = published.rename(columns={"value": "thesis"})
+    return table.merge(known, how="left", on=[*parameters, "fit", "quantity"])
 
-    def tables(self) -> dict[str, pd.DataFrame]:
-        laws = [(fit, name, law) for fit, of in self.laws.items() for name, law in of.items()]
-        return {
-            "quantities": self.estimates,
-            "control_laws": ResultTable(laws, CONTROL_LAW).csv(),
-            "trends": self.trends,
-        }
 
-    @cached_property
-    def estimates(self) -> pd.DataFrame:
-        """One row per point, fit and quantity, with the published value."""
-        rows = [
-            {**result.parameters, "fit": fit, "usable": result.is_usable(fit), "quantity": name,
-             "value": each.value, "low": each.low, "high": each.high}
-            for result in self.results
-            for fit, fitted in result.fits.items()
-            for name, each in fitted.estimates.items()
-        ]  # fmt: skip
-        columns = [*self.parameters, "fit", "usable", "quantity", "value", "low", "high"]
-        table = pd.DataFrame(rows, columns=columns)
-        known = self._published.rename(columns={"value": "thesis"})
-        if not rows:  # an empty table's columns have no types to merge on
-            return table.assign(thesis=float("nan"))
-        return table.merge(known, how="left", on=[*self.parameters, "fit", "quantity"])
+def control_laws(
+    estimates: pd.DataFrame, parameters: list[str]
+) -> dict[tuple[str, str], ControlLaw]:
+    """A control law per fit and quantity, from the points at which the fit finished."""
+    found = {}
+    for (fit, name), rows in estimates.groupby(["fit", "quantity"], sort=False):
+        used = rows[rows["usable"]]
+        points = used[parameters].to_numpy(float)
+        if len(used) >= LEAST_POINTS and np.ptp(points, axis=0).all():
+            functions = control_functions(parameters, points)
+            found[str(fit), str(name)] = fit_control_law(
+                used["value"].to_numpy(), points, functions
+            )
+    return found
 
-    @cached_property
-    def _published(self) -> pd.DataFrame:
-        rows = [
-            {
-                **{name: point[name] for name in self.parameters},
-                "fit": fit,
-                "quantity": q,
-                "value": v,
-            }
-            for fit, points in self.published.items()
-            for point in points
-            for q, v in point.items()
-            if q not in self.parameters
-        ]
-        table = pd.DataFrame(rows, columns=[*self.parameters, "fit", "quantity", "value"])
-        return table.astype(dict.fromkeys(self.parameters, float))
 
-    @property
-    def lines(self) -> list[tuple[str, dict[str, float]]]:
-        """The lines of points that trends go along: a parameter, and the others held."""
-        return lines_of([result.parameters for result in self.results if result.fits] or [{}])
+def trends(
+    estimates: pd.DataFrame,
+    published: pd.DataFrame,
+    lines: Sequence[tuple[str, Mapping[str, float]]],
+) -> pd.DataFrame:
+    """Exponents along each parameter with the others held, for our and the published values."""
+    rows = []
+    for along, at in lines:
+        for (fit, name), own in rows_at(estimates, at).groupby(["fit", "quantity"], sort=False):
+            where = {"fit": fit, "quantity": name}
+            used, known = own[own["usable"]], rows_at(published, {**at, **where})
+            std = (used["high"] - used["low"]) / (2.0 * ndtri(0.5 + 0.5 * LEVEL))
+            x, values = used[along].to_numpy(), used["value"].to_numpy()
+            trend = {"along": along, **vars(fit_trend(x, values, std.to_numpy()))}
+            thesis = fit_trend(known[along].to_numpy(), known["value"].to_numpy()).exponent
+            rows.append(where | trend | {"thesis": thesis})
+    return pd.DataFrame(rows)
 
-    @cached_property
-    def trends(self) -> pd.DataFrame:
-        """Exponents along each parameter with the others held, for our and the published values."""
-        rows = []
-        for along, at in self.lines:
-            held = [r for r in self.results if all(r.parameters[k] == v for k, v in at.items())]
-            for fit, model in self.fits.items():
-                used = [result for result in held if result.is_usable(fit)]
-                x = np.array([result.parameters[along] for result in used])
-                for name in model.quantities:
-                    trend = fit_trend(x, _values(used, fit, name), _std(used, fit, name))
-                    where = {**at, "fit": fit, "quantity": name}
-                    known = rows_at(self._published, where)
-                    xs, values = (known[c].to_numpy(dtype=float) for c in (along, "value"))
-                    row = {"fit": fit, "quantity": name, "along": along, **vars(trend)}
-                    rows.append(row | {"thesis": fit_trend(xs, values).exponent})
-        return pd.DataFrame(rows)
 
-    def figures(self) -> dict[str, Captioned]:
-        """A figure of each model that was fitted, along every line of points."""
-        if self.estimates.empty or not self.lines:
-            return {}
-        fitted = set(self.estimates[self.estimates["usable"]]["fit"])
-        return {f"trends_{name}": self._figure(name) for name in self.models if name in fitted}
-
-    def _figure(self, model: str) -> Captioned:
-        """Quantities of one model: of least squares, refined, and published."""
+def _add_figures(
+    report: Report,
+    estimates: pd.DataFrame,
+    laws: Laws,
+    published: pd.DataFrame,
+    lines: Sequence[tuple[str, Mapping[str, float]]],
+    errors: Mapping[str, float],
+    labels: Mapping[str, str],
+) -> None:
+    """Add a figure of each model: its quantities by least squares, refined, and published."""
+    usable = estimates[estimates["usable"]]
+    for model in dict.fromkeys(fit.removesuffix(REFINED) for fit in usable["fit"] if lines):
         kinds = {model: "least squares", model + REFINED: "refined"}
-        best = min(kinds, key=lambda fit: self.errors.get(fit, np.inf))
-        ours = self.estimates.query("usable and fit in @kinds")
-        ours = ours.sort_values("fit", key=lambda fit: fit != best, kind="stable")
-        theirs = rows_at(self._published, {"fit": model})
+        best = min(kinds, key=lambda fit: errors.get(fit, np.inf))
+        ours = usable[usable["fit"].isin(list(kinds))]
+        ours = pd.concat([ours[ours["fit"] == best], ours[ours["fit"] != best]])
+        theirs = rows_at(published, {"fit": model})
         theirs = theirs.assign(low=theirs["value"], high=theirs["value"], kind=PUBLISHED)
         table = pd.concat([ours.assign(kind=ours["fit"].map(kinds)), theirs])
-        laws = self.laws.get(best, {})
-        published = "; beside them what the thesis found in its data" if len(theirs) else ""
-        lines = f"; lines are the control laws of the filled marks, the fit {spoken(best)}"
-        draw = partial(trends_figure, table, laws, trends=self.lines, labels=self.labels)
-        return Captioned(
-            draw, f"{CAPTION.format(spoken(model))}{published}{lines if laws else ''}."
+        own = {name: law for (fit, name), law in laws.items() if fit == best}
+        beside = "; beside them what the thesis found in its data" if len(theirs) else ""
+        line = f"; lines are the control laws of the filled marks, the fit {best}" if own else ""
+        report.figure(
+            f"trends_{model}",
+            partial(trends_figure, table, own, trends=lines, labels=labels),
+            CAPTION.format(model, beside, line),
         )
 
-    def _units(self, fit: str) -> dict[str, str]:
-        """Unit of every quantity of a fit."""
-        units = next(each.fits[fit].model.units for each in self.results if each.fits)
-        return {n: q.unit(self.library, units) for n, q in self.fits[fit].quantities.items()}
 
-    def in_short(self, compared: str) -> Result:
-        """The control laws of the fit that does best at points left out.
-
-        compared: the errors of all fits, in words.
-        """
-        best, shown = self.best, list[Block]()
-        if best is not None:
-            units = self._units(best)
-            shown += [
-                Equation(
-                    name,
-                    law.coef_by_term,
-                    rate=False,
-                    unit=units[name],
-                    mark=f" ({percent(2)(law.search_error)} off where left out)",
-                    on_screen=True,
-                )
-                for name, law in self.laws[best].items()
-            ]
-        end = f", by the fit {spoken(best)}" if best else ""
-        n_fitted = sum(bool(result.fits) for result in self.results)
-        return Result(
-            f"Found: {len(shown) or 'no'} control laws over {n_fitted} operating points that "
-            f"oscillate{end}",
-            [*shown[:MOST_LAWS], *([Text(compared)] if compared else [])],
-            load='pandas.read_csv("{}/tables/control_laws.csv")',
-            picture=next(iter(self.figures()), ""),
-        )
-
-    def sections(self) -> Iterator[Section]:
-        for fit in self.fits:
-            yield self._fit(fit)
-        yield Section("Intervals", [Text(INTERVALS)], level=3)
-        trends = _table(self.trends, ["along", "fit"], TRENDS)
-        yield Section("Trends", [*trends, *pictures(self.figures())])
-        laws = self.tables()["control_laws"]
-        needed = f"a law needs {LEAST_POINTS} points, and all parameters to vary over them"
-        none = [Text(f"None: {needed}.")]
-        yield Section("Control laws", _table(laws, ["fit"], CONTROL) if len(laws) else none)
-
-    def _fit(self, fit: str) -> Section:
-        """One row per point: quantities with half their interval widths, and published values."""
-        estimates = rows_at(self.estimates, {"fit": fit})
-        headings = {name: _heading(name, unit) for name, unit in self._units(fit).items()}
-        rows = []
-        for result in self.results:
-            here = rows_at(estimates, result.parameters).to_dict("records")
-            cells = {each["quantity"]: _cell(each) for each in here}
-            row: dict[str, Any] = dict(result.parameters)
-            row |= {heading: cells.get(name, "-") for name, heading in headings.items()}
-            if fitted := result.fits.get(fit):
-                row |= {f"R2 {state}": f"{value:.2f}" for state, value in fitted.r2.items()}
-                row |= {"loss": f"{fitted.loss:.3f}"} if fit.endswith(REFINED) else {}
-            rows.append(row | {"status": fitted.status if fitted else result.status})
-        thesis = " (thesis)" if estimates["thesis"].notna().any() else ""
-        return Section(f"{spoken(fit)}{thesis}", [Table(pd.DataFrame(rows))], level=3)
-
-    def headline(self) -> dict[str, float]:
-        """Prediction error of the laws by fit and quantity; NaN for a law that was not found."""
-        found = {}
-        for fit, model in self.fits.items():
-            for name in model.quantities:
-                law = self.laws.get(fit, {}).get(name)
-                found[f"law/{fit}/{name}/loo_error"] = law.loo_error if law else np.nan
-                found[f"law/{fit}/{name}/search_error"] = law.search_error if law else np.nan
-        return found
-
-
-def check_published(
-    published: Mapping[str, Sequence[Mapping[str, float]]], parameters: Sequence[str]
+def _add_values(
+    report: Report, estimates: pd.DataFrame, units: Mapping[tuple[str, str], str]
 ) -> None:
-    """Raise ValueError for a published point without all parameters, or with nothing else."""
-    for points in published.values():
-        for point in points:
-            if not set(parameters) < set(point):
-                raise ValueError(
-                    f"thesis must give {list(parameters)} and quantities at every point, or be "
-                    f"null: {point} came"
-                )
+    """Add the quantities of every fit, one row per point, with the scores of the fit.
+
+    They are shown as `0.0241 ±0.0001 (0.025)`: value, half the interval's width, published value.
+    """
+    report.section("Quantities", INTERVALS)
+    report.table("quantities", estimates, shown=False)
+    for fit, own in estimates.groupby("fit", sort=False):
+        scores = rows_at(report.tables["fits"], {"fit": fit}).drop(columns="fit")
+        point = list(scores.columns[: scores.columns.get_loc("status")])
+        reach = 0.5 * (own["high"] - own["low"])
+        cells = [
+            with_error(value, error) + ("" if np.isnan(thesis) else f" ({thesis:.3g})")
+            for value, error, thesis in zip(own["value"], reach, own["thesis"], strict=True)
+        ]
+        headings = [_heading(name, units[str(fit), name]) for name in own["quantity"]]
+        wide = own.assign(cell=cells, heading=headings).set_index([*point, "heading"])["cell"]
+        table = wide.unstack(sort=False).join(scores.set_index(point)).reset_index()
+        report.add(Table(table, title=str(fit)))
 
 
-def _values(used: Sequence[PointResult], fit: str, name: str) -> np.ndarray:
-    return np.array([result.fits[fit].estimates[name].value for result in used])
-
-
-def _std(used: Sequence[PointResult], fit: str, name: str) -> np.ndarray:
-    """Standard deviations by the intervals."""
-    ends = [result.fits[fit].estimates[name] for result in used]
-    return np.array([each.high - each.low for each in ends]) / (2.0 * ndtri(0.5 + 0.5 * LEVEL))
+def _equation(name: str, law: ControlLaw, unit: str = "", error: str = "") -> Equation:
+    mark = f" ({error} off where left out)" if error else ""
+    return Equation(name, law.coef_by_term, rate=False, unit=unit, mark=mark, on_screen=True)
 
 
 def _heading(name: str, unit: str) -> str:
     """`g_inj (m^-3 s^-1)`: a quantity with its unit; names such as `L_m` already end in theirs."""
     return name if unit == "1" or name.endswith(f"_{unit}") else f"{name} ({unit})"
-
-
-def _cell(row: Mapping[Any, Any]) -> str:
-    """`0.0241 ±0.0001 (0.025)`: value, half the interval's width, published value."""
-    text = with_error(row["value"], 0.5 * (row["high"] - row["low"]))
-    return text if np.isnan(row["thesis"]) else f"{text} ({row['thesis']:.3g})"
-
-
-def _table(rows: pd.DataFrame, by: Sequence[str], note: str = "") -> list[Block]:
-    """A table without its empty columns; a rule is drawn where the values of `by` change."""
-    if rows.empty:
-        return [Text("None.")]
-    rows = rows.assign(fit=rows["fit"].map(spoken))
-    keys = rows[list(by)]
-    ends = (keys != keys.shift(-1)).any(axis=1)
-    shown = rows.dropna(axis=1, how="all").round({"r2": 3, "exponent": 3}).rename(columns=WORDS)
-    return [Table(shown, breaks=np.flatnonzero(ends)[:-1].tolist(), note=note)]

@@ -4,27 +4,29 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
+from math import nan
+from operator import itemgetter
 from textwrap import fill
 from typing import Any
 
-import pandas as pd
 import xarray as xr
 
 from ep2sindy.figures.breathing import curves_figure, stability_figure
-from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Captioned, Result, Section, Table, Text, pictures, places
+from ep2sindy.report.about import setting_text
+from ep2sindy.report.document import Result, Table, Text
+from ep2sindy.report.report import Report
+from ep2sindy.report.results import Metric, ResultTable, View, percent
 from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies.source import doubts, is_simulation, quiet
 from ep2sindy.studies.study import Deferred
 
+Simulated = Mapping[str, Any]  # attributes of a simulation: its status, and numbers in SI
+
 FAILED = "failed"
-SCANNED = (
-    "f_kHz", "multiplicity", "peak_spread", "I_d_mean", "I_d_std", "thrust_N", "isp_s",
-    "anode_efficiency", "mass_balance", "energy_balance",
-)  # fmt: skip
+STATUSES = ("oscillating", "transit", "steady", "decaying", "out", "diverged", FAILED)
 HEADING = 9  # characters per line in a table's heading
 MAP = (
     "Standard deviation of the discharge current over the scanned parameters: the colour and the "
@@ -35,6 +37,38 @@ CURVES = (
     "Discharge current with its standard deviation as bars, frequency, thrust and anode efficiency "
     "over the scanned parameter; vertical lines: points that diverged or could not be run."
 )
+
+
+def number(key: str, heading: str, form: Any, view: View = View.ALL) -> Metric[Simulated]:
+    """A number of a simulation; NaN if it has none, as a run that diverged."""
+    return Metric(key, lambda run: float(run.get(key, nan)), view, heading, form)
+
+
+def _millinewton(value: float) -> str:
+    return "-" if value != value else f"{1e3 * value:.1f} mN"
+
+
+def _cycles(count: float) -> str:
+    return "-" if count != count else f"{count:g} cycle{'s' if count > 1 else ''}"
+
+
+VERDICT: list[Metric[Simulated]] = [
+    Metric("status", itemgetter("status"), View.SHOWN),
+    Metric("cycle", lambda run: run.get("cycle", "none"), View.SHOWN),
+]
+MERITS = [
+    number("I_d_mean", "mean discharge current", "{:.2f} A"),
+    number("I_d_std", "its standard deviation", "{:.2f} A"),
+    number("f_kHz", "frequency", "{:.2f} kHz"),
+    number("peak_spread", "spread of the peaks", percent(1)),
+    number("multiplicity", "peaks repeat after", _cycles),
+    number("thrust_N", "thrust", _millinewton),
+    number("isp_s", "specific impulse", "{:.0f} s"),
+    number("anode_efficiency", "anode efficiency", percent(1)),
+    number("mass_balance", "mass balance", "{:.4f}"),
+    number("energy_balance", "energy balance", "{:.4f}"),
+]
+BALANCE = "balance: (out + stored)/in"
 
 
 def check_simulation(field: object, data: Deferred) -> None:
@@ -57,20 +91,11 @@ class Point:
     def label(self) -> str:
         return ", ".join(f"{name}={value_text(value)}" for name, value in self.values.items())
 
-
-@dataclass(frozen=True)
-class Simulated:
-    """Result of one point.
-
-    notes: warnings besides the status. message: why it could not be run.
-    """
-
-    status: str
-    cycle: str = "none"
-    numbers: Mapping[str, float] = field(default_factory=dict)
-    initial: str = ""
-    notes: Sequence[str] = ()
-    message: str = ""
+    @property
+    def plain(self) -> dict[str, Any]:
+        """Its values, as text unless they are numbers."""
+        values = self.values.items()
+        return {p: v if type(v) in (int, float) else value_text(v) for p, v in values}
 
 
 def scan_points(data: Deferred, scan: Mapping[str, Sequence[Any]]) -> list[Point]:
@@ -93,150 +118,86 @@ def run_point(point: Point) -> Simulated:
     except WriteError:
         raise
     except (ValueError, OSError, ArithmeticError) as error:
-        return Simulated(FAILED, message=str(error) or type(error).__name__)
-    attributes = run.attrs
-    return Simulated(
-        attributes["status"],
-        attributes.get("cycle", "none"),
-        {name: float(attributes.get(name, float("nan"))) for name in SCANNED},
-        attributes.get("initial", ""),
-        doubts(attributes),
-    )
+        return {"status": FAILED, "message": str(error) or type(error).__name__}
+    return dict(run.attrs)
 
 
 def value_text(value: Any) -> str:
-    """A value as text in tables and on axes: `250`, `BN`, `ColdStart(n_i=1e+17)`."""
-    if isinstance(value, Mapping):
-        name = str(value.get("_target_", "")).rpartition(".")[2]
-        inner = [f"{k}={value_text(v)}" for k, v in value.items() if k != "_target_"]
-        return f"{name}({', '.join(inner)})" if inner or not name else name
-    if isinstance(value, list):
-        return f"[{', '.join(map(value_text, value))}]"
-    return f"{value:g}" if isinstance(value, float) else "null" if value is None else str(value)
+    """A value as text in tables and on axes: `250`, `BN`, `ColdStart (n_i 1e+17)`, `null`."""
+    return setting_text(value) or "null"
 
 
-@dataclass(frozen=True, eq=False)
-class ScanOutcome:
-    """All points of a scan and their results. labels: names of some places."""
-
-    points: Sequence[Point]
-    results: Sequence[Simulated]
-    labels: Mapping[str, str]
-
-    @property
-    def rows(self) -> pd.DataFrame:
-        """One row per point: settings, verdict, numbers in SI, and the reason if it failed."""
-        nothing = dict.fromkeys(SCANNED, float("nan"))
-        rows = []
-        for point, each in zip(self.points, self.results, strict=True):
-            verdict = {"status": each.status, "cycle": each.cycle}
-            told = {"initial": each.initial, "message": each.message or "; ".join(each.notes)}
-            rows.append({**point.values, **verdict, **nothing, **each.numbers, **told})
-        return pd.DataFrame(rows)
-
-    @property
-    def scanned(self) -> list[str]:
-        """Places that take several values; the first place if none does."""
-        several = [name for name in self._places if len(self._texts[name].unique()) > 1]
-        return several or self._places[:1]
-
-    @property
-    def _places(self) -> list[str]:
-        return list(self.points[0].values)
-
-    @property
-    def _texts(self) -> pd.DataFrame:
-        """The rows, with the settings as text."""
-        texts = {
-            name: [value_text(each.values[name]) for each in self.points] for name in self._places
-        }
-        return self.rows.assign(**texts)
-
-    def label(self, place: str) -> str:
-        return self.labels.get(place, place.replace(".", ": ").replace("_", " "))
-
-    def models(self) -> dict[str, SparseModel]:
-        return {}
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        return {"points": self._texts}
-
-    def figures(self) -> dict[str, Captioned]:
-        along = self.scanned
-        if len(along) == 1:
-            values = [each.values[along[0]] for each in self.points]
-            numbers = all(type(value) in (int, float) for value in values)
-            points = self.rows if numbers else self._texts
-            draw = partial(curves_figure, points, along[0], self.label(along[0]))
-            return {"curves": Captioned(draw, CURVES)}
-        labels = {name: self.label(name) for name in along}
-        drawn = partial(stability_figure, self._texts, along, labels)
-        return {"stability": Captioned(drawn, MAP)}
-
-    def in_short(self) -> Result:
-        """How many points oscillate, and between which frequencies."""
-        counts = ", ".join(f"{n} {status}" for status, n in self._counts.items())
-        f_kHz = self.rows["f_kHz"].dropna()
-        ends = dict.fromkeys(f"{value:.3g}" for value in (f_kHz.min(), f_kHz.max()))
-        text = f"frequencies {' to '.join(ends)} kHz" if len(f_kHz) else "nothing oscillates"
-        (picture,) = self.figures()
-        return Result(
-            f"Simulated: {len(self.points)} points, {counts}",
-            [Text(f"over {', '.join(map(self.label, self.scanned))}: {text}")],
+def add_scan(
+    report: Report, points: Sequence[Point], results: Sequence[Simulated], names: Mapping[str, str]
+) -> None:
+    """Add all points of a scan and their results. names: of some places."""
+    warn_of_points(report, points, results)
+    labels = {p: names.get(p, p.replace(".", ": ").replace("_", " ")) for p in points[0].values}
+    table = scan_table(points, results, labels)
+    counts = Counter(result["status"] for result in results)
+    statuses = ", ".join(f"{n} {status}" for status, n in counts.items())
+    starts = dict.fromkeys(run["initial"] for run in results if run.get("initial"))
+    report.section("Scan", f"{len(points)} points: {statuses}; from {', '.join(starts)}.")
+    rows = table.csv()
+    scanned = [place for place in labels if rows[place].nunique() > 1] or [*labels][:1]
+    if len(scanned) == 1:
+        picture, caption = "curves", CURVES
+        draw = partial(curves_figure, rows, scanned[0], labels[scanned[0]])
+    else:
+        picture, caption = "stability", MAP
+        texts = rows.assign(**{place: [*map(value_text, rows[place])] for place in scanned})
+        draw = partial(stability_figure, texts, scanned, labels)
+    report.figure(picture, draw, caption)
+    shown = table.screen().rename(columns=partial(fill, width=HEADING, break_long_words=False))
+    report.table("points", table, shown=Table(shown, note=BALANCE))
+    report.summary["statuses"] = dict(counts)
+    report.headline["n_points"] = float(len(points))
+    report.headline |= {f"n_{status}": float(counts[status]) for status in STATUSES}
+    f_kHz = rows["f_kHz"].dropna()
+    ends = dict.fromkeys(f"{value:.3g}" for value in (f_kHz.min(), f_kHz.max()))
+    text = f"frequencies {' to '.join(ends)} kHz" if len(f_kHz) else "nothing oscillates"
+    over = ", ".join(labels[place] for place in scanned)
+    report.found(
+        Result(
+            f"Simulated: {len(points)} points, {statuses}",
+            [Text(f"over {over}: {text}")],
             load='pandas.read_csv("{}/tables/points.csv")',
             picture=picture,
         )
+    )
 
-    def sections(self) -> list[Section]:
-        counts = ", ".join(f"{n} {status}" for status, n in self._counts.items())
-        starts = dict.fromkeys(each.initial for each in self.results if each.initial)
-        lines = [
-            Text(f"{len(self.points)} points: {counts}; from {', '.join(starts)}."),
-            *self._failures(),
-        ]
-        return [Section("Scan", [*lines, self._table(), *pictures(["curves", "stability"])])]
 
-    def _failures(self) -> list[Text]:
-        """Reasons why points could not be run, each once."""
-        failed: dict[str, list[str]] = {}
-        for point, each in zip(self.points, self.results, strict=True):
-            if each.message:
-                failed.setdefault(each.message, []).append(point.label)
-        found = []
-        for message, labels in failed.items():
-            more = f" and {len(labels) - 2} more" if len(labels) > 2 else ""
-            found.append(Text(f"{'; '.join(labels[:2])}{more}: {message}", warning=True))
-        return found
+def scan_table(
+    points: Sequence[Point], results: Sequence[Simulated], labels: Mapping[str, str]
+) -> ResultTable[Simulated]:
+    """One record per point: its settings, verdict, numbers, and why it failed or is in doubt.
 
-    @property
-    def _counts(self) -> dict[str, int]:
-        return dict(Counter(each.status for each in self.results))
+    labels: of all places. A setting that is no number is a text.
+    """
+    settings: list[Metric[Simulated]] = [
+        Metric(p, itemgetter(p), View.SHOWN, label, value_text) for p, label in labels.items()
+    ]
+    metrics = [
+        *settings,
+        *(metric.of(dict, view=View.SHOWN) for metric in (*VERDICT, *MERITS)),  # no headlines
+        Metric("initial", lambda run: run.get("initial", "")),
+        Metric("message", lambda run: "; ".join(reasons(run))),
+    ]
+    pairs = zip(points, results, strict=True)
+    return ResultTable([{**result, **point.plain} for point, result in pairs], metrics)
 
-    def _table(self) -> Table:
-        shown = []
-        for row in self._texts.to_dict("records"):
-            shown.append(
-                {
-                    **{self.label(name): row[name] for name in self._places},
-                    "status": row["status"],
-                    "cycle": row["cycle"].replace("none", "-"),
-                    "current mean (A)": places(row["I_d_mean"], 2),
-                    "std (A)": places(row["I_d_std"], 2),
-                    "f (kHz)": places(row["f_kHz"], 1),
-                    "thrust (mN)": places(1e3 * row["thrust_N"], 1),
-                    "efficiency (%)": places(100.0 * row["anode_efficiency"], 1),
-                    "spread of peaks (%)": places(100.0 * row["peak_spread"], 1),
-                    "mass balance": places(row["mass_balance"], 4),
-                    "energy balance": places(row["energy_balance"], 4),
-                }
-            )
-        narrow = {name: fill(name, HEADING, break_long_words=False) for name in shown[0]}
-        return Table(pd.DataFrame(shown).rename(columns=narrow), note="balance: (out + stored)/in")
 
-    def summary(self) -> dict[str, Any]:
-        return {"statuses": self._counts, "points": self.rows.to_dict("records")}
+def warn_of_points(report: Report, points: Sequence[Point], results: Sequence[Simulated]) -> None:
+    """Warn of points that could not be run, and of doubts about others; each reason once."""
+    labels: dict[str, list[str]] = {}
+    for point, result in zip(points, results, strict=True):
+        for reason in reasons(result):
+            labels.setdefault(reason, []).append(point.label)
+    for reason, those in labels.items():
+        more = f" and {len(those) - 2} more" if len(those) > 2 else ""
+        report.warn(f"{'; '.join(those[:2])}{more}: {reason}")
 
-    def headline(self) -> dict[str, float]:
-        names = ("oscillating", "transit", "steady", "decaying", "out", "diverged", FAILED)
-        counts = {f"n_{name}": float(self._counts.get(name, 0)) for name in names}
-        return {"n_points": float(len(self.points)), **counts}
+
+def reasons(result: Simulated) -> Sequence[str]:
+    """Why a point could not be run, or the doubts about its run besides its status."""
+    return [result["message"]] if "message" in result else doubts(result)

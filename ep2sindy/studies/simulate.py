@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,25 +17,20 @@ import pandas as pd
 import xarray as xr
 
 from ep2sindy.figures import breathing
-from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import (
-    Block,
-    Captioned,
-    Result,
-    Section,
-    Table,
-    Text,
-    pictures,
-    places,
-)
-from ep2sindy.report.run import Run
+from ep2sindy.report.document import Result, Table, Text, places
+from ep2sindy.report.report import Report
+from ep2sindy.report.results import Metric, ResultTable, View, percent
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.spectrum import power_spectrum
 from ep2sindy.studies.scan import (
+    BALANCE,
     FAILED,
-    ScanOutcome,
+    MERITS,
+    VERDICT,
     Simulated,
+    add_scan,
     check_simulation,
+    number,
     run_point,
     scan_points,
 )
@@ -56,10 +52,19 @@ CAPTIONS = {
     "maps": "Discharge current, neutrals and ions over time and axis: neutrals fill the channel, "
     "are ionised, and fill it again. Dashed: the channel's exit.",
 }
-NUMBERS = (
-    "f_kHz", "multiplicity", "peak_spread", "I_d_mean", "I_d_std", "thrust_N", "isp_s",
-    "anode_efficiency", "I_beam_mean", "I_wall_mean", "mass_balance", "energy_balance",
-)  # fmt: skip
+BRIEF = ("I_d_mean", "I_d_std", "thrust_N", "isp_s", "mass_balance")
+PERFORMANCE: list[Metric[Simulated]] = [
+    *VERDICT,
+    Metric("initial", lambda run: run.get("initial"), View.SHOWN, "start"),
+    *MERITS,
+    number("std_share", "standard deviation over mean current", percent(0), View.SHOWN),
+    number("I_beam_mean", "mean ion beam current", "{:.2f} A"),
+    number("beam_share", "ion beam over discharge current", percent(0), View.SHOWN),
+    number("I_wall_mean", "mean ion current to the walls", "{:.2f} A"),
+    Metric("rates", lambda run: run.get("rates"), View.SHOWN, "rates of the propellant"),
+    number("half_angle_deg", "mean half-angle of the plume", "{:.1f} degrees", View.SHOWN),
+    Metric("n_samples", itemgetter("n_samples")),
+]
 
 
 def _is_scan(value: Any) -> bool:
@@ -101,201 +106,107 @@ class Study:
     def __post_init__(self) -> None:
         scan_points(self.data, self.scan or {})  # refuses a misspelt place before any simulation
 
-    def compute(self, run: Run) -> Outcome | ScanOutcome:
-        return self._scanned(run) if self.scan else self._one(run)
+    def run(self, report: Report) -> None:
+        if self.scan:
+            self._scan(report, self.scan)
+        else:
+            self._simulate(report)
 
-    def _one(self, run: Run) -> Outcome:
+    def _simulate(self, report: Report) -> None:
         field = self.data.build()
         check_simulation(field, self.data)
-        write(field, run.folder.path / "field.nc")
-        say_simulation(run, field.attrs)
-        return Outcome(field, periods=self.figures.periods, f_max_Hz=self.figures.f_max_Hz)
-
-    def _scanned(self, run: Run) -> ScanOutcome:
-        points = scan_points(self.data, self.scan or {})
-        with run.progress(None, "", "kernels, compiled once"):
-            compile_kernels([point.data for point in points])
-        stage = run.progress(len(points), "simulation")
-        results: list[Simulated] = collect(self.parallel, run_point, points, stage)
-        if all(each.status == FAILED for each in results):
-            raise ValueError(f"a scan needs a point that can be run: {results[0].message}")
-        for point, result in zip(points, results, strict=True):
-            for note in result.notes:
-                run.warn(f"{point.label}: {note}")
-        return ScanOutcome(points, results, self.labels)
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """A run, and the range that figures show; `field.nc` holds all of it."""
-
-    field: xr.Dataset
-    periods: float
-    f_max_Hz: float | None
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """Figures of merit of a run in SI; NaN for those missing because the run diverged."""
-        attributes = dict(self.field.attrs)
-        if "I_beam" in self.field and self.field.sizes["time"]:
-            attributes["I_beam_mean"] = self.field["I_beam"].mean()
-        return {name: float(attributes.get(name, np.nan)) for name in NUMBERS}
-
-    @property
-    def can_be_drawn(self) -> bool:
-        return self.field.sizes["time"] >= MIN_SAMPLES
-
-    def models(self) -> dict[str, SparseModel]:
-        return {}
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        found = {"performance": self._performance(), "power": power_table(self.field)}
-        if self.can_be_drawn:
-            found |= {"profiles": self._profiles(), "spectrum": self._spectrum()}
-        return found
-
-    def _profiles(self) -> pd.DataFrame:
-        columns = {"z": self.field["z"].values}
-        for name, values in breathing.profile_table(self.field).items():
-            ends = ("mean", "low", "high", "min", "max")
-            columns |= {f"{name}_{end}": each for end, each in zip(ends, values, strict=True)}
-        return pd.DataFrame(columns)
-
-    def _spectrum(self) -> pd.DataFrame:
-        frequency, power = power_spectrum(self.field["time"].values, self.field["I_d"].values)
-        return pd.DataFrame({"frequency_Hz": frequency, "power": power})
-
-    def figures(self) -> dict[str, Captioned]:
-        if not self.can_be_drawn:
-            return {}
-        field, time = self.field, self.field["time"].values
-        window = breathing.last_periods(time, self.numbers["f_kHz"], self.periods)
-        highest = 0.5 / float(time[1] - time[0])
-        up_to = {"f_max_Hz": min(self.f_max_Hz or highest, highest), "transit_Hz": TRANSIT_HZ}
-        drawn = {
-            "current": partial(breathing.current_figure, field, window),
-            "spectrum": partial(
-                breathing.current_spectrum_figure, field, f_kHz=self.numbers["f_kHz"], **up_to
-            ),
-            "profiles": partial(breathing.profile_figure, field),
-            "maps": partial(breathing.space_time_figure, field, window),
-        }
-        radial = AVERAGED if "r" in field.dims else ""
-        tails = {"profiles": radial, "maps": radial}
-        return {n: Captioned(d, CAPTIONS[n] + tails.get(n, "")) for n, d in drawn.items()}
-
-    def in_short(self) -> Result:
-        n = self.numbers
-        numbers = [
-            f"discharge current {_with(places(n['I_d_mean'], 2), 'A')} on average",
-            f"standard deviation {_with(places(n['I_d_std'], 2), 'A')}",
-            f"thrust {_with(places(1e3 * n['thrust_N'], 1), 'mN')}",
-            f"specific impulse {_with(places(n['isp_s'], 0), 's')}",
-            f"mass balance {places(n['mass_balance'], 4)}",
-        ]
-        at = f" at {places(n['f_kHz'], 2)} kHz" if np.isfinite(n["f_kHz"]) else ""
-        return Result(
-            f"Simulated: {status_text(self.field.attrs)}{at}",
-            [Text("; ".join(numbers))],
-            load='ep.read_field("{}/field.nc")',
-            picture="current",
+        write(field, report.folder.file("field.nc"))
+        say_simulation(report, field.attrs)
+        run = performance(field)
+        f_kHz = float(run.get("f_kHz", np.nan))
+        at = f" at {f_kHz:.2f} kHz" if np.isfinite(f_kHz) else ""
+        brief = [f"{m.heading} {m.cell(m.value(run))}" for m in PERFORMANCE if m.key in BRIEF]
+        report.found(
+            Result(
+                f"Simulated: {status_text(run)}{at}",
+                [Text("; ".join(brief))],
+                load='ep.read_field("{}/field.nc")',
+                picture="current",
+            )
         )
+        report.summary["file"] = "field.nc"
+        table = ResultTable({"run": run}, PERFORMANCE)
+        report.section("Performance")
+        report.table("performance", table, shown=Table(table.upright(), note=BALANCE))
+        add_power(report, field)
+        if field.sizes["time"] >= MIN_SAMPLES:
+            self._draw(report, field, f_kHz)
+        else:
+            n = field.sizes["time"]
+            report.add(f"The run broke after {n} samples: there is nothing to draw.")
 
-    def sections(self) -> list[Section]:
-        notes: list[Block] = []
-        if not self.can_be_drawn:
-            n = self.field.sizes["time"]
-            notes = [Text(f"The run broke after {n} samples: there is nothing to draw.")]
-        return [
-            Section("Run", [Table(self._performance()), *notes]),
-            Section("Where the power goes", [power_text(self.field)]),
-            Section("Current", pictures(["current", "spectrum"])),
-            Section("Along the axis", pictures(["profiles", "maps"])),
-        ]
+    def _draw(self, report: Report, field: xr.Dataset, f_kHz: float) -> None:
+        """Add figures of a run, and the samples that they show."""
+        time = field["time"].values
+        window = breathing.last_periods(time, f_kHz, self.figures.periods)
+        highest = 0.5 / float(time[1] - time[0])
+        up_to_Hz = min(self.figures.f_max_Hz or highest, highest)
+        spectrum = partial(
+            breathing.current_spectrum_figure,
+            field, f_kHz=f_kHz, f_max_Hz=up_to_Hz, transit_Hz=TRANSIT_HZ,
+        )  # fmt: skip
+        report.section("Current")
+        draw = partial(breathing.current_figure, field, window)
+        report.figure("current", draw, CAPTIONS["current"])
+        report.figure("spectrum", spectrum, CAPTIONS["spectrum"])
+        frequency, power = power_spectrum(time, field["I_d"].values)
+        report.samples("spectrum", pd.DataFrame({"frequency_Hz": frequency, "power": power}))
+        report.section("Along the axis")
+        radial = AVERAGED if "r" in field.dims else ""
+        draw = partial(breathing.profile_figure, field)
+        report.figure("profiles", draw, CAPTIONS["profiles"] + radial)
+        draw = partial(breathing.space_time_figure, field, window)
+        report.figure("maps", draw, CAPTIONS["maps"] + radial)
+        report.samples("profiles", breathing.profile_table(field))
 
-    def _performance(self) -> pd.DataFrame:
-        """Performance of the run, in words and units."""
-        n, attributes = self.numbers, self.field.attrs
-        mode = "transit" if attributes["status"] == "transit" else "breathing"
-        share = f"{100.0 * n['I_d_std'] / n['I_d_mean']:.0f}"
-        beam = f"{100.0 * n['I_beam_mean'] / n['I_d_mean']:.0f}"
-        rows = {
-            "status": status_text(attributes),
-            "start": attributes.get("initial", "-"),
-            "discharge current, mean": _with(places(n["I_d_mean"], 2), "A"),
-            "discharge current, standard deviation": _with(
-                places(n["I_d_std"], 2), f"A, {share} % of the mean"
-            ),
-            f"{mode} frequency": _with(places(n["f_kHz"], 2), "kHz"),
-            "peaks of the current": _peaks(n),
-            "thrust": _with(places(1e3 * n["thrust_N"], 1), "mN"),
-            "specific impulse": _with(places(n["isp_s"], 0), "s"),
-            "anode efficiency": _with(places(100.0 * n["anode_efficiency"], 1), "%"),
-            "ion beam current, mean": _with(
-                places(n["I_beam_mean"], 2), f"A, {beam} % of the discharge current"
-            ),
-            "ion current to the walls, mean": _with(places(n["I_wall_mean"], 2), "A"),
-            "mass balance, (left + stored)/entered": places(n["mass_balance"], 4),
-            "energy balance, (left + stored)/entered": places(n["energy_balance"], 4),
-            "rates of the propellant": attributes.get("rates", "-"),
-        }
-        if "half_angle" in self.field and self.field.sizes["time"]:
-            mean = float(self.field["half_angle"].mean())
-            rows["half-angle of the plume, mean"] = _with(places(mean, 1), "degrees")
-        return pd.DataFrame({"quantity": list(rows), "value": list(rows.values())})
-
-    def summary(self) -> dict[str, Any]:
-        attributes = self.field.attrs
-        return {
-            "file": "field.nc",
-            "status": attributes["status"],
-            "cycle": attributes.get("cycle", "none"),
-            "initial": attributes.get("initial"),
-            **self.numbers,
-            "rates": attributes.get("rates"),
-            "n_samples": self.field.sizes["time"],
-            "power_W": dict(power_table(self.field)[["name", "power_W"]].to_numpy().tolist()),
-        }
-
-    def headline(self) -> dict[str, float]:
-        return self.numbers
+    def _scan(self, report: Report, scan: Mapping[str, Sequence[Any]]) -> None:
+        points = scan_points(self.data, scan)
+        with report.progress(None, "", "kernels, compiled once"):
+            compile_kernels([point.data for point in points])
+        stage = report.progress(len(points), "simulation")
+        results: list[Simulated] = collect(self.parallel, run_point, points, stage)
+        if all(result["status"] == FAILED for result in results):
+            raise ValueError(f"a scan needs a point that can be run: {results[0]['message']}")
+        add_scan(report, points, results, self.labels)
 
 
-def _with(number: str, unit: str) -> str:
-    return number if number == "-" else f"{number} {unit}"
+def performance(field: xr.Dataset) -> dict[str, Any]:
+    """Attributes of a run, with means over its record."""
+    found = {**field.attrs, "n_samples": field.sizes["time"]}
+    means = {"I_beam": "I_beam_mean", "half_angle": "half_angle_deg"}
+    if field.sizes["time"]:
+        found |= {key: float(field[name].mean()) for name, key in means.items() if name in field}
+        shares = {"I_d_std": "std_share", "I_beam_mean": "beam_share"}
+        found |= {k: found.get(name, np.nan) / found["I_d_mean"] for name, k in shares.items()}
+    return found
 
 
-def _peaks(numbers: Mapping[str, float]) -> str:
-    """How the current's peaks differ from cycle to cycle; `-` where nothing oscillates."""
-    if not np.isfinite(numbers["peak_spread"]):
-        return "-"
-    again, spread = numbers["multiplicity"], places(100.0 * numbers["peak_spread"], 1)
-    cycles = "every cycle" if again == 1.0 else f"after {again:g} cycles"
-    repeat = f"the same {cycles}" if np.isfinite(again) else "not repeating"
-    return f"{spread} % spread, {repeat}"
-
-
-def power_table(field: xr.Dataset) -> pd.DataFrame:
-    """Mean power in W by sink, and its share of the power that the plasma takes."""
+def add_power(report: Report, field: xr.Dataset) -> None:
+    """Add the mean power in W by sink, and its share of the power that the plasma takes."""
+    report.section("Where the power goes")
     known = [name for name in POWERS if name in field and field.sizes["time"]]
     power = {name: float(field[name].mean()) for name in known}
     text = {name: str(field[name].attrs.get("long_name", name)) for name in known}
+    if not known:
+        report.add("This run has no record of its power.")
     if "P_in" in power:
         power["stored"] = power["P_in"] - sum(power[name] for name in known if name != "P_in")
         text["stored"] = "stored by the electrons, or unaccounted for"
-    share = [100.0 * each / power.get("P_in", np.nan) for each in power.values()]
-    columns = {"name": list(power), "goes_to": list(text.values()), "power_W": list(power.values())}
-    return pd.DataFrame({**columns, "share": share})
+    whole = power.get("P_in", np.nan)
+    metrics: list[Metric[str]] = [
+        Metric("goes_to", lambda name: text[name], View.SHOWN, "power"),
+        Metric("power_W", lambda name: power[name], View.SHOWN, "W", _tenths),
+        Metric("share", lambda name: 100.0 * power[name] / whole, View.SHOWN, "%", _tenths),
+    ]
+    table = ResultTable({name: name for name in power}, metrics)
+    shown = Table(table.screen(), breaks=[0], note="Means over the record.")
+    report.table("power", table, heading="name", shown=shown)
 
 
-def power_text(field: xr.Dataset) -> Table | Text:
-    """The power table for reading."""
-    table = power_table(field)
-    if table.empty:
-        return Text("This run has no record of its power.")
-    rows = {
-        "power": table["goes_to"],
-        "W": [places(round(value, 1) + 0.0, 1) for value in table["power_W"]],  # no -0.0
-        "%": [places(round(value, 1) + 0.0, 1) for value in table["share"]],
-    }
-    return Table(pd.DataFrame(rows), breaks=[0], note="Means over the record.")
+def _tenths(value: float) -> str:
+    return places(round(value, 1) + 0.0, 1)  # no -0.0

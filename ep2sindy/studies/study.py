@@ -70,7 +70,9 @@ Count = Annotated[int, Check("a whole number, one or more", _is_count)]
 CountOrNone = Annotated[
     int | None, Check("a whole number, one or more, or null", lambda x: x is None or _is_count(x))
 ]
-Starts = Annotated[int, Check("zero or more starts", lambda x: type(x) is int and x >= 0)]
+ZeroOrMore = Annotated[
+    int, Check("a whole number, zero or more", lambda x: type(x) is int and x >= 0)
+]
 Share = Annotated[float, Check("a number between 0 and 1", lambda x: _is_positive(x) and x < 1)]
 ShareOrNone = Annotated[
     float | None,

@@ -26,7 +26,6 @@ from ep2sindy.studies.study import PositiveOrAll
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
 FROM_DERIVATIVES = (
     "These are the equations that fits of the derivatives select; those that free runs select, "
     "which are sustained if any is, stand above."

@@ -1,7 +1,7 @@
 """Dependence of coefficient errors under noise on the number and length of windows.
 
 The experiment is `+exp=weak_windows`. Source: the thesis, appendix, III-A. The true support is
-known, and least squares gives the coefficients, in the ways that `studies.fits` has.
+known, and least squares gives the coefficients, in the ways that `studies.fitted` has.
 """
 
 from __future__ import annotations
@@ -19,13 +19,11 @@ from ep2sindy.figures.windows import window_error_figure
 from ep2sindy.library.library import named_terms
 from ep2sindy.library.relations import constraint
 from ep2sindy.regression.constrained import constrained_fit
-from ep2sindy.regression.formulations import Weak
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.regression.windows import Boxes
 from ep2sindy.report.document import Result, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
-from ep2sindy.studies.fits import Fit, expand
+from ep2sindy.studies.fitted import Fit, boxes_of, expand
 from ep2sindy.studies.study import Count, Levels, Positive
 from ep2sindy.systems.systems import System
 
@@ -55,7 +53,7 @@ class Study:
 
     def run(self, report: Report) -> None:
         ways = expand(self.fits, self.forms, self.formulation)
-        forms = {name: form for name, (_, form) in ways.items() if form is not None}
+        forms = {way.name: way.form for way in ways if way.form is not None}
         with report.progress(len(self.noises) * self.n_realizations, "realization") as progress:
             errors = self.errors(forms, seed=report.seed, progress=progress)
         cells, system = error_cells(errors, forms), self.system
@@ -106,12 +104,6 @@ class Study:
         sampled = replace(self.system, rate_Hz=self.rate_Hz)
         fit = partial(_realization, sampled, forms, seed=seed)
         return pd.DataFrame(rows_in_order(self.parallel, fit, tasks, progress))
-
-
-def boxes_of(form: Formulation) -> Boxes | None:
-    """The random windows of a form; None if it has none."""
-    functions = form.test_functions if isinstance(form, Weak) else None
-    return functions if isinstance(functions, Boxes) else None
 
 
 def coefficient_error(

@@ -1,0 +1,267 @@
+"""Ways of finding the coefficients of a structure, and the models that are found, run freely."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Constraint
+from ep2sindy.model.comparison import Status
+from ep2sindy.model.model import SparseModel
+from ep2sindy.model.scores import r2
+from ep2sindy.refinement.windows import dominant_window
+from ep2sindy.regression.constrained import constrained_fit
+from ep2sindy.regression.formulations import Weak
+from ep2sindy.regression.rows import Formulation, RegressionRows
+from ep2sindy.regression.windows import Boxes
+from ep2sindy.report.results import Metric, Metrics, View
+from ep2sindy.studies.processes import compared_processes
+from ep2sindy.studies.source import Zones
+from ep2sindy.studies.structures import Structure, balance_model
+from ep2sindy.studies.views import EVALUATION
+
+if TYPE_CHECKING:
+    from ep2sindy.refinement.refine import Refinement
+
+BALANCE = "balance"  # the form of a fit of every process to the recorded balance
+DIVERGED = 10.0  # residual, in std, at samples that a run diverges before
+STARTED = "_started"  # ends the names of what concerns runs from a fitted start
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A way of finding coefficients.
+
+    form: of the regression, one of those that the config names; None means the formulation;
+    "balance" fits every process to the rate that a simulation records. relations: whether those of
+    a structure hold. refine: whether trajectories are followed then. n_points, n_windows: of random
+    windows, for a form that has them; every combination is a fit of its own, `n_points_70`.
+    """
+
+    form: str | None = None
+    relations: bool = True
+    refine: bool = False
+    n_points: Sequence[int] = ()
+    n_windows: Sequence[int] = ()
+
+
+@dataclass(frozen=True)
+class Way:
+    """One fit with its form; None means the recorded balance. of: the config's name of the fit."""
+
+    name: str
+    of: str
+    fit: Fit
+    form: Formulation | None
+
+
+def expand(
+    fits: Mapping[str, Fit], forms: Mapping[str, Formulation], usual: Formulation
+) -> list[Way]:
+    """Every fit with its form, one for each number and length of windows.
+
+    Raises ValueError for a form that is not named, or without random windows where such are asked.
+    """
+    found = []
+    for name, fit in fits.items():
+        if fit.form not in (None, BALANCE, *forms):
+            raise ValueError(
+                f"fits.{name}.form must be null, {BALANCE} or one of {list(forms)}: got "
+                f"{fit.form!r}"
+            )
+        form = usual if fit.form is None else forms.get(fit.form)
+        if not fit.n_points:
+            found.append(Way(name, name, fit, form))
+            continue
+        if not isinstance(form, Weak) or (own := boxes_of(form)) is None:
+            raise ValueError(
+                f"fits.{name}.n_points is for a form of random windows (Weak with Boxes): got "
+                f"{form}"
+            )
+        for n_windows, n_points in product(fit.n_windows or [own.n_windows], fit.n_points):
+            boxes = replace(own, n_points=n_points, n_windows=n_windows)
+            varied = f"n_windows_{n_windows}_" if len(fit.n_windows) > 1 else ""
+            its_form = replace(form, test_functions=boxes)
+            found.append(Way(f"{varied}n_points_{n_points}", name, fit, its_form))
+    return found
+
+
+def boxes_of(form: Formulation) -> Boxes | None:
+    """The random windows of a form; None if it has none."""
+    functions = form.test_functions if isinstance(form, Weak) else None
+    return functions if isinstance(functions, Boxes) else None
+
+
+@dataclass(frozen=True, eq=False)
+class RecordParts:
+    """A record to fit: all of it, the part that is fitted, the one that is run over, its zones."""
+
+    data: Trajectory
+    train: Trajectory
+    held: Trajectory
+    zones: Zones
+
+
+@dataclass(frozen=True, eq=False)
+class FirstModel:
+    """A model as a regression or a config gives it, before trajectories are followed.
+
+    held_to: None for coefficients that are given. r2: of the derivative, by state, on the rows of
+    the fit.
+    """
+
+    model: SparseModel
+    held_to: Constraint | None
+    r2: Mapping[str, float]
+
+
+def first_model(
+    structure: Structure, library: Library, way: Way, record: RecordParts, *, seed: int
+) -> FirstModel:
+    """The model by least squares, or as it is given. seed: of random windows."""
+    train = record.train
+    if structure.coefficients:
+        return FirstModel(structure.given(library, train), None, {})
+    held_to = structure.constraint(library, record.data, record.zones, relations=way.fit.relations)
+    if way.form is None:
+        model, _ = balance_model(library, held_to, record.data, record.zones)
+        return FirstModel(model, held_to, {})
+    rows = way.form.assemble([train], library, rng=np.random.default_rng(seed))
+    words = {"formulation": repr(way.form), "trajectories": train.label}
+    model = constrained_fit(rows, held_to, units=train.units, provenance=words)
+    # Smoothed rows and overlapping windows are not independent: their intervals would be too
+    # narrow. Rows that know the noise of their samples are.
+    if any(problem.noisy is None for problem in rows):
+        model = replace(model, covariance=None)
+    return FirstModel(model, held_to, rows_r2(model, rows))
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A model of one structure, fitted in one way, and its free runs over the same samples.
+
+    name: of the structure. from_sample: from the first sample. from_fit: from a start fitted to the
+    first samples. cpu_s: of the fit; of a refinement without that of its first model. refinement:
+    how trajectories were followed, if they were. wrong: the terms whose sign contradicts the
+    recorded balance.
+    """
+
+    name: str
+    structure: Structure
+    way: Way
+    first: FirstModel
+    model: SparseModel
+    from_sample: Evaluation
+    from_fit: Evaluation
+    cpu_s: float
+    refinement: Refinement | None
+    wrong: Sequence[str]
+
+    @property
+    def n_free(self) -> int:
+        return 0 if self.first.held_to is None else len(self.first.held_to.free)
+
+    @property
+    def r2(self) -> Mapping[str, float]:
+        """R2 of the derivative by state, for a model that is fitted to it."""
+        return {} if self.refinement else self.first.r2
+
+
+FITTED: Metrics[Fitted] = [
+    Metric("n_free", lambda fitted: fitted.n_free, View.SHOWN, "free"),
+    *(metric.of(lambda fitted: fitted.from_sample) for metric in EVALUATION),
+    *(
+        metric.of(lambda fitted: fitted.from_fit, f"{{}}{STARTED}", View.FILES)
+        for metric in EVALUATION
+    ),
+    Metric("wrong_signs", lambda fitted: "; ".join(fitted.wrong), View.SHOWN, "signs wrong"),
+    Metric("r2", lambda fitted: fitted.r2, View.FILES | View.HEADLINE),
+    Metric("loss", lambda fitted: fitted.refinement and fitted.refinement.loss),
+    Metric(
+        "refinement",
+        lambda fitted: fitted.refinement and str(fitted.refinement.status),
+        View.SHOWN,
+    ),
+    Metric("cpu_s", lambda fitted: fitted.cpu_s, View.FILES | View.HEADLINE),
+]
+
+
+def fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_states"]:
+    """Initial state whose trajectory is closest to the first one and a half periods of data.
+
+    Distances are in standard deviations of the data. The search starts from the first sample.
+    """
+    n_samples = min(dominant_window([run], model.states), run.n_samples)
+    data = run.window(0, n_samples).columns(model.states)
+    std = run.columns(model.states).std(axis=0)
+
+    def residual(start: np.ndarray) -> np.ndarray:
+        rollout = model.rollout(run, n_samples=n_samples, initial=start * std, rtol=1e-6)
+        strayed = np.full(data.shape, DIVERGED)
+        strayed[: len(rollout.t)] = (rollout.states - data[: len(rollout.t)]) / std
+        return strayed.ravel()
+
+    return least_squares(residual, data[0] / std, diff_step=1e-4).x * std
+
+
+def rows_r2(model: SparseModel, problems: Sequence[RegressionRows]) -> dict[str, float]:
+    """R2 of the derivative by state, on the rows of a fit."""
+    found = {}
+    for problem in problems:
+        for k, state in enumerate(problem.equations):
+            coef = model.coef[:, model.states.index(state)]
+            columns = np.flatnonzero(coef)
+            prediction = coef[None, columns] @ problem.theta[:, columns].T
+            found[state] = float(r2(truth=problem.target[:, k], prediction=prediction)[0])
+    return found
+
+
+def wrong_signs(model: SparseModel, held_to: Constraint | None, record: RecordParts) -> list[str]:
+    """Terms of processes whose sign is not that by which the recorded balance has them."""
+    if held_to is None or not held_to.processes or not record.zones.balances:
+        return []
+    return [
+        f"{_arrow(*process.ends)} by {term}"
+        for process in compared_processes(model, held_to, record.data, record.zones)
+        for term, coef in process.coef.items()
+        if coef * process.counterpart.get(term, coef) < 0.0
+    ]
+
+
+def _arrow(giver: str, taker: str) -> str:
+    """`n_n to n_i`, `n_i out`, `n_n in`."""
+    if giver and taker:
+        return f"{giver} to {taker}"
+    return f"{giver} out" if giver else f"{taker} in"
+
+
+# Several runs of one kind: over draws of windows, or over operating points.
+
+
+def ends(value: Callable[[Evaluation], float], runs: Sequence[Evaluation]) -> list[float]:
+    """Lowest and highest value over the runs that have it; NaN if none has it."""
+    values = np.array([value(run) for run in runs])
+    known = values[np.isfinite(values)]
+    return [float(known.min()), float(known.max())] if known.size else [np.nan, np.nan]
+
+
+def n_sustained(runs: Sequence[Evaluation]) -> int:
+    return sum(run.status is Status.SUSTAINED for run in runs)
+
+
+def worst_amplitude(run: Evaluation) -> float:
+    """Amplitude over the data's, of the state that is farthest off."""
+    return max(run.amplitude_ratio.values(), key=lambda ratio: abs(ratio - 1.0))
+
+
+def worst_waveform(run: Evaluation) -> float:
+    return max(run.waveform_error.values())

@@ -1,0 +1,135 @@
+"""Fits of structures at several operating points, and where each is sustained: `+exp=theories`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import pandas as pd
+
+from ep2sindy.figures.sustained import sustained_figure
+from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.model.comparison import Status
+from ep2sindy.report.document import Result, Text
+from ep2sindy.report.models import equations
+from ep2sindy.report.report import Report
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
+from ep2sindy.studies.fitted import (
+    FITTED,
+    Fitted,
+    ends,
+    n_sustained,
+    worst_amplitude,
+    worst_waveform,
+)
+
+NOTE = (
+    "Frequency, amplitude and waveform: the largest errors over the points that have a cycle. "
+    "Signs wrong: terms whose sign contradicts the recorded balance of the same process, and at "
+    "how many points."
+)
+CAPTION = (
+    "What becomes of every model, run freely from one sample at every operating point. The colour "
+    "is the error of the amplitude, of the state that is farthest off."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class AtPoints:
+    """One fit at every operating point."""
+
+    fits: Sequence[Fitted]
+
+    @property
+    def runs(self) -> list[Evaluation]:
+        return [fit.from_sample for fit in self.fits]
+
+    @property
+    def elsewhere(self) -> str:
+        """What becomes of the model where it is not sustained, in words."""
+        words = [str(run.status) for run in self.runs if run.status is not Status.SUSTAINED]
+        return ", ".join(f"{word} at {words.count(word)}" for word in dict.fromkeys(words))
+
+    @property
+    def wrong(self) -> str:
+        """The terms whose sign contradicts the balance, and at how many points."""
+        terms = [term for fit in self.fits for term in fit.wrong]
+        return "; ".join(f"{term} at {terms.count(term)}" for term in dict.fromkeys(terms))
+
+
+AT_POINTS: Metrics[AtPoints] = [
+    Metric("n_free", lambda each: max(fit.n_free for fit in each.fits), View.SHOWN, "free"),
+    Metric("n_sustained", lambda each: n_sustained(each.runs), View.FILES | View.HEADLINE),
+    Metric(
+        "sustained", lambda each: f"{n_sustained(each.runs)} of {len(each.runs)}", View.SCREEN
+    ),
+    Metric("elsewhere", lambda each: each.elsewhere, View.SHOWN),
+    Metric(
+        "f_error",
+        lambda each: max(map(abs, ends(lambda run: run.f_error, each.runs))),
+        View.SHOWN, "frequency off by", percent(2),
+    ),
+    Metric(
+        "amplitude_error",
+        lambda each: max(abs(end - 1.0) for end in ends(worst_amplitude, each.runs)),
+        View.SHOWN, "amplitude off by", percent(0),
+    ),
+    Metric(
+        "waveform_error",
+        lambda each: max(ends(worst_waveform, each.runs)),
+        View.SHOWN, "waveform", "{:.3f}",
+    ),
+    Metric("wrong_signs", lambda each: each.wrong, View.SHOWN, "signs wrong"),
+    Metric("source", lambda each: each.fits[0].structure.source),
+]  # fmt: skip
+
+
+def add_points(found: Mapping[str, Mapping[str, Fitted]], report: Report) -> None:
+    """Every fit over all points, and the models of each point. found: by point, then by fit.
+
+    Raises ValueError if no point has a record.
+    """
+    if not found:
+        raise ValueError("structures need a record to be fitted to: no operating point has one")
+    names = list(next(iter(found.values())))
+    over = {name: AtPoints([fits[name] for fits in found.values()]) for name in names}
+    sources = {fits[0].name: fits[0].structure.source for fits in (e.fits for e in over.values())}
+    report.section(f"{len(names)} fits at {len(found)} operating points")
+    report.figure("sustained", partial(sustained_figure, _rows(found)), CAPTION)
+    report.table("over_points", ResultTable(over, AT_POINTS), heading="fit", note=NOTE)
+    report.section("Structures", *(f"{key}: {text}" for key, text in sources.items() if text))
+    rows = {f"{n}, {p}": fit for n in names for p, fit in zip(found, over[n].fits, strict=True)}
+    report.section("Every point")
+    report.table("fits", ResultTable(rows, FITTED), heading="fit", page_only=True)
+    for number, (point, fits) in enumerate(found.items()):
+        report.section(point, level=3)
+        for name, fit in fits.items():
+            report.add(*equations(fit.model, lead=name, on_screen=False))
+            report.model(f"{name}_{number}", fit.model, shown=False)
+    counts = {name: n_sustained(each.runs) for name, each in over.items()}
+    lines = [
+        Text(f"sustained at {n} of {len(found)}: {', '.join(names)}")
+        for n in range(len(found), 0, -1)
+        if (names := [name for name, count in counts.items() if count == n])
+    ]
+    n_all = list(counts.values()).count(len(found))
+    report.found(
+        Result(
+            f"Found: {n_all} of {len(over)} fits are sustained at all {len(found)} points",
+            lines or [Text("none is sustained at any point")],
+            load='pandas.read_csv("{}/tables/over_points.csv")',
+            picture="sustained",
+        )
+    )
+
+
+def _rows(found: Mapping[str, Mapping[str, Fitted]]) -> pd.DataFrame:
+    """One row per structure, way and point: what the figure draws."""
+    rows = [
+        (fit.name, fit.way.name, point, str(fit.from_sample.status),
+         abs(worst_amplitude(fit.from_sample) - 1.0))
+        for point, fits in found.items()
+        for fit in fits.values()
+    ]  # fmt: skip
+    return pd.DataFrame(rows, columns=["structure", "way", "point", "status", "amplitude_error"])
