@@ -130,8 +130,12 @@ def pendulum() -> None:
     held_out = f"held_out={1.0 - 3.6 / 5.5}"
     for words, more in {
         "as it comes": [],
-        "dry friction, its width fitted": ["tried=[{how: auto, degree: 1, functions: ['sign(?*v)']}]"],
-        "dry friction, its width given": ["tried=[{how: auto, degree: 1, functions: ['sign(200*v)']}]"],
+        "dry friction, its width fitted": [
+            "tried=[{how: auto, degree: 1, functions: ['sign(?*v)']}]"
+        ],
+        "dry friction, its width given": [
+            "tried=[{how: auto, degree: 1, functions: ['sign(200*v)']}]"
+        ],
     }.items():
         found = trace(run.t, run.states[:, 0], held_out, *more)
         show(f"pendulum, {words}", found, {"0.1 s": 0.1, "0.4 s": 0.4})

@@ -74,29 +74,21 @@ class Preparation:
         self, past: Trace, method: AnyMethod, *, seed: int, progress: Progress, once: Once
     ) -> tuple[Embedded, Discovery]:
         """The states, and their equations. method: of smoothed states."""
+        make = partial(embed, past, n_states=self.n_states, harmonics=self.harmonics)
         with progress.stage(None, "", f"{self.n_states} states of the signal"):
-            states = embed(past, self.how, n_states=self.n_states, harmonics=self.harmonics)
+            states = make(self.how)
         run, functions = states.run, self.functions
         if any(FITTED in text for text in functions):
-            smoothed = states
-            if states.hidden:
-                smoothed = embed(past, n_states=self.n_states, harmonics=self.harmonics)
+            smoothed = make() if states.hidden else states
             off = partial(self._misfit, smoothed, method)
             functions = fit_functions(functions, smoothed.run, off)
         if states.hidden:
             run, method = end_of(run), by_trajectories(method)
         elif not states.known:
             method = replace(method, depth=min(method.depth, DEPTH_OF_BOTH))
-        search = partial(
-            discover,
-            run,
-            states.library(self.degree, functions, self.function_degree),
-            method,
-            hidden=states.hidden,
-            seed=seed,
-            progress=progress,
-        )
-        return states, once(search)
+        library = states.library(self.degree, functions, self.function_degree)
+        search = partial(discover, run, library, method, hidden=states.hidden, seed=seed)
+        return states, once(partial(search, progress=progress))
 
     def _misfit(self, states: Embedded, method: AnyMethod, functions: Sequence[str]) -> float:
         """Share of the derivatives that the largest candidates leave, the product over equations.
@@ -142,19 +134,13 @@ class Attempt:
                 run = estimate_states(found.model, run)
             else:
                 share = unexplained(states)
-            estimator = tune_estimator(
-                found.model, complete_states(past, run), measured=[past.name]
-            )
+            samples = complete_states(past, run)
+            estimator = tune_estimator(found.model, samples, measured=[past.name])
             skill = forecast_skill(
-                found.model,
-                past.run,
-                n_fitted=len(past.t) // 2,
-                starts=N_TRIED,
-                horizon_s=past.period_s,
-                states_of=states.along,
-                n_draws=N_DRAWS_TRIED,
+                found.model, past.run, n_fitted=len(past.t) // 2, starts=N_TRIED,
+                horizon_s=past.period_s, states_of=states.along, n_draws=N_DRAWS_TRIED,
                 estimator=estimator,
-            )
+            )  # fmt: skip
         error = float(skill.nrmse[MODEL].mean())
         return Attempt(preparation, states, found, run, estimator, error, share)
 
