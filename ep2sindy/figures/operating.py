@@ -333,10 +333,7 @@ def trends_figure(
             ax.set_xlabel(style.name_label(along, labels))
             if at and ax.get_subplotspec().is_first_col():
                 ax.set_ylabel(f"at {style.held_label(at, labels)}".replace(", ", ",\n"))
-    entries = [
-        Line2D([], [], ls="none", label=kind, **mark)
-        for kind, mark in marks.items()
-    ]
+    entries = [Line2D([], [], ls="none", label=kind, **mark) for kind, mark in marks.items()]
     if laws:
         label = f"control law, {entries[0].get_label()}"
         entries.append(Line2D([], [], color=COLOURS[0], lw=1.2, label=label))

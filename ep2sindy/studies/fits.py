@@ -150,9 +150,10 @@ class Study:
         """The record of every operating point that has one."""
         assert self.points is not None
         given = given_points(self.points, self.parameters, self.source)
-        given.tell(report)
+        if given.left_out:
+            report.say(f"left out, for their names hold no number: {', '.join(given.left_out)}")
         inputs = self.source.inputs(self._libraries.values())
-        for point in count_pieces(report.watch, given.sources(self.source), "operating point"):
+        for point in count_pieces(report.watch, given.sources, "operating point"):
             sampling = point.source.trajectory
             try:
                 field = point.source.field()

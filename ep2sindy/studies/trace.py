@@ -123,7 +123,7 @@ class Study:
         fronts = {state: best.found.fronts[state] for state in best.searched}
         add_candidates(report, NAME, replace(best.found, fronts=fronts))
         if best.found.estimate is not None:
-            add_estimate(report, signal.name, best.found, states)
+            add_estimate(report, signal.name, best.found)
 
     def _prepared(self, data: Trajectory, once: Once, report: Report) -> Trace:
         """The signal, with its fitted offset if one is asked for."""
