@@ -81,17 +81,6 @@ def test_runs_of_one_setting_say_so(
     assert (here / "compare.html").is_file()
 
 
-def test_a_template_of_ones_own_makes_the_page(runs: tuple[Path, Path], tmp_path: Path) -> None:
-    template, page = tmp_path / "own.html", tmp_path / "page.html"
-    template.write_text("{{ title }}: {{ parts | length }}")
-    compare([*map(str, runs), "--page", str(page), "--template", str(template)])
-    assert page.read_text() == "Runs compared: 6"
-    other = tmp_path / "other.html"
-    with pytest.raises(ValueError, match=r"a template must be a file of HTML for Jinja2: no\.html"):
-        compare([*map(str, runs), "--page", str(other), "--template", "no.html"])
-    assert not other.exists()
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [

@@ -177,7 +177,7 @@ def years(tmp_path_factory: pytest.TempPathFactory) -> Computed:
         "data.time.unit=year", "data.variables.n_i.name=null", "data.variables.n_n.name=null",
         "+data.variables.hare.name=hare", "+data.variables.hare.unit=1",
         "+data.variables.lynx.name=lynx", "+data.variables.lynx.unit=1",
-        "trajectory.states=[hare,lynx]", "search=joint", "forecasts=0", f"output={folder}",
+        "trajectory.states=[hare,lynx]", "search=trajectory", "forecasts=0", f"output={folder}",
     )  # fmt: skip
     return computed(config)
 

@@ -72,9 +72,9 @@ def test_a_written_config_is_that_of_the_file(folder: Path, capsys: pytest.Captu
     text = (folder / "conf" / "data" / "mine.yaml").read_text()
     config = yaml.safe_load(text)
     assert config["path"] == "a b.npz"
-    assert config["variables"]["n_i"] == {"name": "ni_cm3", "unit": "cm^-3", "dims": None}
-    assert config["variables"]["null"] == {"name": "null", "unit": "1", "dims": None}
-    assert "z: {name: z, unit: m, dims: null}  # the file names no unit: put it right" in text
+    assert config["variables"]["n_i"] == {"name": "ni_cm3", "unit": "cm^-3"}
+    assert config["variables"]["null"] == {"name": "null", "unit": "1"}
+    assert "# The file names no unit for z: put these right." in text
     field = ep.open_field(
         config.pop("path"), **{k: v for k, v in config.items() if k != "_target_"}
     )

@@ -121,32 +121,6 @@ def test_marks_of_a_figure_say_more_under_the_mouse() -> None:
     assert html == draw(_hovering("n_i' of 2 terms"), PIXEL, "A front.").html
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (None, "a template must be a file of HTML for Jinja2: .* is none; leave it out"),
-        ("{{ nothing }}", "cannot be filled: 'nothing' is undefined"),
-        ("{{ title.__class__.__mro__ }}", "cannot be filled: .* attribute '__class__' .* unsafe"),
-    ],
-)
-def test_a_template_that_cannot_be_filled_is_refused(
-    text: str | None, message: str, tmp_path: Path
-) -> None:
-    template = tmp_path / "own.html"
-    if text is not None:
-        template.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        page_html("a study", SECTIONS, FIGURES, template=template)
-
-
-def test_a_template_of_ones_own_is_given_all(tmp_path: Path) -> None:
-    template = tmp_path / "own.html"
-    template.write_text("{% for part in parts.values() %}{{ part.title }};{% endfor %}")
-    assert page_html("a study", SECTIONS, FIGURES, template=template) == (
-        "Fronts &amp; models;Only a picture;"
-    )
-
-
 def test_settings_read_in_words() -> None:
     variables = {"x": {"name": "X", "unit": "1"}, "y": {"name": None, "unit": "m"}}
     settings = {

@@ -2,7 +2,6 @@
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
@@ -30,19 +29,19 @@ REFUSED = [
 @pytest.mark.parametrize("name", REFUSED)
 def test_only_what_is_for_configs_is_built(name: object) -> None:
     node = {"_target_": name}
-    with pytest.raises(ValueError, match=r"here must name a _target_ .*came"):
+    with pytest.raises(ValueError, match=r"here must name a _target_ .*got "):
         bind(node, "here")
-    inner = {"_target_": "ep2sindy.Weak", "windows": {"_target_": name}}
-    with pytest.raises(ValueError, match=r"here\.windows must name a _target_ .*came"):
+    inner = {"_target_": "ep2sindy.Weak", "test_functions": {"_target_": name}}
+    with pytest.raises(ValueError, match=r"here\.test_functions must name a _target_ .*got "):
         bind(inner, "here")
-    with pytest.raises(ValueError, match=r"a\.b\[0\] must name a _target_ .*came"):
+    with pytest.raises(ValueError, match=r"a\.b\[0\] must name a _target_ .*got "):
         check_targets({"a": {"b": [{"_target_": name}]}})
 
 
 def test_a_config_is_refused_before_anything_of_it_is_built(tmp_path: Path) -> None:
     evil = {"_target_": "sympy.sympify", "a": RUNS}
     common = {"seed": 0, "experiment": "toy", "study": "libraries", "output": str(tmp_path)}
-    with pytest.raises(ValueError, match=r"x\[0\] must name a _target_ .*'sympy.sympify' came"):
+    with pytest.raises(ValueError, match=r"x\[0\] must name a _target_ .*got 'sympy.sympify'"):
         run_config(OmegaConf.create({**common, "x": [evil]}))
     assert not list(tmp_path.iterdir())
 
@@ -97,46 +96,9 @@ def test_studies_and_functions_are_the_packages_or_lie_in_the_folder(name: str, 
     assert not {"idlelib", "this"} & (set(sys.modules) - before)
 
 
-CALLBACK = {"_target_": "sympy.sympify", "_args_": [RUNS]}
-CALLED = [
-    ({"hydra": {"callbacks": {"x": CALLBACK}}}, "hydra.callbacks must stay as it is"),
-    ({"hydra": {"callbacks": "${mine}"}, "mine": {"x": CALLBACK}}, "callbacks must stay as it is"),
-    ({"hydra": {"job_logging": {"filters": {"f": {"()": "os.abort"}}}}}, "job_logging must stay"),
-]
-
-
-@pytest.mark.parametrize(("said", "message"), CALLED, ids=lambda v: v if type(v) is str else "")
-def test_hydra_calls_nothing_that_a_file_names(
-    said: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In the whole program, a run and a sweep."""
-    write_theirs(tmp_path, said)
-    monkeypatch.chdir(tmp_path)
-    assert message in ended("+exp=theirs")
-    assert message in ended("-m", "+exp=theirs")
-    assert {path.name for path in tmp_path.iterdir()} <= {"conf", "outputs"}  # it has not run
-
-
-@pytest.mark.parametrize("part", ["launcher", "sweeper"])
-def test_a_part_of_hydra_is_none_of_a_files(
-    part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_theirs(tmp_path, {"hydra": {part: {"_target_": "os.abort"}}})
-    monkeypatch.chdir(tmp_path)
-    refused = ended("-m", "+exp=theirs")
-    assert f"hydra.{part} must be one of Hydra's plugins: 'os.abort' came" in refused
-
-
-def write_theirs(folder: Path, said: dict[str, Any]) -> None:
-    """A config of an experiment that says this besides what `discover` does."""
-    (folder / "conf" / "exp").mkdir(parents=True)
-    text = "# @package _global_\ndefaults: [discover, _self_]\n" + OmegaConf.to_yaml(said)
-    (folder / "conf" / "exp" / "theirs.yaml").write_text(text)
-
-
 def test_every_run_begins_with_the_packages_own_config(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     refused = ended("--config-path", str(tmp_path), "+exp=discover")
-    assert "error: every run begins with the package's own config.yaml" in refused
+    assert "error: unknown option '--config-path'" in refused

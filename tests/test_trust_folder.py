@@ -1,13 +1,10 @@
 """A folder full of what others wrote: nothing of it is run but what is named."""
 
-import os
-import py_compile
 import subprocess
 import sys
 import sysconfig
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from py_compile import PycInvalidationMode
 
 import h5py
 import numpy as np
@@ -15,7 +12,7 @@ import pytest
 
 from ep2sindy.report.folder import commit
 from ep2sindy.runtime.parallel import Loky
-from ep2sindy.trust.user_code import leave_folder, load_user_module, own_packages
+from ep2sindy.trust.user_code import load_user_module, own_packages
 
 PROGRAM = Path(sysconfig.get_path("scripts")) / "ep2sindy"
 SPY = "with open({ran!r}, 'a') as file:\n    print(__name__, file=file)\n"
@@ -36,15 +33,12 @@ RUNS: dict[str, Sequence[str]] = {
     ),
     "compare": ("compare", "run.h5"),
     "theirs": ("+exp=theirs",),
-    "callback": ("+exp=callback",),
 }  # fmt: skip
-FAST = ("help", "inspect", "theirs", "callback")
-REFUSED = ("compare", "theirs", "callback")
-# Named where the package would call it, and where Hydra would.
+FAST = ("help", "inspect", "theirs")
+REFUSED = ("compare", "theirs")
 CALL = "{{_target_: os.system, command: 'echo called >> {ran}'}}"
 CONFIGS = {
     "theirs": f"defaults: [discover]\nexperiment: theirs\nprepare: [{CALL}]\n",
-    "callback": f"defaults: [discover]\nhydra: {{{{callbacks: {{{{x: {CALL}}}}}}}}}\n",
 }
 
 
@@ -64,7 +58,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, text in CONFIGS.items():
         config = "# @package _global_\n" + text.format(ran=folder / "ran")
         (folder / "conf" / "exp" / f"{name}.yaml").write_text(config)
-    (folder / ".numba_config.yaml").write_text("disable_jit: 1\n")
     t, x, _ = write_csv(folder / "run.csv").T
     with h5py.File(folder / "run.h5", "w") as file:
         file["time"], file["x"] = t, x
@@ -89,37 +82,15 @@ def test_nothing_of_the_folder_is_imported(run: str, folder: Path) -> None:
     assert done.returncode == (run in REFUSED), done.stderr
 
 
-SETTINGS = """
-import ep2sindy.runtime.compilation, numba
-print(numba.config.DISABLE_JIT)
-"""
-
-
-def test_settings_of_the_folder_are_not_obeyed(folder: Path) -> None:
-    command = [sys.executable, "-P", "-c", SETTINGS]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
-    assert done.stdout == "0\n"
-
-
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder for modules of one's own, of which none is left behind."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
     yield tmp_path
     for module in own_packages():
         for name in [each for each in sys.modules if each.partition(".")[0] == module.__name__]:
             del sys.modules[name]
-
-
-def test_a_module_is_made_from_its_source(here: Path) -> None:
-    """What lies beside it, compiled, may say anything else."""
-    source = here / "mine.py"
-    source.write_text("value = 2\n")
-    py_compile.compile(str(source), invalidation_mode=PycInvalidationMode.UNCHECKED_HASH)
-    source.write_text("value = 1\n")
-    first = load_user_module("mine")
-    assert first is load_user_module("mine")
-    assert (first.value, first.__file__) == (1, str(here / "mine.py"))
 
 
 def test_modules_of_a_folder_import_each_other_by_its_name(here: Path) -> None:
@@ -153,27 +124,6 @@ def test_workers_get_the_code_of_ones_own(here: Path) -> None:
     (here / "mine.py").write_text("def double(x):\n    return 2 * x\n")
     found = Loky(2).run(load_user_module("mine").double, range(3))
     assert sorted(found) == [(0, 0), (1, 2), (2, 4)]
-
-
-def test_the_folder_leaves_the_path_and_nothing_else_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", ["", str(tmp_path), str(other), *sys.path])
-    leave_folder()
-    assert sys.path[0] == str(other)
-
-
-@pytest.mark.skipif(os.name == "nt", reason="no folder that is in use can be removed there")
-def test_a_folder_that_is_gone_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    gone = tmp_path / "gone"
-    gone.mkdir()
-    monkeypatch.chdir(gone)
-    gone.rmdir()
-    with pytest.raises(ValueError, match="has been removed; change to another: cd FOLDER"):
-        leave_folder()
 
 
 def test_the_commit_is_not_that_of_a_folder_around(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def test_an_experiment_refuses_such_names_before_it_makes_a_folder(
         run_config(config)
     config = composed("+exp=breathing", f"output={tmp_path}")
     config.experiment = name
-    with pytest.raises(ValueError, match="experiment names a folder"):
+    with pytest.raises(ValueError, match="experiment must be a name for a folder"):
         run_config(config)
     assert not list(tmp_path.iterdir())
 

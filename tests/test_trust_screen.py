@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from ep2sindy.app import program
 from ep2sindy.app.inspection import commands, config_text
 from ep2sindy.data.open import inspect_file
 from ep2sindy.report.screen import Screen
@@ -23,7 +22,6 @@ ODD = (
     "ok\u202eabc",
     "I [arb]",
     "it's",
-    "c\x85d",
 )
 
 
@@ -71,16 +69,6 @@ def test_a_run_says_odd_names_without_obeying_them(
     screen.close()
     assert (tmp_path / "run.log").read_text() == "a\\x1b[2Jb\n"
     assert capsys.readouterr().out == "c\\x1b[2Jd\n"
-
-
-def test_warnings_and_errors_of_the_program_are_plain(capsys: pytest.CaptureFixture[str]) -> None:
-    text = program._warning_text(UserWarning("a\x1bb"), UserWarning, "file.py", 1)
-    assert text.endswith("UserWarning: a\\x1bb\n")
-    try:
-        raise RuntimeError("c\x1bd")
-    except RuntimeError:
-        program._print_error(*sys.exc_info())
-    assert capsys.readouterr().err.endswith("RuntimeError: c\\x1bd\n")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="pipes of POSIX")

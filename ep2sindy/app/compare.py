@@ -25,7 +25,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import by_place
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text, cell_text
 from ep2sindy.report.models import equations
-from ep2sindy.report.page import TEMPLATES, page_html
+from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import read_png
 from ep2sindy.report.results import in_words, value_text
 from ep2sindy.report.screen import Screen
@@ -44,19 +44,17 @@ NOTE = (
 def main(arguments: Sequence[str]) -> None:
     """Compare the run folders, and the jobs of sweeps, named on the command line.
 
-    Raises ValueError for a folder that holds no run, or a template that is missing.
+    Raises ValueError for a folder that holds no run.
     """
     parser = argparse.ArgumentParser("ep2sindy compare", description=ABOUT)
     parser.add_argument("run", nargs="+", help="run folder, two or more; or a sweep")
     parser.add_argument("--page", default="compare.html", help="where the page goes")
-    parser.add_argument("--template", help="a Jinja2 template of your own for the page")
     given = parser.parse_args(arguments)
     folders = [folder for path in given.run for folder in folders_of(Path(path))]
     if len(folders) < 2:
         raise ValueError(f"to compare takes two runs or more: {list(map(str, folders))} came")
     runs = [read_run(folder, k) for k, folder in enumerate(folders)]
     page = Path(given.page)
-    template = Path(given.template) if given.template else TEMPLATES / "page.html"
     names = sorted(set.intersection(*({*run.figures} for run in runs)))
     figures = {
         f"{run.label}-{name}": read_png(run.figures[name], f"Run {run.label}.")
@@ -64,7 +62,7 @@ def main(arguments: Sequence[str]) -> None:
         for run in runs
     }
     sections = compare_runs(runs, names, beside=page.parent)
-    html = page_html("Runs compared", sections, figures, template=template)
+    html = page_html("Runs compared", sections, figures)
     Screen().show(sections)
     write_text(page, html)
     say(str(page))

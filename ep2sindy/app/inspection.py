@@ -6,16 +6,15 @@ import argparse
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import yaml
+from omegaconf import OmegaConf
 
 from ep2sindy.data.inspection import STEP, Inspection, compare_files, unlike
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import inspect_file
-from ep2sindy.data.quantities import COORDINATE_UNITS, KNOWN_UNITS
+from ep2sindy.data.quantities import COORDINATE_UNITS
 from ep2sindy.data.run_files import FilePattern, propose_pattern
 from ep2sindy.data.steps import records_of
 from ep2sindy.data.trajectory import point_label
@@ -74,24 +73,20 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         say("\n".join(point_lines(pattern)))
     name = re.sub(r"\W+", "_", given.write or _word_for(found[0].source.path)).strip("_")
     differing = unlike(found)
-    if given.write is not None:
-        if differing:
-            raise ValueError(f"no mapping is written: {differing}")
+    if differing and given.write is not None:
+        raise ValueError(f"no mapping is written: {differing}")
+    if differing:
+        lines, end = [], differing
+    elif given.write is None:
+        more = ["data.plasma=true"] if given.plasma else []
+        lines = commands(found, "recognised", pattern, path=_hydra(given.path), more=more)
+        end = f"--write makes conf/data/{name}.yaml of it, for data={name}"
+    else:
         path = own_config(name, conf)
         write_text(path, config_text(found, paths))
-        say(f"written: {path}")
-        say_next(commands(found, name, pattern))
-    elif differing:
-        say(differing)
-    else:
-        more = ["data.plasma=true"] if given.plasma else []
-        say_next(commands(found, "recognised", pattern, path=_hydra(given.path), more=more))
-        say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
-
-
-def say_next(commands: Sequence[str]) -> None:
-    if commands:
-        say("\n".join(["next, for example:", *(f"  {command}" for command in commands)]))
+        lines, end = commands(found, name, pattern), f"written: {path}"
+    header = ["next, for example:"] if lines else []
+    say("\n".join([*header, *(f"  {line}" for line in lines), end]))
 
 
 def point_lines(pattern: FilePattern) -> list[str]:
@@ -208,12 +203,9 @@ def _word_for(path: Path) -> str:
 
 
 def _hydra(paths: Sequence[str]) -> str:
-    """One path, or a list, as Hydra reads it on the command line; quoted unless it is plain."""
-    if len(paths) > 1:
-        return f"[{','.join(_hydra([path]) for path in paths)}]"
-    (text,) = paths
-    plain = re.fullmatch(r"[\w/.*?-]+", text, re.ASCII)
-    return text if plain else "'" + text.replace("'", "\\'") + "'"
+    """One path as it is typed, or a list of several as Hydra reads it."""
+    quoted = ("'" + path.replace("'", "\\'") + "'" for path in paths)
+    return paths[0] if len(paths) == 1 else f"[{','.join(quoted)}]"
 
 
 def experiments(found: Inspection) -> list[str]:
@@ -240,44 +232,38 @@ def own_config(name: str, conf: Path) -> Path:
 
 
 def config_text(found: Sequence[Inspection], paths: Sequence[str | list[str]]) -> str:
-    """The config of the data group, with a comment on every unit that the file does not name."""
+    """The config of the data group; its first lines name the units that the file does not name."""
     first = found[0]
-    variables = {n: Variable(None, u) for n, u in KNOWN_UNITS.items()} | {**first.variables}
-
-    def line(name: str, variable: Variable) -> str:
-        doubt = "  # the file names no unit: put it right" if name in first.no_unit else ""
-        return f"{_flow(name)}: {_flow(asdict(variable))}{doubt}"
-
-    more = " ..." * (len(paths) > 1)
+    axes = {
+        name: first.axes.get(name, Variable(None, unit)) for name, unit in COORDINATE_UNITS.items()
+    }
+    content = {
+        "_target_": "ep2sindy.open_field",
+        "path": _literal(paths[0] if len(paths) == 1 else [*paths]),
+        "variables": {name: _entry(variable) for name, variable in first.variables.items()},
+        **{name: _entry(variable) for name, variable in axes.items()},
+        "dt_s": first.dt_s,
+        "channel_m": None,
+    }
+    path = in_line(str(first.source.path)) + " ..." * (len(paths) > 1)
     lines = [
-        f"# {in_line(str(first.source.path))}{more}, as `ep2sindy inspect` found it.",
-        "# A name is the one in the file; null: the file has it not. Correct what is wrong.",
-        "_target_: ep2sindy.open_field",
-        f"path: {_flow(paths[0] if len(paths) == 1 else list(paths))}",
-        "",
-        "variables:",
-        *(f"  {line(n, variable)}" for n, variable in variables.items()),
-        "",
-        *(line(n, first.axes.get(n, Variable(None, u))) for n, u in COORDINATE_UNITS.items()),
-        f"dt_s: {_flow(first.dt_s)}"
-        "  # time step in s where the file has no time; taken instead of it",
-        'mask: {name: null, unit: "1", dims: null}  # nonzero in the plasma',
-        "channel_m: null  # length of the channel from z = 0; null: as the file says",
-        "chunks: null  # such as {time: 1000}, for steps on what exceeds memory (needs dask)",
+        f"# {path}, as `ep2sindy inspect` found it; correct it if needed.",
+        "# A name is the one in the file; null: the file has it not. dt_s: step in s, instead of",
+        "# time. channel_m: length of the channel from z = 0 in m; null: as the file says.",
     ]
-    return "\n".join(lines) + "\n"
+    if first.no_unit:
+        names = ", ".join(map(in_line, first.no_unit))
+        lines.append(f"# The file names no unit for {names}: put these right.")
+    return "\n".join([*lines, OmegaConf.to_yaml(OmegaConf.create(content))])
 
 
-def _flow(value: Any) -> str:
-    """A value as YAML on one line that Hydra reads back unchanged; ambiguous text is quoted."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_flow, value)) + "]"
-    if not isinstance(value, str):
-        return "null" if value is None else repr(value)
-    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)  # Hydra would interpolate it
-    if in_line(text) != text:
-        return yaml.safe_dump(text, default_style='"', width=float("inf")).strip()
-    is_plain = re.fullmatch(r"[\w./^-]+", text) and yaml.safe_load(text) == text
-    return text if is_plain else "'" + text.replace("'", "''") + "'"
+def _entry(variable: Variable) -> dict[str, Any]:
+    dims = {"dims": list(variable.dims)} if variable.dims else {}
+    return {"name": _literal(variable.name), "unit": _literal(variable.unit), **dims}
+
+
+def _literal(value: Any) -> Any:
+    """Text, or lists of it, in which `${` interpolates nothing."""
+    if isinstance(value, list):
+        return [_literal(each) for each in value]
+    return value and re.sub(r"(\\*)\$\{", r"\1\1\\${", value)

@@ -1,25 +1,177 @@
-"""Entry point of the command line: `ep2sindy`, `python -m experiments.run`.
+"""The command line: `ep2sindy +exp=breathing`, or `python -m experiments.run +exp=breathing`.
 
-The current folder, which may be untrusted, is removed from the path before anything else is
-imported.
+`ep2sindy compare RUN RUN` compares run folders instead. `ep2sindy inspect PATH` inspects files,
+and `ep2sindy warm` compiles, once after installation, all that needs compiling.
+
+Only Hydra is imported here: `--help` must not wait for the numerics.
 """
 
 from __future__ import annotations
 
+import atexit
+import gc
+import os
 import sys
+from collections.abc import Sequence
+from pathlib import Path
+from shlex import quote
+from typing import Any
 
-from ep2sindy.trust.user_code import leave_folder
+import hydra
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from ep2sindy.app.arguments import COMMANDS, JOBS, explain, options_first
+from ep2sindy.runtime.files import write_json
+from ep2sindy.runtime.screen import listed, near_words, plain, say
+from ep2sindy.runtime.threads import start_on_one_thread
+from ep2sindy.trust.interruption import end_as_interrupted
+from ep2sindy.trust.user_code import PACKAGE
 
 
 def main() -> None:
+    """Run the command line; user errors end in one message, all others keep their traceback."""
+    gc.set_threshold(100_000, 50, 100)  # imports make many objects that are never freed
+    atexit.register(gc.freeze)  # a last collection over all of them takes a second
+    end_as_interrupted()
+    start_on_one_thread()
+    # Errors are reported here, not in Hydra's words; and a file of the user's that is called like a
+    # module of Python, such as signal.py, must not take its place in workers.
+    os.environ |= {"HYDRA_FULL_ERROR": "1", "PYTHONSAFEPATH": "1"}
     try:
-        leave_folder()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+        conf = conf_folder()
+        errors = [] if command(sys.argv[1:], conf) else run(conf)
+    except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
+        errors = [str(error) or type(error).__name__]
+    except OSError as error:
+        errors = [
+            f"{error}; where a run writes is chosen with output=PATH, and where it keeps what it "
+            "can use again with data.cache=PATH"
+        ]
+    except KeyboardInterrupt:
+        sys.exit("interrupted: files under their final names are whole")
+    if errors:
+        why = errors[0] if len(errors) == 1 else f"{len(errors)} jobs failed"
+        sys.exit(plain(f"error: {why}"))
 
-    from ep2sindy.app.program import run
 
-    run()
+def command(arguments: Sequence[str], conf: Path) -> bool:
+    """Carry out the command that the first argument names; returns whether it names one."""
+    name, rest = "".join(arguments[:1]), arguments[1:]
+    if name == "compare":
+        from ep2sindy.app.compare import main as compare_runs
+
+        compare_runs(rest)
+    elif name == "inspect":
+        from ep2sindy.app.inspection import main as inspect_files
+
+        inspect_files(rest, conf)
+    elif name == "warm":
+        from ep2sindy.app.warm import main as compile_kernels
+
+        compile_kernels(rest)
+    return name in COMMANDS
+
+
+def conf_folder() -> Path:
+    """Folder of the package's configs: beside it in a checkout, inside it when installed."""
+    places = (PACKAGE.parent / "conf", PACKAGE / "conf")
+    for place in places:
+        if (place / "config.yaml").is_file():
+            return place
+    raise ValueError(
+        f"the package's configs must lie in one of {list(map(str, places))}: none of them has a "
+        "config.yaml; install the package again"
+    )
+
+
+def run(conf: Path) -> list[str]:
+    """Run the job, or the jobs of a sweep, that the command line sets; returns their errors.
+
+    Configs in ./conf are found as if `--config-dir conf` were given.
+    Raises ValueError for settings that cannot be composed.
+    """
+    options, settings = options_first(sys.argv[1:])
+    own = Path.cwd() / "conf"
+    if "--config-dir" not in options and own.is_dir() and own.resolve() != conf.resolve():
+        options += ["--config-dir", str(own)]
+    sys.argv[1:] = [*options, *settings]
+    sweeps: list[Path] = []
+    errors: list[str] = []  # Hydra too would report an error that left a job
+
+    @hydra.main(config_path=str(conf), config_name="config", version_base="1.3")
+    def job(config: DictConfig) -> None:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            sweeps[:] = [Path(HydraConfig.get().sweep.dir)]
+        errors.extend(run_job(config, conf))
+
+    def composed(settings: list[str]) -> DictConfig:
+        folders = (
+            options[options.index("--config-dir") + 1 :][:1] if "--config-dir" in options else []
+        )
+        places = [f"file://{Path(folder).absolute()}" for folder in folders]
+        with initialize_config_dir(str(conf), version_base="1.3"):
+            return compose("config", [f"hydra.searchpath={places}", *settings])
+
+    try:
+        job()
+    except HydraException as error:
+        raise ValueError(explain(error, settings, composed)) from error
+    finally:
+        for sweep in sweeps:
+            say(f"the jobs side by side: ep2sindy compare {quote(str(sweep))}")
+    return errors
+
+
+def run_job(config: DictConfig, conf: Path) -> list[str]:
+    """Run one job; returns why it ended early, if it did. A sweep notes that and goes on.
+
+    In a sweep, its record for `compare` is written when it ends, in whichever way.
+    """
+    run = HydraConfig.get()
+    job = f"job {run.job.num}" if run.mode == RunMode.MULTIRUN else ""
+    record: dict[str, Any] = {"overrides": list(run.overrides.task)}
+    if job:
+        say(f"{job}: {' '.join(record['overrides'])}")
+    try:
+        if config.experiment is None:
+            raise _no_experiment(record["overrides"], conf)
+        folder = Path(str(config.get("output")), str(config.experiment))
+        study = config.get("study")  # the imports below take seconds
+        say(f"{config.experiment}: loading study={study}; writes below {folder}/")
+        from ep2sindy.app.runner import run_config
+
+        record["folder"] = str(run_config(config))
+    except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
+        record["error"] = str(error)
+    except BaseException as error:
+        record["error"] = str(error) or type(error).__name__
+        raise
+    finally:
+        if job and "error" in record:
+            say(f"{job} failed: {record['error']}")
+        if job:
+            write_json(Path(run.sweep.dir) / JOBS / f"{run.job.num}.json", record)
+    return [record["error"]] if "error" in record else []
+
+
+def _no_experiment(typed: Sequence[str], conf: Path) -> ValueError:
+    """The error of a command that names no experiment, with all that there are."""
+    folders = {conf, Path.cwd() / "conf"}
+    names = sorted({path.stem for each in folders for path in each.glob("exp/*.yaml")})
+    for text in typed:
+        key, _, value = text.lstrip("+").partition("=")
+        if value in names and near_words(key, ["exp", "experiment"]):
+            return ValueError(f"an experiment is chosen with +exp={value}: {text!r} came")
+    return ValueError(
+        f"choose an experiment with +exp=NAME; there are {listed(names)}. A config of your own "
+        "begins with the line '# @package _global_'"
+    )
 
 
 if __name__ == "__main__":

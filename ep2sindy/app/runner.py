@@ -19,7 +19,7 @@ from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
 from ep2sindy.report.about import ASIDE
-from ep2sindy.report.folder import FORMATS, RunFolder
+from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.report import Report
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
@@ -31,8 +31,6 @@ from ep2sindy.trust.user_code import load_user_module
 
 def run_config(config: DictConfig) -> Path:
     """Build the study that a config names, and run it; returns its run folder."""
-    check_common(config)
-    formats = formats_of(config)
     with Bars().stage(3, "step", "loading") as advance:
         check_targets(OmegaConf.to_container(config))
         advance(1)
@@ -43,6 +41,7 @@ def run_config(config: DictConfig) -> Path:
     warm()
     with start_run(config) as report:
         study.run(report)
+        formats = config.get("formats", ["png"])
         report.finish(purpose=purpose_of(kind), keys=keys_of(kind) - {*ASIDE}, formats=formats)
     return report.folder.path
 
@@ -83,38 +82,6 @@ def list_studies() -> list[str]:
     (folder,) = ep2sindy.studies.__path__
     texts = {path.stem: path.read_text("utf-8") for path in sorted(Path(folder).glob("*.py"))}
     return [name for name, text in texts.items() if re.search(r"^class Study\b", text, re.M)]
-
-
-def check_common(config: DictConfig) -> None:
-    """Raise ValueError for an invalid seed, name or folder, or a verbose that is no truth value."""
-    if not isinstance(config.seed, int) or isinstance(config.seed, bool) or config.seed < 0:
-        raise ValueError(f"seed must be a whole number, zero or more: {config.seed!r} came")
-    if not isinstance(config.get("verbose", False), bool):
-        raise ValueError(
-            "verbose must be true, for all tables on the screen, or false, for what was found: "
-            f"{config.verbose!r} came"
-        )
-    if not str(config.experiment).isidentifier():
-        raise ValueError(
-            f"experiment names a folder: letters, digits and _, not {config.experiment!r}"
-        )
-    if not isinstance(config.get("output"), str) or not config.output:
-        raise ValueError(f"output must be a folder's name: {config.get('output')!r} came")
-
-
-def formats_of(config: DictConfig) -> list[str]:
-    """File formats of the figures; they must include png, which pages use.
-
-    Raises ValueError for an invalid list.
-    """
-    figures: Any = OmegaConf.to_container(config.get("figures") or OmegaConf.create({}))
-    formats = figures.get("formats", ["png"])
-    if not isinstance(formats, list) or "png" not in formats or not {*formats} <= {*FORMATS}:
-        raise ValueError(
-            f"figures.formats must be a list of {', '.join(FORMATS)} that has png, which pages "
-            f"are made of: {formats!r} came; figures.formats=[png,pdf] adds drawings for print"
-        )
-    return formats
 
 
 @contextmanager

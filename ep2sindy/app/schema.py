@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import partial
@@ -20,27 +20,48 @@ from omegaconf import DictConfig, OmegaConf
 from ep2sindy._stubs import place_of
 from ep2sindy.app.targets import nodes_of, target_of
 from ep2sindy.discovery.method import AnyMethod, method_of
-from ep2sindy.runtime.screen import joined, near_words
+from ep2sindy.report.folder import FORMATS
+from ep2sindy.runtime.screen import near_words
 from ep2sindy.studies.source import Source, Step
 from ep2sindy.studies.study import Check, Deferred
 
-# Keys of conf/config.yaml that every run has.
-COMMON = ("experiment", "study", "seed", "output", "figures", "verbose")
-# Fields of these types are made of the top-level groups listed with them: a method is five groups.
+
+def _are_formats(value: Any) -> bool:
+    return isinstance(value, list) and "png" in value and {*value} <= {*FORMATS}
+
+
+# Keys of conf/config.yaml that every run has, with their types.
+COMMON: Mapping[str, Any] = {
+    "experiment": Annotated[
+        str,
+        Check("a name for a folder, of letters, digits and _", lambda x: str(x).isidentifier()),
+    ],
+    "study": str,
+    "seed": Annotated[
+        int, Check("a whole number, zero or more", lambda x: type(x) is int and x >= 0)
+    ],
+    "output": Annotated[str, Check("a folder's name", bool)],
+    "formats": Annotated[
+        Any,
+        Check(f"a list of {', '.join(FORMATS)} with png, which pages are made of", _are_formats),
+    ],
+    "verbose": bool,
+}
+# Fields of these types are made of the top-level groups that these functions take.
 GATHERED: Mapping[Any, Callable[..., Any]] = {AnyMethod: method_of, Source: Source}
 # Groups of conf/config.yaml that a study may leave aside.
-GROUPS = (
-    "data", "prepare", "trajectory", "formulation", "search", "bootstraps", "selection", "depth",
-    "parallel",
-)  # fmt: skip
+GROUPS = frozenset(
+    name for call in GATHERED.values() for name in inspect.signature(call).parameters
+)
 
 
 def keys_of(study: type) -> set[str]:
     """The top-level keys of a study's config."""
-    found: set[str] = set()
-    for name, kind in hints_of(study).items():
-        found |= set(_groups(kind)) if kind in GATHERED else {name}
-    return found
+    hints = hints_of(study).items()
+    gathered = {
+        group for _, kind in hints if kind in GATHERED for group in hints_of(GATHERED[kind])
+    }
+    return gathered | {name for name, kind in hints if kind not in GATHERED}
 
 
 def study_of(study: type, config: DictConfig) -> Any:
@@ -50,22 +71,22 @@ def study_of(study: type, config: DictConfig) -> Any:
     differs from the study's.
     """
     used = keys_of(study)
-    known = {*COMMON, *GROUPS, *used}
-    unknown = set(map(str, config)) - known
-    if unknown:
+    known = {*COMMON, *GROUPS, "parallel", *used}
+    if unknown := {*map(str, config)} - known:
         hint = ""
         if "thruster" in unknown:  # a file of ./conf/thruster that lacks its first line
             hint = "; a file of conf/thruster begins with the line '# @package data.thruster'"
         near = "".join(near_words(name, known) for name in sorted(unknown))
         raise ValueError(f"unknown keys {sorted(unknown)}{near}; there are {sorted(known)}{hint}")
-    _open_by_points(config)
-    typed: Any = OmegaConf.to_container(config)
-    for place, value in nodes_of({name: typed[name] for name in typed if name in used}):
-        if value == "???":
+    if isinstance(config.get("points"), str) and OmegaConf.is_missing(config.data, "path"):
+        config.data.path = None  # the points name the files
+    for place, value in nodes_of(OmegaConf.to_container(config)):
+        if value == "???" and re.split(r"\W", place)[0] in used:
             raise ValueError(f"{place} must be set: it is still '???'")
-    hints = hints_of(study)
-    needed = [name for name in hints if is_required(study, name)]
-    return _fill(study, hints, needed, _without_formats(plain(config), has_own="figures" in used))
+    settings = plain(config)
+    for name in {*COMMON} & {*settings}:
+        value_of(COMMON[name], settings[name], name)
+    return _filled(study, settings)
 
 
 def plain(config: Any) -> Any:
@@ -73,232 +94,166 @@ def plain(config: Any) -> Any:
     return OmegaConf.to_container(config, resolve=True)
 
 
-def _open_by_points(config: DictConfig) -> None:
-    """A path of the data that is to be set need not be, where the points name the files."""
-    by_files = isinstance(config.get("points"), str)
-    if by_files and "data" in config and OmegaConf.is_missing(config.data, "path"):
-        config.data.path = None
-
-
-def _without_formats(settings: dict[str, Any], *, has_own: bool) -> dict[str, Any]:
-    """Settings without `figures.formats`, the list of file formats, which the runner uses."""
-    own = {name: v for name, v in (settings.get("figures") or {}).items() if name != "formats"}
-    if own and not has_own:
-        first = f"figures.{next(iter(own))}"
-        raise ValueError(f"unknown key {first!r}: this experiment has figures.formats alone")
-    return settings | {"figures": own}
-
-
-def _fill(
-    call: Callable[..., Any],
-    hints: Mapping[str, Any],
-    needed: Collection[str],
-    settings: Mapping[str, Any],
-) -> Any:
-    """A study, or a method or source made of groups, from the top level of the config.
-
-    A group that is left out (`~search`) gets no default.
-    """
+def _filled(call: Callable[..., Any], settings: Mapping[str, Any]) -> Any:
+    """A study, or a method or source made of groups, from the top level of the config."""
+    takes = inspect.signature(call).parameters
     arguments = {}
-    for name, kind in hints.items():
+    for name, kind in hints_of(call).items():
         if kind in GATHERED:
-            groups = _groups(kind)
-            arguments[name] = _fill(GATHERED[kind], groups, groups, settings)
+            arguments[name] = _filled(GATHERED[kind], settings)
         elif name in settings:
             arguments[name] = value_of(kind, settings[name], name)
-        elif name in needed:
+        elif takes[name].default is inspect.Parameter.empty:
             way = f": choose one with {name}=NAME, see --help" if name in GROUPS else ""
             raise ValueError(f"the config of this experiment must have {name!r}{way}")
     return call(**arguments)
 
 
-def _groups(kind: Any) -> dict[str, Any]:
-    """The groups that make up a value of this type, each with its required type."""
-    hints = get_type_hints(GATHERED[kind], include_extras=True)
-    return {name: hint for name, hint in hints.items() if name != "return"}
+def hints_of(call: Any) -> dict[str, Any]:
+    """Type annotations of a function's or class's arguments by name; empty if there are none."""
+    try:
+        hints = get_type_hints(
+            getattr(call, "__init__") if isinstance(call, type) else call,  # noqa: B009
+            include_extras=True,
+        )
+    except Exception:  # an annotation that does not exist at run time; a compiled function
+        return {}
+    return {name: kind for name, kind in hints.items() if name != "return"}
 
 
 # From plain settings to values: the only place where the type of a setting is checked.
 #
 # The type comes from the signature that takes the setting: a field of a study, or an argument of a
-# `_target_`. Only plain arguments are checked here, since the class or function itself reports
-# errors in the others best.
+# `_target_`. Of the latter only plain arguments are checked here, since the class or function
+# itself reports errors in the others best.
 
 
 PLAIN = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 
 
 def value_of(kind: Any, node: Any, place: str) -> Any:
-    """A value of this type from a setting. place: its dotted path, for errors."""
+    """A value of this type from a setting. place: its dotted path, for errors.
+
+    Any takes a node as it is, object builds all targets in it.
+    """
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         if isinstance(parts[1], Check) and not parts[1].test(node):
-            raise ValueError(f"{place} must be {parts[1].message}: {node!r} came")
+            raise ValueError(f"{place} must be {parts[1].message}: got {node!r}")
         return value_of(parts[0], node, place)
     if kind is Any:
         return node
     if kind is Deferred:
         return Configured(node, place)
     if kind == Step:
-        return bind_step(node, place)
+        return bind(node, place, None)
     if origin in (Union, UnionType):
         return _one_of(parts, node, place)
     if _names_target(node):
-        return _instance(node, origin or kind, place)
+        return _built(node, origin or kind, place)
     if is_dataclass(kind):
-        return _dataclass(kind, node, place)
+        if not isinstance(node, Mapping):
+            raise ValueError(f"{place} must have {[*hints_of(kind)]}: got {node!r}")
+        return _call(kind, node, place, hints_of(kind))()
     if origin is not None:
         return _container(origin, parts, node, place)
-    value = check_plain((kind,), node, place)  # without a `_target_` its type is always plain
-    return float(value) if kind is float else value
+    if kind is object:
+        if isinstance(node, Mapping):
+            return {key: value_of(object, each, f"{place}.{key}") for key, each in node.items()}
+        return _container(list, (object,), node, place) if isinstance(node, list) else node
+    # A whole number counts as a number, too; a truth value does not.
+    if type(node) is not kind and (kind, type(node)) != (float, int):
+        wanted = PLAIN.get(kind, f"a {kind.__name__}, named by its _target_")
+        raise ValueError(f"{place} must be {wanted}: got {node!r}")
+    return float(node) if kind is float else node
 
 
 def _names_target(node: Any) -> bool:
     return isinstance(node, Mapping) and "_target_" in node
 
 
+def _check_target(node: Any, place: str) -> None:
+    if not _names_target(node):
+        raise ValueError(
+            f"{place} must name a _target_, like {{_target_: ep2sindy.prepare.crop, start_s: 0}}: "
+            f"got {node!r}"
+        )
+
+
 def _container(origin: type, parts: Sequence[Any], node: Any, place: str) -> Any:
-    if issubclass(origin, Mapping):
-        if not isinstance(node, Mapping):
-            raise ValueError(f"{place} must be like {{name: ...}}: {node!r} came")
-        if parts[1] is Deferred or is_dataclass(parts[1]):
-            check_names(map(str, node), place)
-        return {str(k): value_of(parts[1], each, f"{place}.{k}") for k, each in node.items()}
-    if not isinstance(node, list):
-        raise ValueError(f"{place} must be a list: {node!r} came")
-    return [value_of(parts[0], each, f"{place}[{k}]") for k, each in enumerate(node)]
-
-
-def check_names(names: Iterable[str], place: str) -> None:
-    """Raise ValueError for a name that cannot serve in file names and headings."""
-    for name in names:
-        if not re.fullmatch(r"\w[\w .,+-]{,99}", name):
-            raise ValueError(
-                f"{place} must be named by words, for files are named so: letters, digits and "
-                f"_ . , + -, not {name!r}"
-            )
+    if not issubclass(origin, Mapping):
+        if not isinstance(node, list):
+            raise ValueError(f"{place} must be a list: got {node!r}")
+        return [value_of(parts[0], each, f"{place}[{k}]") for k, each in enumerate(node)]
+    if not isinstance(node, Mapping):
+        raise ValueError(f"{place} must be like {{name: ...}}: got {node!r}")
+    if parts[1] is Deferred or is_dataclass(parts[1]):
+        for name in node:
+            if not re.fullmatch(r"\w[\w .,+-]{,99}", str(name)):
+                raise ValueError(
+                    f"{place} must be named by words, for files are named so: letters, digits and "
+                    f"_ . , + -, not {name!r}"
+                )
+    return {str(k): value_of(parts[1], each, f"{place}.{k}") for k, each in node.items()}
 
 
 def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:
     """A value of the first type that fits; if none fits, the error is that of the last."""
     if node is None and NoneType in kinds:
         return None
-    kinds = [kind for kind in kinds if kind is not NoneType]
-    for kind in kinds[:-1]:
+    *others, last = [kind for kind in kinds if kind is not NoneType]
+    for kind in others:
         try:
             return value_of(kind, node, place)
         except ValueError:
             continue
-    return value_of(kinds[-1], node, place)
+    return value_of(last, node, place)
 
 
-def check_plain(kinds: Collection[type], node: Any, place: str) -> Any:
-    """The value of a setting; raises ValueError if it has none of these types."""
-    # A whole number counts as a number, too; a truth value does not.
-    if not any(type(node) is kind or (kind, type(node)) == (float, int) for kind in kinds):
-        wanted = [PLAIN.get(kind, f"a {kind.__name__}, named by its _target_") for kind in kinds]
-        raise ValueError(f"{place} must be {' or '.join(wanted)}: {node!r} came")
-    return node
-
-
-def _dataclass(kind: Any, node: Any, place: str) -> Any:
-    """A mapping as a dataclass; missing keys and unused keys are errors."""
-    hints = hints_of(kind)
-    needed = [name for name in hints if is_required(kind, name)]
-    given = set(node) if isinstance(node, Mapping) else None
-    if given is None or given - set(hints) or set(needed) - given:
-        came = sorted(given) if given is not None else node
-        near = "".join(near_words(each, hints) for each in sorted((given or set()) - set(hints)))
-        raise ValueError(
-            f"{place} may have {sorted(hints)} and needs {joined(needed) or 'none'}: {came} came"
-            f"{near}"
-        )
-    named = {name: node[name] for name in hints if name in node}
-    return kind(**{n: value_of(hints[n], each, f"{place}.{n}") for n, each in named.items()})
-
-
-def hints_of(kind: type) -> dict[str, Any]:
-    """Type annotations of a dataclass's init fields, by name."""
-    hints = get_type_hints(kind, include_extras=True)
-    return {f.name: hints[f.name] for f in fields(kind) if f.init}
-
-
-def is_required(kind: type, name: str) -> bool:
-    (field,) = (f for f in fields(kind) if f.name == name)
-    return field.default is MISSING and field.default_factory is MISSING
-
-
-def _instance(node: Mapping[str, Any], kind: type, place: str) -> Any:
+def _built(node: Mapping[str, Any], kind: type, place: str) -> Any:
     """The object that a node names, checked to be of this type."""
-    value = bind(node, place)()
+    call = bind(node, place)
+    try:
+        value = call()
+    except TypeError as error:
+        raise ValueError(f"{place} cannot be made: {error}") from error
     if not isinstance(value, kind):
-        raise ValueError(f"{place} must name a _target_ that is a {kind.__name__}: {value!r} came")
+        raise ValueError(f"{place} must name a _target_ that is a {kind.__name__}: got {value!r}")
     return value
 
 
-def bind_step(node: Any, place: str) -> Step:
-    """A step of `prepare`; unknown arguments are refused here."""
-    if not _names_target(node):
-        raise ValueError(
-            f"{place} must be like {{_target_: ep2sindy.prepare.crop, start_s: 0}}: {node!r} came"
-        )
-    return bind(node, place, None)
-
-
-def bind(node: Mapping[str, Any], place: str, *first: Any) -> partial[Any]:
+def bind(node: Any, place: str, *first: Any) -> partial[Any]:
     """The node's `_target_`, with the remaining entries, built, as its arguments.
 
     place: the node's dotted path, for errors. first: leading arguments, given when it is called.
     Raises ValueError if the target cannot be called so, and errors that a nested target raises.
     """
+    _check_target(node, place)
     target = target_of(node, place)
-    kinds = _plain_arguments(target)
-    given = {name: each for name, each in node.items() if name != "_target_"}
-    call = partial(
-        target,
-        **{n: _argument(kinds.get(n, ()), each, f"{place}.{n}") for n, each in given.items()},
-    )
+    plain_or_none = {*PLAIN, NoneType}
+    kinds = {
+        name: kind
+        for name, kind in hints_of(target).items()
+        if {*(get_args(kind) if isinstance(kind, UnionType) else (kind,))} <= plain_or_none
+    }
+    settings = {name: each for name, each in node.items() if name != "_target_"}
+    return _call(target, settings, place, kinds, *first)
+
+
+def _call(
+    target: Any, settings: Mapping[str, Any], place: str, kinds: Mapping[str, Any], *first: Any
+) -> partial[Any]:
+    """A call of a function or class with these settings. kinds: types of its arguments."""
+    takes = inspect.signature(target)
     try:
-        takes = inspect.signature(target)
-    except ValueError:  # a compiled function may have no signature
-        return call
-    try:
-        takes.bind(*first, **call.keywords)
+        takes.bind(*first, **settings)
     except TypeError as error:
         name = getattr(target, "__name__", target)
         names = list(takes.parameters)[len(first) :]
-        near = "".join(near_words(each, names) for each in {*call.keywords} - {*names})
+        near = "".join(near_words(each, names) for each in {*settings} - {*names})
         raise ValueError(f"{place}, {name}: {error}{near}; it takes {names}") from error
-    return call
-
-
-def _plain_arguments(target: Any) -> dict[str, list[type]]:
-    """Arguments of a target that can only be plain values or None, with their types."""
-    try:
-        hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
-    except Exception:  # an annotation that does not exist at run time; no annotations
-        return {}
-    unions = {n: get_origin(hint) in (Union, UnionType) for n, hint in hints.items()}
-    kinds = {n: get_args(hint) if unions[n] else (hint,) for n, hint in hints.items()}
-    without = {n: [kind for kind in each if kind is not NoneType] for n, each in kinds.items()}
-    return {n: each for n, each in without.items() if set(each) <= set(PLAIN)}
-
-
-def _argument(kinds: Collection[type], node: Any, place: str) -> Any:
-    """An argument of a target, with nested targets built. kinds: its types, empty for any."""
-    if kinds and node is not None:
-        return check_plain(kinds, node, place)
-    if isinstance(node, list):
-        return [_argument((), each, f"{place}[{k}]") for k, each in enumerate(node)]
-    if not isinstance(node, Mapping):
-        return node
-    if "_target_" not in node:
-        return {key: _argument((), each, f"{place}.{key}") for key, each in node.items()}
-    call = bind(node, place)
-    try:
-        return call()
-    except TypeError as error:
-        raise ValueError(f"{place} cannot be made: {error}") from error
+    values = {n: value_of(kinds.get(n, object), v, f"{place}.{n}") for n, v in settings.items()}
+    return partial(target, **values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,8 +264,7 @@ class Configured:
     place: str
 
     def __post_init__(self) -> None:
-        if not _names_target(self.settings):
-            raise ValueError(f"{self.place} must name a _target_: {self.settings!r} came")
+        _check_target(self.settings, self.place)
 
     def build(self) -> Any:
         return bind(self.settings, self.place)()
@@ -353,32 +307,26 @@ def _merged(value: Any, new: Any) -> Any:
 
 def defaults_of(call: Any) -> dict[str, Any]:
     """Arguments of a class or function that have a default, with that default."""
-    if is_dataclass(call):
-        found = {}
-        for each in fields(call):
-            if each.init and each.default is not MISSING:
-                found[each.name] = each.default
-            elif each.init and each.default_factory is not MISSING:
-                found[each.name] = each.default_factory()
-        return found
-    try:
-        takes = inspect.signature(call).parameters.values()
-    except (TypeError, ValueError):  # a compiled function may have no signature
-        return {}
-    return {each.name: each.default for each in takes if each.default is not each.empty}
+    takes = inspect.signature(call).parameters.values()
+    found = {each.name: each.default for each in takes if each.default is not each.empty}
+    for each in fields(call) if is_dataclass(call) else ():
+        if each.init and each.default_factory is not MISSING:
+            found[each.name] = each.default_factory()
+    return found
 
 
 def as_node(value: Any) -> Any:
-    """A value as a config writes it; a dataclass becomes a node that names its class."""
+    """A value as a config writes it; a dataclass becomes a node that names its class.
+
+    Its name is that in the package's stubs if it is there, since modules may move.
+    """
     if is_dataclass(value) and not isinstance(value, type):
-        members = {each.name: as_node(getattr(value, each.name)) for each in fields(value)}
-        taken = {each.name for each in fields(value) if each.init}
-        return {"_target_": _name(type(value))} | {n: m for n, m in members.items() if n in taken}
+        kind = type(value)
+        name = place_of(kind) or f"{kind.__module__}.{kind.__qualname__}"
+        members = {
+            each.name: as_node(getattr(value, each.name)) for each in fields(value) if each.init
+        }
+        return {"_target_": name} | members
     if isinstance(value, Mapping):
         return {str(name): as_node(member) for name, member in value.items()}
     return [as_node(each) for each in value] if isinstance(value, list | tuple) else value
-
-
-def _name(kind: type) -> str:
-    """Name of a class in the package's stubs if it is there, since modules may move."""
-    return place_of(kind) or f"{kind.__module__}.{kind.__qualname__}"  # a user's class

@@ -1,7 +1,7 @@
 """Targets that a config may name: those that the stubs or the user mark for configs.
 
-A config can come from an untrusted source. Values, readers and simulators are offered. Functions
-that write to a given place, or run what they are given, are not.
+Values, readers and simulators are marked. Functions that write to a given place, or run what they
+are given, are not.
 """
 
 from __future__ import annotations
@@ -22,46 +22,29 @@ def target_of(node: Mapping[str, Any], place: str) -> Callable[..., Any]:
 
     Raises ValueError for a name that configs may not use, before anything of it is imported.
     """
-    name = _known_name(node, place)
-    return dotted_names()[name].load() if name in FOR_CONFIGS else _own(name, place)
-
-
-def _known_name(node: Mapping[str, Any], place: str) -> str:
-    """The name of a node's `_target_`: one of FOR_CONFIGS, or of a module of the user's."""
     name = str(node["_target_"])
-    if name in FOR_CONFIGS:
-        return name
-    module, _, last = name.rpartition(".")
-    room = module.partition(".")[0]
-    if room and room != "ep2sindy":
-        return name
-    raise ValueError(
-        f"{place} must name a _target_ that there is, such as ep2sindy.EBIC, and that is for "
-        f"configs: {name!r} came; {_near(last)}"
-    )
-
-
-def _near(name: str) -> str:
-    """Targets with similar names; all targets if there are none."""
-    alike = get_close_matches(name, {each.rpartition(".")[2] for each in FOR_CONFIGS})
-    near = sorted(each for each in FOR_CONFIGS if each.rpartition(".")[2] in alike)
-    if not near:
-        return f"there are {', '.join(sorted(FOR_CONFIGS))}"
-    return f"near it {'is' if len(near) == 1 else 'are'} {', '.join(near)}"
+    return dotted_names()[name].load() if name in FOR_CONFIGS else _own(name, place)
 
 
 def _own(name: str, place: str) -> Callable[..., Any]:
     """An object that the user has marked; only files below the current folder are imported."""
+    place = place or "the config"
+    module, _, last = name.rpartition(".")
+    if module.partition(".")[0] in ("", "ep2sindy"):
+        alike = get_close_matches(last, {each.rpartition(".")[2] for each in FOR_CONFIGS})
+        near = sorted(each for each in FOR_CONFIGS if each.rpartition(".")[2] in alike)
+        raise ValueError(
+            f"{place} must name a _target_ that there is, such as ep2sindy.EBIC, and that is for "
+            f"configs: got {name!r}; near it: {', '.join(near or sorted(FOR_CONFIGS))}"
+        )
     try:
         return load_marked(name)
-    except (ModuleNotFoundError, AttributeError) as error:
+    except (ModuleNotFoundError, AttributeError, ValueError) as error:
         raise ValueError(
             f"{place} must name a _target_ of ep2sindy that is for configs, such as "
-            f"ep2sindy.EBIC, or one of yours below the folder that you start in: {name!r} came, "
+            f"ep2sindy.EBIC, or one of yours below the folder that you start in: got {name!r}, "
             f"and {error}"
         ) from error
-    except ValueError as error:
-        raise ValueError(f"{place} must name a _target_: {error}") from error
 
 
 def nodes_of(node: Any, place: str = "") -> Iterator[tuple[str, Any]]:
@@ -82,8 +65,7 @@ def check_targets(settings: Any) -> None:
     yet: a definition that a run leaves out may need an extra.
     """
     for place, node in nodes_of(settings):
-        named = isinstance(node, Mapping) and "_target_" in node
-        if named and "${" not in str(node["_target_"]):
-            name = _known_name(node, place or "the config")
-            if name not in FOR_CONFIGS:
-                _own(name, place or "the config")
+        if isinstance(node, Mapping) and "_target_" in node:
+            name = str(node["_target_"])
+            if name not in FOR_CONFIGS and "${" not in name:
+                _own(name, place)

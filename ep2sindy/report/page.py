@@ -35,42 +35,22 @@ def page_html(
     about: About | None = None,
     *,
     result: Result | None = None,
-    template: Path = TEMPLATES / "page.html",
 ) -> str:
     """HTML of all sections with their equations, tables and figures; the template escapes text.
 
-    result: what was found, which comes first. template: a Jinja2 file that is given the title, the
-    result, the sections by part, the figures and `about`; see the package's own.
-    Raises ValueError for a template that is missing or invalid.
+    result: what was found, which comes first.
     """
-    from jinja2 import TemplateError
-
-    if not template.is_file():
-        raise ValueError(
-            f"a template must be a file of HTML for Jinja2: {template} is none; leave it out for "
-            "the package's own"
-        )
     named = {f"part-{k}": each for k, each in enumerate(sections)}
-    try:
-        return (
-            _environment(template)
-            .get_template(template.name)
-            .render(title=title, result=result, parts=named, figures=figures, about=about)
-        )
-    except TemplateError as error:
-        raise ValueError(f"the template {template} cannot be filled: {error}") from error
+    template = _environment().get_template("page.html")
+    return template.render(title=title, result=result, parts=named, figures=figures, about=about)
 
 
-def _environment(template: Path) -> Environment:
-    """Jinja2 environment with the template's folder, the package's, and functions for equations.
+def _environment() -> Environment:
+    """Jinja2 environment with the package's templates, and functions for equations."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    It is sandboxed: a template from someone else can read the data it is given, but run no code.
-    """
-    from jinja2 import FileSystemLoader, StrictUndefined
-    from jinja2.sandbox import ImmutableSandboxedEnvironment
-
-    environment = ImmutableSandboxedEnvironment(
-        loader=FileSystemLoader([template.parent, TEMPLATES]),
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -14,16 +14,12 @@ from tempfile import mkdtemp
 from typing import Any
 from uuid import uuid4
 
+import numba
+from numba.core import config, cpu, event, options
+
 from ep2sindy.runtime.screen import say
 from ep2sindy.runtime.user_cache import cache_folder
-from ep2sindy.trust.user_code import PACKAGE, away_from
-
-SETTINGS = ".numba_config.yaml"  # read from the current folder, which may not be trustworthy
-
-with away_from(SETTINGS):
-    import numba
-    from numba.core import config, cpu, event, options
-config._config_fname = ""  # numba looks for the file again at every compilation
+from ep2sindy.trust.user_code import PACKAGE
 
 THIS = Path(__file__)
 SHARED = PACKAGE / "__pycache__" / "kernels"  # of `ep2sindy warm --shared`

@@ -22,7 +22,7 @@ from joblib import Memory, Parallel, delayed, effective_n_jobs
 
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.trust.interruption import end_with
-from ep2sindy.trust.user_code import isolate_children, own_packages
+from ep2sindy.trust.user_code import own_packages
 
 # Wall time that the start of processes costs, each with its imports.
 START_S = 4.5
@@ -157,9 +157,7 @@ class Loky:
         # max_nbytes=None, or joblib would keep a copy of every large array on disk.
         workers = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered", max_nbytes=None)
         code, numbered = _with_its_code(function), enumerate(pieces)
-        with isolate_children():  # all workers start here, before the first result is requested
-            found = workers(delayed(_in_worker)(code, os.getpid(), each) for each in numbered)
-        yield from found
+        yield from workers(delayed(_in_worker)(code, os.getpid(), each) for each in numbered)
 
 
 Once = Callable[[Callable[[], Any]], Any]  # does a piece of work, or reads its result back

@@ -21,7 +21,8 @@ from ep2sindy.trust.user_code import PACKAGE, own_source
 # Settings of every study that do not change a piece's result; they may differ when a broken run is
 # continued.
 ALWAYS_ASIDE = {
-    "output", "parallel", "keep", "experiment", "study", "verbose", "figures", "labels", "thesis",
+    "output", "parallel", "keep", "experiment", "study", "verbose", "formats", "figures", "labels",
+    "thesis",
 }  # fmt: skip
 
 
