@@ -335,13 +335,11 @@ def fit_functions(
     whose numbers can be used.
     """
     known = [text for text in functions if FITTED not in text]
-    for text in functions:
-        if FITTED not in text:
-            continue
-        unit = _unit(text, run)
+    for text in (each for each in functions if FITTED in each):
+        fill_in = partial(_fill_in, text, unit=_unit(text, run))
 
-        def off(log_size: float, text: str = text, unit: float = unit) -> float:
-            return misfit([*known, _fill_in(text, np.exp(log_size), unit)])
+        def off(log_size: float, fill_in: Callable[[float], str] = fill_in) -> float:
+            return misfit([*known, fill_in(np.exp(log_size))])
 
         tried = np.array([off(log_size) for log_size in np.log(SIZES)])
         if not np.isfinite(tried).any():
@@ -350,7 +348,7 @@ def fit_functions(
                 "argument leaves the domain; write the number yourself, or another function"
             )
         log_size = least_beside_grid(off, np.log(SIZES), tried, tolerance=TOLERANCE)
-        known.append(_fill_in(text, np.exp(log_size), unit))
+        known.append(fill_in(np.exp(log_size)))
     return known
 
 
