@@ -42,9 +42,13 @@ TOYS: dict[str, list[str]] = {
         "+exp=benchmark", "variants=[STLSQ,BALASSO,wALASSO,ours]", "n_realizations=2",
         "systems=[oscillator,lotka_volterra]", "noises=[0.0,0.05]", "parallel=serial",
     ],
-    "weak": ["+exp=weak", *ON_FILE, LINE, ZONE, "n_windows=500", "n_points=[10,50]"],
+    "weak": [
+        "+exp=weak", *ON_FILE, LINE, ZONE, "fits.boxes.n_windows=[500]",
+        "fits.boxes.n_points=[10,50]",
+    ],
     "weak_windows": [
-        "+exp=weak_windows", "n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]",
+        "+exp=weak_windows", "fits.boxes.n_windows=[100,300]", "fits.boxes.n_points=[10,30]",
+        "noises=[0.0,0.1]",
         "n_realizations=2", "parallel=serial",
     ],
     "frontier": [
@@ -54,7 +58,7 @@ TOYS: dict[str, list[str]] = {
     "constrained": ["+exp=constrained", *ON_FILE, LINE, ZONE],
     "ils": [
         "+exp=ils", *ON_FILE, LINE, ZONE, "n_windows=8", "windows=[30,60]",
-        "weak.test_functions.n_windows=500", "weak.test_functions.n_points=50",
+        "forms.weak.test_functions.n_windows=500", "forms.weak.test_functions.n_points=50",
     ],
     "parametric": [
         "+exp=parametric", "data.cache={cache}", "data.duration_s=2.0e-3", "data.warm_up_s=0.5e-3",

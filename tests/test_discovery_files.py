@@ -13,9 +13,10 @@ import ep2sindy as ep
 from ep2sindy.data.trajectory import Trajectory
 
 THESIS = ep.Regression(ep.Differential(), ep.AdaptiveLasso(), ep.Knee(), ep.Bootstraps(n=4))
+TIED = ep.polynomial(["x", "y"]).relate("x: x*y == -1 * y: x*y")
 CASES: dict[str, dict[str, Any]] = {
     "trajectories": {"method": ep.TrajectorySearch(max_terms=3)},
-    "regression": {"method": ep.Regression(), "relations": ["x: x*y == -1 * y: x*y"]},
+    "regression": {"method": ep.Regression(), "library": TIED},
     "bootstraps": {"method": THESIS},
     "runs": {"method": ep.Regression(selection=ep.FreeRunScore(judged=("x",), n_windows=4))},
 }

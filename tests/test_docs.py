@@ -27,7 +27,7 @@ from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.model.comparison import Status
 from ep2sindy.report.results import View
-from ep2sindy.studies.library_result import RULES, candidate_metrics
+from ep2sindy.studies.candidates import RULES, candidate_metrics
 from tests.pages import (
     FENCE,
     PAGES,
@@ -174,7 +174,10 @@ def write_modules(page: str) -> None:
     for module, code in re.findall(
         r"`(my_\w+/\w+\.py)`.*?^```python\n(.*?)^```", page, re.M | re.S
     ):
-        Path(module).parent.mkdir(exist_ok=True)
+        folder = Path(module).parent
+        for name in [name for name in sys.modules if name.partition(".")[0] == folder.name]:
+            del sys.modules[name]  # of a test before, in another folder
+        folder.mkdir(exist_ok=True)
         Path(module).write_text(code)
 
 

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
 from ep2sindy.data.open import write_field
-from ep2sindy.figures.operating import PUBLISHED, trends_figure
+from ep2sindy.figures.operating import trends_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.operating.quantities import fit_control_law
 from tests import programs
@@ -153,7 +153,7 @@ def trend_table(kinds: Sequence[str]) -> pd.DataFrame:
 
 
 def test_a_figure_has_a_panel_per_quantity_and_trend_and_a_colour_per_kind() -> None:
-    estimates = trend_table(["least squares", "refined", PUBLISHED])
+    estimates = trend_table(["least squares", "refined", "thesis"])
     parameters = estimates[["V", "m"]].to_numpy()
     law = fit_control_law(parameters.prod(axis=1), parameters, polynomial(["V", "m"], degree=2))
     trends = [("m", {"V": 300.0}), ("V", {"m": 5.0})]

@@ -38,9 +38,12 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
         ("frontier", ["rates_Hz=[0]"], "rates_Hz[0] must be numbers, above zero: got 0"),
         ("ils", ["held_out=0.001"], "held_out=0.001 must leave 20 samples on either side"),
         ("ils", ["window=901"], "window must hold 5 samples or more and fit the first part"),
-        ("ils", ["relations=[]"], "relations must be a list of relations, such as"),
-        ("ils", ["relations=['n_i: n_n == 1']"], "'n_n' is not in the support of 'n_i'"),
-        ("ils", ["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
+        (
+            "ils",
+            ["models.predator_prey.relations=['n_i: n_n == 1']"],
+            "'n_n' is not in the support of 'n_i'",
+        ),
+        ("ils", ["models.predator_prey.fits=[ils]"], "fits must name some of ['base', 'weak', "),
         (
             "ils",
             ["+figures.colour=1"],
@@ -75,12 +78,10 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
         ("simulate", ["scan={operating_point.volts:[1]}"], "operating_point.volts must be there"),
         ("simulate", ["scan={n_cells:[]}"], "scan must be like {operating_point.voltage: [250,"),
         ("simulate", ["scan={n_cells:[30,30]}"], "each value once"),
-        ("weak", ["boxes.test_functions.n_points=70"], "test_functions.n_points is what n_points"),
-        ("weak", ["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
-        ("weak", ["model.n_n=[q]"], "unknown variables ['q']"),
-        ("weak", ["n_points=[10,1201]"], "n_points=1201 was asked of 1200 samples; lower n_points"),
-        ("weak_windows", ["n_points=[10,3001]"], "n_points=3001 was asked of 3000 samples"),
-        ("weak_windows", ["boxes.test_functions.n_windows=9"], "n_windows is what n_windows"),
+        ("weak", ["fits.boxes.form=box"], "fits.boxes.form must be null, balance or one of ['boxe"),
+        ("weak", ["models.predator_prey.terms.n_n=[q]"], "unknown variables ['q']"),
+        ("weak", ["fits.boxes.n_points=[1201]"], "n_points=1201 was asked of 1200 samples; lower"),
+        ("weak_windows", ["fits.boxes.n_points=[3001]"], "n_points=3001 was asked of 3000 samples"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(

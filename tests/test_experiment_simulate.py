@@ -277,8 +277,7 @@ def test_a_steady_simulation_warns_on_the_page_of_the_study_that_takes_it(tmp_pa
             *(each for each in toy(tmp_path) if each != "parallel=serial"),
             "data.operating_point.voltage=150.0",
             "data.warm_up_s=4.0e-4",
-            "n_windows=50",
-            "n_points=[10]",
+            "~fits.boxes",
         )
     )
     warning = "the simulation is steady: there is no oscillation to learn from"

@@ -16,7 +16,6 @@ from matplotlib.transforms import Bbox
 
 from ep2sindy.figures.operating import (
     FADED,
-    PUBLISHED,
     WRONG,
     cycle_figure,
     frequency_scale,
@@ -208,7 +207,8 @@ def example_law(n: int, parameters: Sequence[str]) -> tuple[OperatingLaw, pd.Dat
     rows = [
         {
             **dict(zip(parameters, point, strict=True)), "state": state, "term": term,
-            "law": value, "alone": 1.1 * value, "alone_low": value, "alone_high": 1.2 * value,
+            "law": value, "law_low": value, "law_high": value,
+            "alone": 1.1 * value, "alone_low": value, "alone_high": 1.2 * value,
         }
         for point, at in zip(points, of_law, strict=True)
         for (state, term), value in zip(pairs, at, strict=True)
@@ -260,6 +260,7 @@ def test_a_coefficient_that_is_constant_looks_constant_and_has_its_unit() -> Non
         pd.DataFrame({"a": a, "state": "x", "term": term, "alone": v, "law": v})
         for term, v in values.items()
     )
+    rows[["alone_low", "alone_high", "law_low", "law_high"]] = np.nan
     figure = laws_figure(rows, law, parameters=["a"], labels={})
     drawn(figure)
     low, high = figure.axes[0].get_ylim()
@@ -269,7 +270,7 @@ def test_a_coefficient_that_is_constant_looks_constant_and_has_its_unit() -> Non
     ]  # fmt: skip
 
 
-KINDS = ("refined", "least squares", PUBLISHED)
+KINDS = ("refined", "least squares", "thesis")
 
 
 @pytest.mark.parametrize("n", [1, 8])
@@ -281,7 +282,7 @@ def test_estimates_of_all_kinds_stand_at_their_points(n: int, name: str) -> None
         {"V": V, "m": m, "kind": kind, "quantity": f"{name} {q}", "value": 1e23 * (V * m + k)}
         for k, kind in enumerate(KINDS)
         for q in range(n)
-        for V, m in [*points, *([(300.0, 9.0)] if kind == PUBLISHED else [])]
+        for V, m in [*points, *([(300.0, 9.0)] if kind == "thesis" else [])]
     )
     rows = rows.assign(low=0.9 * rows["value"], high=1.1 * rows["value"])
     labels = {quantity: quantity for quantity in rows["quantity"]} | {"V": "$V_D$ (V)"}

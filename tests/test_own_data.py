@@ -107,7 +107,7 @@ def test_several_files_are_several_records(folder: Path) -> None:
     ]  # fmt: skip
     found = computed(composed(*overrides, "data.path=run*.csv"))
     assert all(f"data: run{k}.csv; 1000 samples" in found.log for k in range(2))
-    assert len(found.report.tables["records"]) == 2
+    assert list(found.summary["evaluations"]) == ["model", "model, run1.csv"]
     assert found.summary["models"]["model"]["equations"]["x"] == pytest.approx(
         {"x": -10.0, "y": 10.0}, rel=0.01
     )
@@ -180,7 +180,7 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
         "+exp=discover", "data=recognised", "data.path=a.csv", "trajectory.states=[x,y,z]",
         "search=best_subset", "selection=ebic", f"output={folder}",
     ))  # fmt: skip
-    assert "records" not in found.report.tables
+    assert list(found.summary["evaluations"]) == ["model"]
     assert f"500 samples of {SECONDS.duration_text(step, digits=4)} from" in found.log
     assert [text for text in found.warnings if "the record has 1 gap" in text]
 

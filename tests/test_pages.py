@@ -8,15 +8,13 @@ import pytest
 from ep2sindy.app.runner import run_config
 from tests import (
     test_experiment_benchmark,
-    test_experiment_constrained,
-    test_experiment_ils,
+    test_experiment_fits,
     test_experiment_libraries,
     test_experiment_parametric,
     test_experiment_pointwise,
     test_experiment_predict,
     test_experiment_simulate,
     test_experiment_trace,
-    test_experiment_weak,
     test_several_zones,
 )
 from tests.browser import browser, seen
@@ -53,13 +51,13 @@ def trace(path: Path, output: Path) -> list[str]:
 TOYS: dict[str, Toy] = {
     "benchmark": lambda _, output: test_experiment_benchmark.toy(output),
     "breathing": test_experiment_libraries.breathing,
-    "constrained": test_experiment_constrained.on_file,
+    "constrained": test_experiment_fits.constrained,
     "discover": discover,
     "frontier": lambda _, output: [
         "parallel=serial", "variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]",
         f"output={output}",
     ],
-    "ils": test_experiment_ils.toy,
+    "ils": test_experiment_fits.ils,
     "parametric": lambda _, output: [
         *test_experiment_parametric.toy(output), test_experiment_parametric.POINTS,
     ],
@@ -71,12 +69,10 @@ TOYS: dict[str, Toy] = {
         *test_experiment_predict.toy(output), test_experiment_predict.POINTS,
     ],
     "simulate": lambda _, output: test_experiment_simulate.toy(output),
+    "theories": lambda _, output: test_experiment_fits.theories(output),
     "trace": trace,
-    "weak": test_experiment_weak.weak_on,
-    "weak_windows": lambda _, output: [
-        "n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]", "parallel=serial",
-        "n_realizations=2", f"output={output}",
-    ],
+    "weak": test_experiment_fits.weak,
+    "weak_windows": lambda _, output: test_experiment_fits.weak_windows(output),
     "zones": lambda _, output: test_several_zones.toy(output),
 }  # fmt: skip
 

@@ -33,7 +33,7 @@ SECTIONS = [
             Text("short"),
             Text("long", page_only=True),
             Text("amiss", warning=True),
-            Equation("n_i", {"n_i": -2.0}, lead="thesis", aside=True, on_screen=True),
+            Equation("n_i", {"n_i": -2.0}, lead="thesis", on_screen=True),
             Equation("n_n", {"n_n": 3.0}),
             Table(ROWS, title="candidates", bold=[1], italic=[0], note="a note"),
             Picture("front"),
@@ -91,7 +91,7 @@ def test_a_page_marks_rows_and_escapes_text() -> None:
     assert f'<tr class="italic">{italic}</tr>' in page
     assert "<p>long</p>" in page
     assert '<p class="warning">amiss</p>' in page
-    assert '<p class="equation aside">thesis: <span class="math"><math' in page
+    assert '<p class="equation">thesis: <span class="math"><math' in page
 
 
 @pytest.mark.parametrize(

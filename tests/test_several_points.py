@@ -510,7 +510,6 @@ UNLIKE = "runs of several operating points need the same parameters"
         ({}, {"law": ep.named_terms(["b"], ["1", "b"])}, r"must be of \['a'\]: \['b'\] came"),
         ({}, {"law": []}, "must name degrees or functions"),
         ({}, {"law": 1, "hidden": ["z"]}, r"samples of every state: .*z.* came as hidden"),
-        ({}, {"known": {"x": {"x": {"a": 1.0}}}}, "give law=1 or shared=True as well"),
         (
             {},
             {"law": 1, "method": ep.Regression(search=ep.AdaptiveLasso())},

@@ -1,59 +1,48 @@
+"""Windows of the weak form under noise, and how fast and how long systems must be sampled."""
+
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.app.schema import Configured
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.runtime.parallel import Serial
 from ep2sindy.studies import frontier as frontiers
 from ep2sindy.studies import weak_windows
-from ep2sindy.studies.weak import Setting, boxes_grid, fit_settings
-from ep2sindy.studies.weak_windows import (
-    coefficient_error,
-    true_library,
-    window_cells,
-)
+from ep2sindy.studies.weak_windows import coefficient_error, error_cells
 from ep2sindy.systems.systems import System
+from tests import programs, test_experiment_fits
 
 EVERY_ROW = ep.RandomSplit(test_fraction=0.0)
-BOXES = ep.Weak(
-    test_functions=ep.Boxes(),
-    smooth_library=False,
-    split=EVERY_ROW,
-    errors_in_variables=False,
-)
-AUTOMATIC = ep.Weak(split=EVERY_ROW)
+UNWEIGHTED = ep.Weak(split=EVERY_ROW, errors_in_variables=False)
 
 
 def sampled(*, rate_Hz: float = 30.0, duration_s: float = 40.0) -> System:
     return replace(ep.lotka_volterra(), rate_Hz=rate_Hz, duration_s=duration_s)
 
 
-def boxes(n_windows: int, n_points: int) -> Setting:
-    return Setting(replace(BOXES, test_functions=ep.Boxes(n_windows=n_windows, n_points=n_points)))
+def boxes(n_windows: int, n_points: int) -> ep.Weak:
+    windows = ep.Boxes(n_windows=n_windows, n_points=n_points)
+    return replace(UNWEIGHTED, test_functions=windows, smooth_library=False)
 
 
 def coefficient_errors(
     system: System,
-    settings: Mapping[str, Setting],
+    forms: Mapping[str, Formulation],
     *,
     noises: Sequence[float],
     n_realizations: int,
     seed: int = 0,
 ) -> pd.DataFrame:
-    forms = {"formulation": ep.Differential(), "automatic": AUTOMATIC, "parallel": Serial()}
-    form = Configured({"_target_": "ep2sindy.Weak"}, "boxes")
     study = weak_windows.Study(
-        system=system, rate_Hz=system.rate_Hz, boxes=form, n_windows=[1], n_points=[2],
-        noises=noises, n_realizations=n_realizations, **forms,
+        system=system, rate_Hz=system.rate_Hz, formulation=ep.Differential(), fits={},
+        noises=noises, n_realizations=n_realizations, parallel=Serial(),
     )  # fmt: skip
-    return study.errors(settings, seed=seed)
-
-
-TERMS = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
+    return study.errors(forms, seed=seed)
 
 
 @pytest.mark.parametrize("n_points", [2, 10])
@@ -72,104 +61,62 @@ def test_without_noise_errors_are_those_of_the_trapezoidal_rule(n_points: int) -
 
 
 def test_without_noise_smooth_windows_find_the_coefficients() -> None:
-    for weighted in (False, True):
-        system = sampled()
-        setting = Setting(AUTOMATIC, weighted=weighted)
-        error = coefficient_error(
-            system, system.trajectory(), setting, rng=np.random.default_rng(0)
-        )
-        assert error < 1e-8  # the bump falls to 1e-10 at its edge; the integration has 1e-10
+    system, rng = sampled(), np.random.default_rng(0)
+    for form in (UNWEIGHTED, ep.Weak(split=EVERY_ROW)):
+        # The bump falls to 1e-10 at its edge; the integration has 1e-10.
+        assert coefficient_error(system, system.trajectory(), form, rng=rng) < 1e-8
 
 
 def test_more_and_longer_windows_bear_more_noise() -> None:
-    settings = boxes_grid(BOXES, n_windows=[100, 2000], n_points=[10, 100])
-    errors = coefficient_errors(sampled(), settings, noises=[0.0, 0.05], n_realizations=4, seed=1)
+    forms = {f"{n}_{length}": boxes(n, length) for n in (100, 2000) for length in (10, 100)}
+    errors = coefficient_errors(sampled(), forms, noises=[0.0, 0.05], n_realizations=4, seed=1)
     assert len(errors) == 4 * 2 * 4
-    cells = window_cells(errors, settings)
+    cells = error_cells(errors, forms)
     assert (cells["n"] == 4).all()
     noisy = cells[cells["noise"] == 0.05].set_index(["n_windows", "n_points"])["error_mean"]
     assert noisy[2000, 100] < noisy[2000, 10] < noisy[100, 10]
     assert noisy[2000, 100] < noisy[100, 100] < noisy[100, 10]
 
 
-def test_leaving_a_setting_out_changes_no_other() -> None:
-    settings = {"boxes": boxes(100, 10), "automatic": Setting(AUTOMATIC)}
-    both = coefficient_errors(sampled(), settings, noises=[0.1], n_realizations=2)
-    del settings["automatic"]
-    alone = coefficient_errors(sampled(), settings, noises=[0.1], n_realizations=2)
-    kept = both[both["setting"] == "boxes"].reset_index(drop=True)
+def test_leaving_a_form_out_changes_no_other() -> None:
+    forms = {"boxes": boxes(100, 10), "automatic": UNWEIGHTED}
+    both = coefficient_errors(sampled(), forms, noises=[0.1], n_realizations=2)
+    del forms["automatic"]
+    alone = coefficient_errors(sampled(), forms, noises=[0.1], n_realizations=2)
+    kept = both[both["fit"] == "boxes"].reset_index(drop=True)
     pd.testing.assert_frame_equal(kept, alone)
 
 
 def test_levels_of_noise_share_their_draws() -> None:
-    settings = {"boxes": boxes(2000, 100)}
-    errors = coefficient_errors(sampled(), settings, noises=[0.005, 0.01], n_realizations=1)
+    forms = {"boxes": boxes(2000, 100)}
+    errors = coefficient_errors(sampled(), forms, noises=[0.005, 0.01], n_realizations=1)
     # The first order in the noise doubles; the rest is noise^2 and the trapezoidal rule.
     small, large = errors["error"]
     assert large / small == pytest.approx(2.0, rel=0.05)
 
 
-def test_a_grid_is_named_by_what_varies() -> None:
-    assert list(boxes_grid(BOXES, n_windows=[7], n_points=[5, 9])) == ["n_points_5", "n_points_9"]
-    assert list(boxes_grid(BOXES, n_windows=[7], n_points=[5])) == ["n_points_5"]
-    both = boxes_grid(BOXES, n_windows=[7, 8], n_points=[5, 9])
-    assert both["n_windows_8_n_points_9"].boxes == ep.Boxes(n_windows=8, n_points=9)
-
-
-def fitted(run: ep.Trajectory, settings: dict[str, Setting]) -> dict:
-    return fit_settings(
-        run,
-        true_library(ep.lotka_volterra()),
-        TERMS,
-        settings,
-        rollout_s=None,
-        rng=np.random.default_rng(0),
-    )
-
-
-def test_every_form_follows_exact_data() -> None:
-    run = sampled().trajectory()
-    settings = {
-        "differential": Setting(ep.Differential(split=EVERY_ROW)),
-        "boxes": boxes(1000, 50),
-        "automatic": Setting(AUTOMATIC),
-        "automatic_weighted": Setting(AUTOMATIC, weighted=True),
-    }
-    for name, found in fitted(run, settings).items():
-        assert found.integrated.is_similar  # fewer than three periods: no cycle
-        assert found.r2 == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-5)
-        # 40 s hold less than three periods: a spectral line of that width, and no cycle to compare
-        assert found.integrated.frequency_Hz["x"] == pytest.approx(1.0 / 15.0, rel=0.2)
-        assert np.isnan(found.integrated.f_error)
-        assert (found.integrated.model.covariance is not None) == (name == "automatic_weighted")
-    bumps = fitted(run, {"automatic": Setting(AUTOMATIC)})["automatic"]
-    for state, x in zip(run.state_names, run.states.T, strict=True):
-        windows = ep.Bumps().windows(run.t, x, rng=np.random.default_rng(0))
-        assert 2 * bumps.half_width[state] + 1 == windows.mean.indptr[1]
-
-
-def test_a_weighted_fit_needs_rows_that_know_their_noise() -> None:
-    with pytest.raises(ValueError, match="a weighted fit needs the formulation Weak with"):
-        Setting(ep.Differential(), weighted=True)
-
-
 def test_windows_longer_than_the_data_are_refused() -> None:
-    system = sampled(duration_s=2.0)
-    settings = {"automatic": Setting(AUTOMATIC), "boxes": boxes(100, 61)}
-    message = "windows must fit the data: n_points=61 was asked of 60 samples"
-    with pytest.raises(ValueError, match=message):
-        fitted(system.trajectory(), settings)
-    with pytest.raises(ValueError, match=message):
-        coefficient_errors(system, settings, noises=[0.0], n_realizations=1)
+    forms = {"automatic": UNWEIGHTED, "boxes": boxes(100, 61)}
+    with pytest.raises(ValueError, match="windows must fit the data: n_points=61 was asked of 60"):
+        coefficient_errors(sampled(duration_s=2.0), forms, noises=[0.0], n_realizations=1)
 
 
-@pytest.mark.parametrize(
-    "settings", [{"n_realizations": 0}, {"noises": []}, {"settings": {}}], ids=str
-)
-def test_errors_of_nothing_are_refused(settings: dict) -> None:
-    defaults = {"settings": {"boxes": boxes(10, 2)}, "noises": [0.0], "n_realizations": 1}
+@pytest.mark.parametrize("nothing", [{"n_realizations": 0}, {"noises": []}, {"forms": {}}], ids=str)
+def test_errors_of_nothing_are_refused(nothing: dict) -> None:
+    defaults = {"forms": {"boxes": boxes(10, 2)}, "noises": [0.0], "n_realizations": 1}
     with pytest.raises(ValueError, match="there must be something to run"):
-        coefficient_errors(sampled(), **(defaults | settings))
+        coefficient_errors(sampled(), **(defaults | nothing))
+
+
+def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
+    found = programs.computed(programs.composed(*test_experiment_fits.weak_windows(tmp_path)))
+    cells = found.summary["cells"]
+    assert len(cells) == 2 * (4 + 3)
+    others = {cell["fit"] for cell in cells if cell["n_points"] is None}
+    assert others == {"differential", "automatic", "automatic_weighted"}
+    assert all(cell["n"] == 2 for cell in cells)
+    assert found.report.headline["n_windows_100_n_points_10/error_10_percent"] > 0.0
+    found.check_figures("errors")
 
 
 VARIANT = ep.Regression(

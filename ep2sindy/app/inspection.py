@@ -31,6 +31,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "weak": ("n_i", "n_n"),
     "constrained": ("n_i", "n_n", "R_ion", "u_iz"),
     "ils": ("n_i", "n_n"),
+    "theories": ("n_i", "n_n", "R_ion", "u_iz"),  # the last two for the balance of a file
     "parametric": ("n_i", "n_n", "R_ion", "u_iz"),
     "predict": ("n_i", "n_n"),
     "zones": ("n_i", "n_n"),

@@ -36,7 +36,6 @@ MAX_LINES = 5  # number of the other parameters' values that are drawn
 FADED = 0.35  # opacity of a map's colours beyond the points that the law was fitted to
 WRONG = "#d00000"  # marks where the law says otherwise than the record; no colour of the map
 MARKERS = "os^Dv<>"  # seven, of eight colours: a pair recurs after 56
-PUBLISHED = "thesis"  # the kind of estimate that comes from a publication
 
 FILLED: dict[str, Any] = {"marker": "o", "ms": 3.5}
 OPEN: dict[str, Any] = {"marker": "o", "ms": 6.0, "mfc": "none"}
@@ -74,7 +73,7 @@ def laws_figure(
             line, points = style.sample_line(rows[along], along, held, law.parameters)
             ax.plot(line, law.functions.evaluate(points) @ factors, color=colour, lw=1.5)
             for kind, mark in (("law", FILLED), ("alone", OPEN)):
-                ends = rows.get(f"{kind}_low"), rows.get(f"{kind}_high")
+                ends = rows[[f"{kind}_low", f"{kind}_high"]]
                 _draw_estimates(ax, rows[along], rows[kind], ends, {"color": colour, **mark})
         ax.set_xlabel(style.name_label(along, labels))
         ax.grid(alpha=0.3)
@@ -121,12 +120,11 @@ def _draw_estimates(
     ax: Axes,
     x: pd.Series,
     value: pd.Series,
-    ends: tuple[pd.Series | None, pd.Series | None],
+    ends: pd.DataFrame,
     mark: Mapping[str, Any],
 ) -> None:
     """Draw marks at their x, with bars where the ends of an interval are known."""
-    low, high = ends
-    reach = None if low is None or high is None else np.abs([low - value, high - value])
+    reach = np.abs(ends.sub(value, axis=0)).to_numpy(float).T
     ax.errorbar(x, value, reach, ls="none", elinewidth=0.8, capsize=2, zorder=3, **mark)
 
 
@@ -371,8 +369,7 @@ def _draw_trend(
     """Draw estimates of one quantity with their intervals, and the law of the first kind."""
     for kind, mark in marks.items():
         of = rows_at(rows, {"kind": kind})
-        ends = (None, None) if kind == PUBLISHED else (of["low"], of["high"])
-        _draw_estimates(ax, of[along], of["value"], ends, mark)
+        _draw_estimates(ax, of[along], of["value"], of[["low", "high"]], mark)
     x = rows_at(rows, {"kind": next(iter(marks))})[along]
     if law is not None and x.nunique() > 1:
         line, points = style.sample_line(x, along, at, law.functions.variables)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from html import escape
+from textwrap import wrap
 from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
@@ -27,13 +28,15 @@ from ep2sindy.model.stability import (
     periods_to_reach,
     share_reaching,
 )
-from ep2sindy.runtime.screen import html_table, one_screen, text_table
+from ep2sindy.runtime.screen import WIDTH, html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.attractor import follow_phase
 from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency
 
 N_REST = 16  # samples of a record from which rest points are looked for
+NEUTRAL = 1e-6  # growth per turn of a departure from a rest point that neither grows nor decays
 APART = 1e-6  # distance of two rest points, in standard deviations
+STD, WIDEST = " standard deviations", len("distribution error  ")
 N_SHOWN = 4  # most states, and most rest points, that the table shows one by one
 
 
@@ -152,9 +155,10 @@ class Evaluation:
 
     @property
     def phase_end(self) -> float:
-        """How far the run is ahead of the record at its end, in periods; NaN if it diverged.
+        """How far the run is ahead of the record at its end, in periods.
 
-        Also NaN for data without a period.
+        It is averaged over the last eight periods. NaN if the run diverged, or for data without a
+        period.
         """
         if self._slip is None or self.rollout.diverged:
             return float("nan")
@@ -193,17 +197,19 @@ class Evaluation:
     def rest_points(self) -> tuple[RestPoint, ...]:
         """Rest points that Newton's method reaches from samples of the record and their mean.
 
-        Empty for a model with inputs. A state that is positive in the record is positive there.
+        Empty for a model with inputs. No density is negative there.
         """
         if self.model.inputs:
             return ()
-        states = self.compared.states
-        every = max(1, len(states) // N_REST)
-        found: list[RestPoint] = [] if self.rest is None else [self.rest]
-        for near in (states.mean(axis=0), *states[::every]):
-            point = rest_point(self.model, near, self.compared.std, states.min(axis=0) > 0.0)
-            known = [np.abs(p.state - point.state) / self.compared.std for p in found if point]
-            if point is not None and all(distance.max() > APART for distance in known):
+        states, std = self.compared.states, self.compared.std
+        anywhere = np.zeros(len(std), dtype=np.bool_)
+        starts = (states.mean(axis=0), *states[:: max(1, len(states) // N_REST)])
+        found: list[RestPoint] = []
+        for near in starts:
+            point = rest_point(self.model, near, std, anywhere)
+            if point is None or (point.state[list(self.compared.densities)] < 0.0).any():
+                continue
+            if all(np.abs((point.state - p.state) / std).max() > APART for p in found):
                 found.append(point)
         return tuple(found)
 
@@ -244,11 +250,13 @@ class Evaluation:
             for state, value in zip(self.model.states, rest.state.tolist(), strict=True)
         )
         change = "grows" if rest.growth_per_s > 0.0 else "decays"
-        rate = f"{clock.seconds * abs(rest.growth_per_s):.3g} {clock.rate_unit('1')}"
+        rate = f" by {clock.seconds * abs(rest.growth_per_s):.3g} {clock.rate_unit('1')}"
+        if abs(rest.growth_per_s) <= NEUTRAL * rest.frequency_Hz:
+            change, rate = "neither grows nor decays", ""
         turns = (
             f" and turns at {clock.frequency_text(rest.frequency_Hz)}" if rest.frequency_Hz else ""
         )
-        return f"{place}, where a departure {change} by {rate}{turns}"
+        return f"{place}, where a departure {change}{rate}{turns}"
 
     @property
     def rows(self) -> list[tuple[str, str]]:
@@ -260,13 +268,13 @@ class Evaluation:
             f"{self.cycle.stability}, multiplier {self.multiplier:.3g}; "
             f"{100.0 * self.share_reaching:.0f} % of starts reach it"
         )
-        phase = f"{self.phase_end:+.2g} periods at the end, a quarter after {self.periods:.3g}"
+        phase = f"in phase for {self.periods:.3g} periods; {self.phase_end:+.2g} periods at the end"
         found = [
             ("status", self.text),
             ("frequency", _listed(frequencies) + error),
-            ("amplitude / record's", _listed(_texts(self.amplitude_ratio))),
-            ("waveform error (std)", _listed(_texts(self.waveform_error))),
-            ("distribution error (std)", _listed(_texts(self.distribution))),
+            ("amplitude ratio", _listed(_texts(self.amplitude_ratio))),
+            ("waveform error", _listed(_texts(self.waveform_error), STD)),
+            ("distribution error", _listed(_texts(self.distribution), STD)),
             ("phase", phase if np.isfinite(self.phase_end) else ""),
             ("cycle", cycle or ""),
             *(("rests at", self._rest_text(rest)) for rest in self.rest_points[:N_SHOWN]),
@@ -276,7 +284,12 @@ class Evaluation:
         return [(name, value) for name, value in found if value]
 
     def __repr__(self) -> str:
-        return one_screen(text_table(["quantity", "value"], self.rows))
+        rows = [
+            (name if k == 0 else "", line)
+            for name, value in self.rows
+            for k, line in enumerate(wrap(value, WIDTH - WIDEST))
+        ]
+        return one_screen(text_table(["quantity", "value"], rows))
 
     def _repr_html_(self) -> str:
         return html_table(["quantity", "value"], [(n, escape(value)) for n, value in self.rows])
@@ -342,8 +355,10 @@ def _texts(values: Mapping[str, float]) -> dict[str, str]:
     return {state: f"{value:.3g}" for state, value in values.items() if np.isfinite(value)}
 
 
-def _listed(texts: Mapping[str, str]) -> str:
-    """`x 1.01, y 0.99`, of the first states if there are many."""
+def _listed(texts: Mapping[str, str], unit: str = "") -> str:
+    """`x 1.01, y 0.99`, of the first states if there are many; empty without any."""
     shown = [f"{state} {text}" for state, text in texts.items()]
     left = len(shown) - N_SHOWN
-    return ", ".join(shown[:N_SHOWN]) + (f" and {left} more" if left > 0 else "")
+    return (
+        ", ".join(shown[:N_SHOWN]) + (f" and {left} more" if left > 0 else "") + unit * bool(shown)
+    )

@@ -41,7 +41,8 @@ def rest_point(
     rates = model.derivative(near + 0.5 * np.diag(scale), np.empty((len(near), 0)))
     size = zero_to_one(np.abs(rates).max(axis=0))
     found = root(lambda y: model.derivative(y * scale, np.empty(0)) / size, near / scale)
-    state: np.ndarray = found.x * scale
+    # What is this close to zero is zero but for rounding.
+    state: np.ndarray = np.where(np.abs(found.x) < RESTING, 0.0, found.x) * scale
     if not np.abs(found.fun).max() < RESTING or (state[positive] <= 0.0).any():
         return None
     values = np.linalg.eigvals(model.field.jacobian(state))

@@ -29,7 +29,7 @@ class Equation:
 
     rate: the terms make the time derivative of the state; if False, they make its value, as in a
     law. lead: text before it; mark: text after it. unit: of the left side, consistent with the
-    terms; may be left out if they are in SI. aside: set less prominently, as of lesser importance.
+    terms; may be left out if they are in SI.
     Shown only on the page, unless on_screen. As a cell of a table it is always shown.
     """
 
@@ -38,7 +38,6 @@ class Equation:
     lead: str = ""
     mark: str = ""
     unit: str = ""
-    aside: bool = False
     on_screen: bool = False
     rate: bool = True
 

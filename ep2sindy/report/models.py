@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -83,18 +83,17 @@ def interval_table(
     words: str = "95 %",
     note: str = "",
     *,
-    states: Sequence[str] | None = None,
     page_only: bool = False,
 ) -> list[Table]:
     """Coefficients with 95 % intervals; no table if these are not known.
 
-    words: what the intervals are called. note: what they mean. states: None means all.
+    words: what the intervals are called. note: what they mean.
     """
     if model.covariance is None:
         return []
     units = {term.name: term.unit(model.units) for term in model.library.terms}
     rows = []
-    for state in model.states if states is None else states:
+    for state in model.states:
         for term, ends in model.intervals(state).items():
             numbers = [model.terms(state)[term], *ends]
             unit = unit_product([(model.units[state], 1), (units[term], -1)])

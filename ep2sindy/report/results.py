@@ -137,17 +137,15 @@ class ResultTable(Generic[Record]):
         empty = [n for n in table if all(cell_text(cell) in ("", "-") for cell in table[n])]
         return table.drop(columns=empty)
 
-    def upright(self, heading: str = "quantity") -> pd.DataFrame:
-        """A row per metric, and a column of formatted cells per record."""
-        cells = self.screen("").T
-        cells.columns = [name for name, _ in self._named()]
-        return cells.rename_axis(heading).reset_index()
-
     def json(self) -> dict[str, dict[str, Any]] | list[dict[str, Any]]:
         """Metrics by key, of every record by its name or in turn; values by state stay mappings."""
+        rows = [
+            {m.key: dict(value) if isinstance(value, Mapping) else value for m, value in values}
+            for _, values in self._rows("", View.FILES)
+        ]
         if isinstance(self.records, Mapping):
-            return {name: facts(record, self.metrics) for name, record in self._named()}
-        return [facts(record, self.metrics) for record in self.records]
+            return dict(zip(self.records, rows, strict=True))
+        return rows
 
     def headline(self) -> dict[str, float]:
         """Headline values by `name/key`, or `name/state/key` if they are by state."""
@@ -174,12 +172,6 @@ class ResultTable(Generic[Record]):
 
     def _in(self, view: View) -> list[Metric[Record]]:
         return [metric for metric in self.metrics if view in metric.view]
-
-
-def facts(record: Record, metrics: Metrics[Record]) -> dict[str, Any]:
-    """Metrics of one record for `summary.json`, by key."""
-    found = {m.key: m.value(record) for m in metrics if View.FILES in m.view}
-    return {key: dict(v) if isinstance(v, Mapping) else v for key, v in found.items()}
 
 
 def json_rows(table: pd.DataFrame) -> list[dict[Any, Any]]:

@@ -96,7 +96,7 @@ def renderables(block: Block) -> Iterator[RenderableType]:
         case Text(page_only=False):
             yield _text(block.text, "bold red" if block.warning else "")
         case Equation(on_screen=True):
-            yield _text(block.text, "italic" if block.aside else "")
+            yield _text(block.text)
         case Table(page_only=False):
             yield rich_table(block)
         case Picture() | Text() | Equation() | Table():

@@ -45,7 +45,6 @@ from ep2sindy.studies.fitted import (
     fitted_start,
     n_sustained,
     worst_amplitude,
-    worst_waveform,
     wrong_signs,
 )
 from ep2sindy.studies.over_points import add_points
@@ -60,7 +59,14 @@ from ep2sindy.studies.study import (
     ShareOrNone,
     ZeroOrMore,
 )
-from ep2sindy.studies.views import PlotRange, add_figures, add_samples, best_run, found_model
+from ep2sindy.studies.views import (
+    PlotRange,
+    add_figures,
+    add_samples,
+    best_run,
+    found_model,
+    largest,
+)
 
 if TYPE_CHECKING:
     from ep2sindy.refinement.problem import Iteration
@@ -244,6 +250,7 @@ class Study:
         held, clock = record.held, record.held.clock
         f_Hz = dominant_frequency(held.t, held.states[:, 0])
         where = "held-out time" if self.held_out else "the record"
+        since = f"time since start of {'held-out part' if self.held_out else 'record'}"
         report.section(f"Run freely over {where}")
         report.table(
             "fits",
@@ -253,10 +260,11 @@ class Study:
             note=f"The data have {clock.frequency_text(f_Hz)}. {NOTE}",
         )
         runs = {name: each.from_sample for name, each in fits.items()}
-        add_figures(report, FIGURES, held, runs, self.figures)
+        draw = partial(add_figures, report, data=held, shown=self.figures, since=since)
+        draw(FIGURES, runs=runs)
         add_samples(report, held, runs)
         started = {name: each.from_fit for name, each in fits.items()}
-        add_figures(report, ["trajectories"], held, started, self.figures, suffix=STARTED)
+        draw(["trajectories"], runs=started, suffix=STARTED)
         relations = dict.fromkeys(t for each in self.models.values() for t in each.relations)
         report.section("Equations", *(f"relation: {text}" for text in relations))
         if any(each.model.covariance is not None for each in fits.values()):
@@ -328,7 +336,12 @@ SPREAD: Metrics[Sequence[Evaluation]] = [
     Metric("f_error", partial(ends, lambda run: run.f_error), View.SHOWN, format=_PERCENT),
     Metric("nrmse", partial(ends, lambda run: run.nrmse), View.SHOWN, format=_range),
     Metric("amplitude", partial(ends, worst_amplitude), View.SHOWN, format=_range),
-    Metric("waveform", partial(ends, worst_waveform), View.SHOWN, format=_range),
+    Metric(
+        "waveform",
+        partial(ends, lambda run: largest(run.waveform_error)),
+        View.SHOWN,
+        format=_range,
+    ),
 ]
 
 

@@ -261,7 +261,3 @@ def n_sustained(runs: Sequence[Evaluation]) -> int:
 def worst_amplitude(run: Evaluation) -> float:
     """Amplitude over the data's, of the state that is farthest off."""
     return max(run.amplitude_ratio.values(), key=lambda ratio: abs(ratio - 1.0))
-
-
-def worst_waveform(run: Evaluation) -> float:
-    return max(run.waveform_error.values())

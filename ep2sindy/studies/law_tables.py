@@ -113,8 +113,8 @@ class FoundLaw:
             return f"{windows}."
         return (
             f"{windows}, and run freely {found['n_lives']} of {found['n']} points live, diverging: "
-            f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} (nine "
-            f"in ten within {text(found['f_90'])}), the worst state's amplitude "
+            f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} "
+            f"(nine in ten within {text(found['f_90'])}), the worst state's amplitude "
             f"{text(found['amplitude_median'])} and waveform {places(found['waveform_median'], 3)}."
         )
 

@@ -21,9 +21,8 @@ from ep2sindy.library.roles import Roles
 from ep2sindy.model.comparison import samples_in
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Table, Text
+from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
-from ep2sindy.report.results import ResultTable
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
@@ -35,7 +34,7 @@ from ep2sindy.studies.candidates import (
 from ep2sindy.studies.forecasts import add_forecasts, skill_of, why_none
 from ep2sindy.studies.library_result import (
     LibraryResult,
-    add_records,
+    add_evaluations,
     add_tables,
     find_best,
     refit,
@@ -52,14 +51,7 @@ from ep2sindy.studies.source import (
     zones_of,
 )
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Terms, ZeroOrMore
-from ep2sindy.studies.views import (
-    EVALUATED,
-    EVALUATION,
-    FROM_DERIVATIVES,
-    PlotRange,
-    add_figures,
-    add_samples,
-)
+from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module
 
 FIGURES = ("data", "trajectories", "derivatives", "phase")
@@ -265,32 +257,24 @@ class Study:
         results: Mapping[str, LibraryResult],
         files: Sequence[str],
     ) -> None:
-        """Models that live with what tells of them, then the selected models, then candidates."""
+        """All runs, models that live with what tells of them, the selected models, candidates."""
         report.found(find_best(results, len(files)))
+        add_evaluations(report, results, files)
         for name, result in results.items():
             if result.living is not None and result.balance is not None:
                 add_living(report, name, result.living)
                 add_balance(report, name, result.balance, data, result.living.run.cycle)
-                self._add_forecasts(report, name, data, result)
+            if result.skill is not None:
+                where = "that it has seen" if result.living is None else "held out"
+                title = f"{name}: forecasts over time {where}"
+                add_forecasts(report, name, data, result.skill, title=title)
         self._add_selected(report, data, results)
-        if len(files) > 1:
-            add_records(report, results, files)
         for name, result in results.items():
             found = result.discovery
-            if result.living is None:
-                self._add_forecasts(report, name, data, result)
             add_candidates(report, name, found, note=result.note, beside=result.beside)
             if found.estimate is not None:
                 add_estimate(report, name, found)
         add_tables(report, results)
-
-    def _add_forecasts(
-        self, report: Report, name: str, data: Trajectory, result: LibraryResult
-    ) -> None:
-        if result.skill is not None:
-            where = "that it has seen" if result.living is None else "held out"
-            title = f"{name}: forecasts over time {where}"
-            add_forecasts(report, name, data, result.skill, title=title)
 
     def _add_selected(
         self, report: Report, data: Trajectory, results: Mapping[str, LibraryResult]
@@ -305,10 +289,6 @@ class Study:
             report.model(name, result.discovery.model, clock=clock, held=held)
         selected = {name: result.runs[0] for name, result in results.items()}
         published = {f"{n}_thesis_terms": r.published for n, r in results.items() if r.published}
-        is_living = any(result.living is not None for result in results.values())
-        note = f"{FROM_DERIVATIVES} {EVALUATED}" if is_living else EVALUATED
-        rows = ResultTable(selected | published, EVALUATION).screen("model", by_state=True)
-        report.section("Run freely from the first sample", Table(rows, note=note))
         figures(FIGURES, runs=selected, smoother=self.formulation.smoother)
         add_samples(report, data, selected | published)
         for name, run in published.items():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import compress
 
 import numpy as np
@@ -17,16 +16,20 @@ from ep2sindy.model.model import SparseModel, model_of
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.regression.front import Candidate, fit_support
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Result, Text
+from ep2sindy.report.document import Result, Table, Text
 from ep2sindy.report.report import Report
-from ep2sindy.report.results import Metric, Metrics, ResultTable, View
+from ep2sindy.report.results import ResultTable
 from ep2sindy.studies.balance import ModelBalance
 from ep2sindy.studies.candidates import CandidateRow, left_over_of_all, selected_metrics
 from ep2sindy.studies.living import LIVING, Living
 from ep2sindy.studies.study import Coefficients
 from ep2sindy.studies.views import EVALUATED, EVALUATION, best_run, found_model, worst_run
 
-EVERY_RECORD = "the selected models, integrated from the first sample of every record"
+FROM_DERIVATIVES = (
+    "Living models, which free runs select, and equations selected by derivatives and then refined "
+    "are run over held-out time; the equations that fits of derivatives select, and the thesis's "
+    "terms fitted here, over the record from its first sample."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,44 +85,42 @@ class LibraryResult:
         }
 
 
-RECORDS: Metrics[tuple[str, str, Evaluation]] = [
-    Metric("model", lambda row: row[0], View.SHOWN),
-    Metric("record", lambda row: row[1], View.SHOWN),
-    *(metric.of(lambda row: row[2], view=View.SHOWN) for metric in EVALUATION),
-]
-
-
-def add_records(report: Report, results: Mapping[str, LibraryResult], files: Sequence[str]) -> None:
-    """Add how the selected models run over every record."""
-    rows = [
-        (name, file, run)
-        for name, result in results.items()
-        for file, run in zip(files, result.runs, strict=True)
-    ]
-    report.section("Every record")
-    report.table("records", ResultTable(rows, RECORDS), title=EVERY_RECORD, note=EVALUATED)
-
-
-def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
-    """Add tables of all libraries whose facts stand in the sections: for files and headline."""
-    add = partial(report.table, shown=False)
-    living = {name: each.living for name, each in results.items() if each.living is not None}
+def add_evaluations(
+    report: Report, results: Mapping[str, LibraryResult], files: Sequence[str]
+) -> None:
+    """Add how all models run: those that live, the selected over every record, and published."""
     runs: dict[str, Evaluation] = {}
-    rows: dict[str, CandidateRow] = {}
     for name, result in results.items():
         if result.living is not None:
             runs |= {f"{name}_living": result.living.run, f"{name}_refined": result.living.refined}
         runs |= {name: result.runs[0]}
+        others = zip(files[1:], result.runs[1:], strict=True)
+        runs |= {f"{name}, {file}": run for file, run in others}
         runs |= {f"{name}_thesis_terms": result.published} if result.published else {}
+    is_living = any(result.living is not None for result in results.values())
+    rows = ResultTable(runs, EVALUATION)
+    shown = Table(
+        rows.screen("model", by_state=True),
+        title="run freely from one sample",
+        note=f"{FROM_DERIVATIVES} {EVALUATED}" if is_living else EVALUATED,
+    )
+    report.section("How the models run")
+    report.table("evaluations", rows, heading="model", shown=shown)
+
+
+def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
+    """Add tables of all libraries whose facts stand in the sections: for files and headline."""
+    rows: dict[str, CandidateRow] = {}
+    for name, result in results.items():
         chosen, refitted = result.discovery.chosen.items(), result.refitted.items()
         left = result.discovery.noise_test.left
         rows |= {f"{name}/{s}": CandidateRow(each, True, left.get(s)) for s, each in chosen}
         rows |= {f"{name}_thesis_terms/{s}": CandidateRow(each) for s, each in refitted}
     label = next(iter(results.values())).discovery.method.selection.label
-    add("evaluations", ResultTable(runs, EVALUATION), heading="model")
-    add("equations", ResultTable(rows, selected_metrics(label)), heading="of")
+    report.table("equations", ResultTable(rows, selected_metrics(label)), heading="of", shown=False)
+    living = {f"{name}_living": each.living for name, each in results.items() if each.living}
     if living:
-        add("living", ResultTable(living, LIVING), heading="library")
+        report.table("living", ResultTable(living, LIVING), heading="model", shown=False)
 
 
 def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:

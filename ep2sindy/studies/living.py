@@ -36,7 +36,7 @@ from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import power_spectrum, samples_in_periods
 from ep2sindy.studies.source import NO_ZONES, TELLING, Zones, told_roles
 from ep2sindy.studies.study import Count, Positive
-from ep2sindy.studies.views import CYCLE, EVALUATED, EVALUATION, add_samples, terms_text
+from ep2sindy.studies.views import CYCLE, add_samples, terms_text
 
 WAVEFORM = "One period by phase, shown twice: samples, their waveform, and the model's."
 CAPTIONS = {
@@ -195,10 +195,7 @@ def add_living(report: Report, name: str, found: Living) -> None:
         draw = partial(figures.free_run_figure, run.record, run.rollout, period_s=period_s)
         report.figure(f"free_run_{name}", draw, CAPTIONS["free_run"])
     report.model(f"{name}_refined", found.refined.model, shown=False)
-    runs = {"living": run, "by derivatives, refined": found.refined}
-    rows = ResultTable(runs, EVALUATION).screen("model", by_state=True)
-    title = "run freely from one sample over held-out time"
-    report.add(Table(rows, title=title, note=EVALUATED), *_notes(found))
+    report.add(*_notes(found))
     add_cycle(report, name, run)
     add_samples(report, run.record, {f"{name}_living": run})
     _add_others(report, name, found.discovery.others)

@@ -21,8 +21,8 @@ from ep2sindy.studies.fitted import (
     ends,
     n_sustained,
     worst_amplitude,
-    worst_waveform,
 )
+from ep2sindy.studies.views import largest
 
 NOTE = (
     "Frequency, amplitude and waveform: the largest errors over the points that have a cycle. "
@@ -77,7 +77,7 @@ AT_POINTS: Metrics[AtPoints] = [
     ),
     Metric(
         "waveform_error",
-        lambda each: max(ends(worst_waveform, each.runs)),
+        lambda each: max(ends(lambda run: largest(run.waveform_error), each.runs)),
         View.SHOWN, "waveform", "{:.3f}",
     ),
     Metric("wrong_signs", lambda each: each.wrong, View.SHOWN, "signs wrong"),

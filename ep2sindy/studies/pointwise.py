@@ -222,7 +222,7 @@ def found_regimes(regimes: Regimes, points: str) -> Result:
     unsure = float((regimes.confidence < UNSURE).sum() / regimes.confidence.count())
     return Result(
         f"Found: {count}{limit}; confidence below {UNSURE:g} at {unsure:.0%} of points",
-        [Text(points), *largest],
+        [*largest, Text(points)],
         load='xarray.open_dataset("{}/pointwise.nc")',
         picture="regimes",
     )

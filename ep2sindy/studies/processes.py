@@ -64,7 +64,8 @@ def compared_processes(
 
     held_to: the model's constraint, from a search under `Roles`. Rates are those of the zone that
     gives, or takes from outside. Where ions give back by a process of their own, ionization is the
-    whole of it; else what is given back is subtracted, as the model's terms are net of it.
+    whole of it; else what is given back is subtracted, as the model's terms are net of it. So is
+    what leaves of a state for which the model has no outflow, unless its inflow is told.
     """
     theta = model.library.evaluate(data.columns(model.library.variables))
     found: dict[tuple[str, str], dict[str, float]] = {}
@@ -72,11 +73,13 @@ def compared_processes(
         found.setdefault(ends_of(process), {})[process.term] = amount
     known = {zone: recorded_rates(balance, data) for zone, balance in zones.balances.items()}
     gone = _through_ends(known, zones.sizes or dict.fromkeys(known, 1.0))
+    told = {ends_of(process) for process in held_to.known}
+    leaving = {g for g, taker in found if not taker or _zone(g) != _zone(taker)}
     compared = []
     # What enters comes first, what leaves last.
     for ends, terms in sorted(found.items(), key=lambda each: (bool(each[0][0]), not each[0][1])):
         columns = theta[:, [model.library.index(term) for term in terms]]
-        gross = ends[::-1] in found
+        gross = ends[::-1] in found if ends[0] else ends[1] in leaving or ends in told
         rate = _zone_rate(*ends, known, gone, gross=gross)
         modelled = columns @ np.array([*terms.values()])
         beside = fitted_rate(rate, columns, list(terms)) if rate is not None else FittedRate({})
@@ -111,11 +114,15 @@ def _through_ends(
     return found
 
 
+def _zone(state: str) -> str:
+    return state.partition("@")[2]
+
+
 def _zone_words(giver: str, taker: str, *, gross: bool) -> str:
     (state, _, zone), (other, _, beyond) = giver.partition("@"), taker.partition("@")
     names = {IONS: "ions", NEUTRALS: "neutrals"}
     if not giver:
-        return f"{names[other]} that enter"
+        return f"{names[other]} that enter{'' if gross else ', less those that leave'}"
     if not taker:
         return f"{names[state]} that leave"
     if zone != beyond:
@@ -136,10 +143,15 @@ def _zone_rate(
     *,
     gross: bool,
 ) -> np.ndarray | None:
-    """The rate of a process in the record; None if it does not give it."""
-    (state, _, zone), (_, _, beyond) = giver.partition("@"), taker.partition("@")
+    """The rate of a process in the record; None if it does not give it.
+
+    gross: False subtracts what goes the other way, which the model has no process for.
+    """
+    (state, _, zone), (other, _, beyond) = giver.partition("@"), taker.partition("@")
     if not giver:
-        return known[beyond].get("supply")
+        supply = known[beyond].get("supply") if other == NEUTRALS else None
+        left = 0.0 if gross else gone.get((other, beyond))
+        return None if supply is None or left is None else supply - left
     if not taker or zone != beyond:  # to the outside, or to the next zone
         return gone.get((state, zone))
     if gross:

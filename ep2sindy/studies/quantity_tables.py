@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
-from ep2sindy.figures.operating import PUBLISHED, rows_at, trends_figure
+from ep2sindy.figures.operating import rows_at, trends_figure
 from ep2sindy.library.library import Library
 from ep2sindy.operating.given_models import REFINED, GivenModel, PointResult
 from ep2sindy.operating.quantities import (
@@ -208,8 +208,7 @@ def _add_figures(
         best = min(kinds, key=lambda fit: errors.get(fit, np.inf))
         ours = usable[usable["fit"].isin(list(kinds))]
         ours = pd.concat([ours[ours["fit"] == best], ours[ours["fit"] != best]])
-        theirs = rows_at(published, {"fit": model})
-        theirs = theirs.assign(low=theirs["value"], high=theirs["value"], kind=PUBLISHED)
+        theirs = rows_at(published, {"fit": model}).assign(kind="thesis")
         table = pd.concat([ours.assign(kind=ours["fit"].map(kinds)), theirs])
         own = {name: law for (fit, name), law in laws.items() if fit == best}
         beside = "; beside them what the thesis found in its data" if len(theirs) else ""
@@ -246,7 +245,8 @@ def _add_values(
 
 def _equation(name: str, law: ControlLaw, unit: str = "", error: str = "") -> Equation:
     mark = f" ({error} off where left out)" if error else ""
-    return Equation(name, law.coef_by_term, rate=False, unit=unit, mark=mark, on_screen=True)
+    shown = "" if unit == "1" else unit
+    return Equation(name, law.coef_by_term, rate=False, unit=shown, mark=mark, on_screen=True)
 
 
 def _heading(name: str, unit: str) -> str:

@@ -52,9 +52,13 @@ def _cycles(count: float) -> str:
     return "-" if count != count else f"{count:g} cycle{'s' if count > 1 else ''}"
 
 
+def _cycle(strength: str) -> str:
+    return "-" if strength == "none" else strength
+
+
 VERDICT: list[Metric[Simulated]] = [
     Metric("status", itemgetter("status"), View.SHOWN),
-    Metric("cycle", lambda run: run.get("cycle", "none"), View.SHOWN),
+    Metric("cycle", lambda run: run.get("cycle", "none"), View.SHOWN, format=_cycle),
 ]
 MERITS = [
     number("I_d_mean", "mean discharge current", "{:.2f} A"),

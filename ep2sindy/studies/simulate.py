@@ -132,7 +132,8 @@ class Study:
         report.summary["file"] = "field.nc"
         table = ResultTable({"run": run}, PERFORMANCE)
         report.section("Performance")
-        report.table("performance", table, shown=Table(table.upright(), note=BALANCE))
+        upright = table.screen().T.reset_index().set_axis(["quantity", "value"], axis=1)
+        report.table("performance", table, shown=Table(upright, note=BALANCE))
         add_power(report, field)
         if field.sizes["time"] >= MIN_SAMPLES:
             self._draw(report, field, f_kHz)

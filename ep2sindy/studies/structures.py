@@ -119,13 +119,14 @@ def balance_model(
     empty = model_of(library, {state: {} for state in held.states}, units=run.units)
     processes = compared_processes(empty, held, run, zones) if held.processes else []
     found = {(p.ends, term): v for p in processes for term, v in p.counterpart.items()}
-    try:
-        values = [found[ends_of(process), process.term] for process in held.processes]
-    except KeyError as error:
+    asked = [(ends_of(process), process.term) for process in held.processes]
+    if not asked or not {*asked} <= {*found}:
         raise ValueError(
-            f"coefficients of the balance need a process that the record tells: got {error}; take "
-            "roles, and the zone of a simulated thruster from its anode on"
-        ) from error
+            "coefficients of the balance need processes that the record tells, by roles: asked for "
+            f"{asked}, told are {[*found]}; take roles, and the zone of a simulated thruster from "
+            "its anode on"
+        )
+    values = [found[each] for each in asked]
     known, places = sum_known(held.known), [held.coefficients[k] for k in held.free]
     z = shares_of(held) @ np.array(values) + [known.get(place, 0.0) for place in places]
     model = model_of(library, held.equations(z), units=run.units)

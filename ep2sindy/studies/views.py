@@ -26,10 +26,6 @@ from ep2sindy.studies.study import PositiveOrAll
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FROM_DERIVATIVES = (
-    "These are the equations that fits of the derivatives select; those that free runs select, "
-    "which are sustained if any is, stand above."
-)
 MARKS = "Carets: the model leaves the panel; cross: a run that diverged stops."
 CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",
@@ -164,14 +160,20 @@ def found_model(
 
 
 def _fate(run: Evaluation, *, seen: bool, misfit: str) -> str:
-    """`is sustained`, `has the wrong cycle`, `diverges after 12 us`."""
+    """`sustains the oscillation`, `has the wrong cycle`, `diverges after 12 us`."""
+    words = {
+        Status.SUSTAINED: "sustains the oscillation",
+        Status.WRONG_FREQUENCY: "has the wrong frequency",
+        Status.WRONG_CYCLE: "has the wrong cycle",
+        Status.NO_CYCLE: "is unlike the data",
+    }
+    if not run.is_similar:
+        return words.get(run.status, run.text)
     if run.status is Status.NO_CYCLE:
-        does = "has the statistics of the data" if run.is_similar else "is unlike the data"
-        return "does not explain the data" if misfit else does
-    words = {Status.SUSTAINED: "is sustained", Status.WRONG_CYCLE: "has the wrong cycle"}
-    words |= {Status.WRONG_FREQUENCY: "has the wrong frequency"}
-    where = " where it was fitted" if seen and run.is_similar else ""
-    return f"{words.get(run.status, run.text)}{where}"
+        if misfit:
+            return "does not explain the data"
+        words[Status.NO_CYCLE] = "has the statistics of the data"
+    return f"{words[run.status]}{' where it was fitted' if seen else ''}"
 
 
 def frequency_words(run: Evaluation, form: str = "+.1f") -> str:

@@ -1,6 +1,8 @@
-"""Free runs: what becomes of a model that starts from one sample."""
+"""How a model does on a record: its free run, cycle, rest points and forecasts."""
 
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,12 +10,13 @@ import pytest
 
 from benchmarks.known_systems import noisy
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting import evaluation
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.comparison import FreeRunBounds, Status, samples_in
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.studies.views import found_model, worst_run
-from ep2sindy.systems.systems import lorenz
+from ep2sindy.systems.systems import lorenz, lotka_volterra
 from tests.models import model_of
 
 LIBRARY = polynomial(["x", "y"], degree=3)
@@ -66,6 +69,7 @@ def test_verdicts(model, verdict, f_error, amplitude) -> None:
 
 def test_the_phase_slips_by_a_quarter_when_it_should() -> None:
     found = evaluate(hopf(turn=1.01), record(60.0))  # a quarter after 25 periods
+    assert found.phase_end == pytest.approx(0.01 * (60.0 - 4.0), abs=1e-3)  # mean of the last eight
     assert found.periods == pytest.approx(25.0, abs=1.0)
 
 
@@ -172,8 +176,10 @@ def test_the_title_of_a_result_says_where_a_model_was_fitted_and_what_it_does_no
     def title(run: Evaluation, **how: Any) -> str:
         return found_model("Found", run, file="a", picture="", where="it", **how).title
 
-    assert title(run) == "Found: a model that is sustained"
-    assert title(run, seen=True) == "Found: a model that is sustained where it was fitted"
+    assert title(run) == "Found: a model that sustains the oscillation"
+    assert (
+        title(run, seen=True) == "Found: a model that sustains the oscillation where it was fitted"
+    )
     similar = replace(run, status=Status.NO_CYCLE)
     assert title(similar) == "Found: a model that has the statistics of the data"
     assert title(similar, misfit="no law") == "Found: a model that does not explain the data"
@@ -185,8 +191,89 @@ def test_of_several_records_the_worst_run_counts() -> None:
     assert worst_run([run, apart, run]) is apart
 
 
-def test_a_neutral_cycle_is_told_and_an_attracting_one_is_not() -> None:
-    neutral, attracting = hopf(growth=0.0), hopf()
-    cautions = [evaluate(each, record()).caution for each in (neutral, attracting)]
-    assert "neither attracts nor repels" in cautions[0]
-    assert not cautions[1]
+def test_a_neutral_cycle_is_told_and_every_start_has_its_own() -> None:
+    prey = lotka_volterra()
+    found = evaluate(prey.model, prey.trajectory())
+    assert found.cycle is not None
+    assert (found.status, found.cycle.stability) == (Status.SUSTAINED, "neutral")
+    assert found.multiplier == pytest.approx(1.0, abs=1e-6)
+    assert found.share_reaching < 0.2
+    assert "neither attracts nor repels" in found.caution
+    assert found.rest is not None
+    np.testing.assert_allclose(found.rest.state, [1 / 3, 2 / 3], rtol=1e-9)
+    assert found.rest.frequency_Hz == pytest.approx(np.sqrt(2.0) / 3.0 / (2.0 * np.pi))
+    assert "neither grows nor decays and turns at 75.03 mHz" in found.cycle_text
+
+
+def test_an_attracting_cycle_has_its_multiplier_and_rests_inside() -> None:
+    found = evaluate(hopf(growth=0.05), record())
+    assert found.multiplier == pytest.approx(np.exp(-0.2 * np.pi), rel=1e-6)
+    assert found.share_reaching == 1.0
+    assert not found.caution
+    (rest,) = found.rest_points
+    np.testing.assert_array_equal(rest.state, [0.0, 0.0])
+    assert rest.growth_per_s == pytest.approx(0.05)
+    assert rest.frequency_Hz == pytest.approx(0.5 / np.pi)
+
+
+def test_rest_points_are_those_near_the_record() -> None:
+    system = replace(lorenz(), duration_s=20.0)
+    found = evaluate(system.model, system.trajectory())
+    places = sorted(tuple(point.state.round(9)) for point in found.rest_points)
+    side = round(np.sqrt(8 / 3 * 27), 9)
+    assert places == [(-side, -side, 27.0), (0.0, 0.0, 0.0), (side, side, 27.0)]
+    assert all(point.growth_per_s > 0.0 for point in found.rest_points)
+
+
+def test_a_run_without_a_cycle_has_none_of_its_numbers() -> None:
+    decays, diverges = (evaluate(hopf(growth=g, radius=1e9), record()) for g in (-0.2, 0.3))
+    for found in (decays, diverges):
+        numbers = (found.multiplier, found.share_reaching)
+        assert np.isnan(numbers).all()
+        assert (found.cycle, found.rest, found.cycle_text, found.caution) == (None, None, "", "")
+        assert [rest.growth_per_s > 0.0 for rest in found.rest_points] == [found is diverges]
+    assert np.isnan(diverges.phase_end)
+    assert re.fullmatch(r"diverges after [0-9.]+ s", diverges.text)
+
+
+def test_only_what_is_asked_for_is_computed_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    for name in ("limit_cycle", "share_reaching", "rest_point", "forecast_skill"):
+        plain = getattr(evaluation, name)
+
+        def told(*args: Any, name: str = name, plain: Any = plain, **kwargs: Any) -> Any:
+            calls.append(name)
+            skill = SimpleNamespace(text=f"fitted to {kwargs.get('n_fitted')}")
+            return skill if name == "forecast_skill" else plain(*args, **kwargs)
+
+        monkeypatch.setattr(evaluation, name, told)
+    found = evaluate(hopf(growth=0.05), record(), n_fitted=1000)
+    assert (found.status, found.record.n_samples) == (Status.SUSTAINED, 1002)
+    assert found.periods == pytest.approx(20.0, abs=0.1)
+    assert not calls
+    assert found.multiplier < 1.0
+    assert calls == ["limit_cycle"]
+    assert "fitted to 1000" in repr(found)
+    n_calls = len(calls)
+    assert repr(found)
+    assert len(calls) == n_calls
+    assert calls.count("forecast_skill") == calls.count("limit_cycle") == 1
+
+
+def test_forecasts_need_held_out_samples_and_a_model_of_its_own() -> None:
+    assert evaluate(hopf(), record()).forecast is None
+    with pytest.raises(ValueError, match="n_fitted=1999 came for 2001 samples"):
+        evaluate(hopf(), record(), n_fitted=1999)
+
+
+def test_the_table_fits_a_screen_and_tells_what_a_discovery_does_not_explain() -> None:
+    found = evaluate(SimpleNamespace(model=hopf(), misfit="x < its noise"), record())
+    assert found.lack_of_fit == "x < its noise"
+    lines = repr(found).splitlines()
+    assert lines[1].split() == ["status", "sustained"]
+    assert lines[-1].split(maxsplit=2)[2] == "fit         x < its noise"
+    assert len(lines) <= 25
+    assert max(map(len, lines)) <= 100
+    assert "x &lt; its noise" in found._repr_html_()
+    with pytest.raises(ValueError, match="model must be a SparseModel"):
+        evaluate("x", record())  # type: ignore[arg-type]

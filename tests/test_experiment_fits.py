@@ -1,0 +1,323 @@
+"""Fits of given structures: `+exp=constrained`, `ils`, `weak` and `theories`."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import ep2sindy as ep
+from ep2sindy.app.schema import study_of
+from ep2sindy.data.open import write_field
+from ep2sindy.library.library import polynomial
+from ep2sindy.library.relations import constraint
+from ep2sindy.model.model import SparseModel, model_of
+from ep2sindy.refinement.problem import Iteration
+from ep2sindy.studies.fits import Study, watcher
+from ep2sindy.studies.fitted import Fit, expand
+from ep2sindy.studies.processes import compared_processes
+from ep2sindy.studies.source import Zones
+from ep2sindy.studies.structures import Structure, balance_model
+from tests import programs
+from tests.fields import along_channel
+
+STATES = ["n_i", "n_n"]
+EXACT = {"n_i": {"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, "n_n": {"n_n": 4.39e4, "n_i*n_n": -4.66e-14}}
+
+
+def on_file(name: str, path: Path, output: Path, *inputs: str) -> list[str]:
+    return [f"+exp={name}", *programs.on_file(path, output, *inputs)]
+
+
+def constrained(path: Path, output: Path) -> list[str]:
+    return on_file("constrained", path, output, "R_ion", "u_iz")
+
+
+def ils(path: Path, output: Path) -> list[str]:
+    """Predator and prey alone, for it conserves nothing, at toy size."""
+    return [
+        *on_file("ils", path, output), "~models.law", "n_windows=6", "windows=[60]", "n_draws=2",
+        "forms.weak.test_functions.n_windows=500", "forms.weak.test_functions.n_points=50",
+    ]  # fmt: skip
+
+
+def weak(path: Path, output: Path) -> list[str]:
+    windows = ["fits.boxes.n_points=[10,50]", "fits.boxes.n_windows=[500]"]
+    return [*on_file("weak", path, output), *windows]
+
+
+def weak_windows(output: Path) -> list[str]:
+    windows = ["fits.boxes.n_windows=[100,300]", "fits.boxes.n_points=[10,30]"]
+    few = ["noises=[0.0,0.1]", "n_realizations=2", "parallel=serial"]
+    return ["+exp=weak_windows", *windows, *few, f"output={output}"]
+
+
+def theories(output: Path) -> list[str]:
+    """Two structures at two points of the law, without a recorded balance."""
+    points = ",".join(
+        f"{{V_D_V: {100 * k}, mdot_mg_s: 5, data: {{path: {law_record(output, 1 + 0.1 * k)}}}}}"
+        for k in (0, 1)
+    )
+    exchange = 'exchange: [[n_n, n_i, ["n_i^2*n_n", "n_i*n_n^2"]]]'
+    outflow = 'outflow: {n_i: [n_i, "n_i^2"], n_n: [n_n]}'
+    roles = f"+models.law.roles={{{exchange}, {outflow}, inflow: {{n_n: free}}}}"
+    return [
+        *on_file("theories", output, output), f"points=[{points}]", "~models", roles,
+        "+models.predator_prey.terms={n_i: [n_i, n_i*n_n], n_n: [n_n, n_i*n_n]}",
+        "parameters={V_D_V: null, mdot_mg_s: null}",
+        "~fits.balance", "fits.refined.form=null", "n_windows=10",
+    ]  # fmt: skip
+
+
+@cache
+def law_states(faster: float) -> np.ndarray:
+    """The law of the breathing mode on its cycle, all of it `faster` by a factor."""
+    law = {
+        "n_i": {"n_i^2*n_n": 1.62e-32, "n_i*n_n^2": 3.12e-33, "n_i": -3.64e5, "n_i^2": -8.45e-14},
+        "n_n": {"1": 2.31e23, "n_i^2*n_n": -1.62e-32, "n_i*n_n^2": -3.12e-33, "n_n": -2.76e3},
+    }
+    model = model_of(polynomial(STATES, degree=3), law, units=dict.fromkeys(STATES, "m^-3"))
+    time = 1.5e-6 * np.arange(6000)
+    return model.simulate(faster * time, [5e17, 8e18]).states[-2000:]
+
+
+def law_record(folder: Path, faster: float) -> Path:
+    path = folder / f"law_{faster}.nc"
+    time = 1.5e-6 * np.arange(2000)
+    columns = zip(STATES, law_states(faster).T, strict=True)
+    data = {state: (values, "m^-3") for state, values in columns}
+    write_field(along_channel(time, np.linspace(0.003, 0.027, 5), data), path)
+    return path
+
+
+def check_exact(equations: dict[str, dict[str, float]], rel: float) -> None:
+    for state, terms in EXACT.items():
+        assert equations[state] == pytest.approx(terms, rel=rel)
+
+
+def test_relations_hold_to_the_last_digit(predator_prey: Path, tmp_path: Path) -> None:
+    toy = [*constrained(predator_prey, tmp_path), "~models.ionization", "figures.duration_s=1e-4"]
+    found = programs.computed(programs.composed(*toy))
+    summary = found.summary
+    assert (summary["data"]["n_samples"], summary["data"]["n_held_out"]) == (1200, 300)
+    names = ("predator_prey", "velocity")
+    assert list(summary["fits"]) == [f"{n}_{way}" for n in names for way in ("base", "constrained")]
+    for name, shared in zip(names, ("n_i*n_n", "n_i*n_n*R_ion"), strict=True):
+        base, held = (
+            summary["models"][f"{name}_{w}"]["equations"] for w in ("base", "constrained")
+        )
+        assert held["n_i"][shared] == -held["n_n"][shared]
+        assert base["n_i"][shared] != -base["n_n"][shared]
+        assert summary["fits"][f"{name}_base"]["n_free"] == 4
+        assert summary["fits"][f"{name}_constrained"]["n_free"] == 3
+    # Second-order differences at 1.5 us on a 14 kHz wave: (omega dt)^2 / 6 = 0.3 %, and the
+    # smoothing window flattens peaks by about 1 %.
+    check_exact(summary["models"]["predator_prey_constrained"]["equations"], rel=0.02)
+    assert "relation: n_i: n_i*n_n == -1 * n_n: n_i*n_n" in found.log
+    assert "rollout_velocity_base" in found.report.tables
+    for name in ("trajectories", "trajectories_started"):
+        (ax, *_) = reversed(found.report.figures[name].draw().axes)
+        assert ax.get_xlabel() == "time since start of held-out part (µs)"
+        ends = [np.asarray(line.get_xdata())[[0, -1]] for line in ax.lines]
+        assert np.min(ends) == 0.0
+        assert np.max(ends) <= 100.0
+
+
+def test_refinements_return_predator_and_prey(predator_prey: Path, tmp_path: Path) -> None:
+    found = programs.computed(programs.composed(*ils(predator_prey, tmp_path)))
+    summary, refined = found.summary, ("refined", "refined_constrained")
+    assert list(summary["fits"]) == ["base", "weak", "constrained", *refined]
+    for name, fit in summary["fits"].items():
+        exact = name in refined
+        # A refinement has the error of one Runge-Kutta step alone, (omega dt)^4 / 120 = 3e-6 for a
+        # sine, and the wave has harmonics; the others as above.
+        check_exact(summary["models"][name]["equations"], rel=1e-4 if exact else 0.02)
+        assert fit["refinement"] == ("converged" if exact else None)
+        assert (summary["models"][name]["intervals"] is None) != exact
+        assert bool(fit["r2"]) != exact
+        # Of a Hann window on some four periods: 1 % of a bin at most.
+        for end in ("", "_started"):
+            assert fit[f"f_error{end}"] == pytest.approx(0.0, abs=1e-3 if exact else 0.02)
+            ratios = list(fit[f"amplitude_ratio{end}"].values())
+            assert ratios == pytest.approx([1.0, 1.0], abs=1e-3 if exact else 0.1)
+    held = summary["models"]["refined_constrained"]["equations"]
+    assert held["n_i"]["n_i*n_n"] == -held["n_n"]["n_i*n_n"]
+    swept = summary["loss_against_window"]
+    assert [(row["fit"], row["window"]) for row in swept] == [(name, 60) for name in refined]
+    assert all(row["loss"] < 1e-6 and abs(row["f_error_started"]) < 1e-3 for row in swept)
+    assert list(summary["spread"]) == list(refined)
+    for spread in summary["spread"].values():
+        assert (spread["n_draws"], spread["n_sustained"]) == (2, 2)
+        assert spread["f_error"] == pytest.approx([0.0, 0.0], abs=1e-3)
+        assert 0.0 <= spread["waveform"][0] <= spread["waveform"][1] < 1e-2
+    assert found.page.count("95 % from") == 2  # of the refinements
+    assert "95 % from" not in found.log
+    events = b"".join(p.read_bytes() for p in (found.folder / "tensorboard").glob("events*"))
+    for tag in (b"refined/scaling/n_i/n_i.n_n", b"refined_constrained/loss"):
+        assert tag in events
+    found.check_figures("loss_against_window", "phase", "spectra")
+
+
+def test_every_iteration_is_told_one_scalar_each() -> None:
+    library = polynomial(["x", "y"], degree=2)
+    held = constraint(library, {"x": ["x", "x*y"], "y": ["y", "x*y"]}, ["x: x*y == -1 * y: x*y"])
+    told: list[tuple[int, dict[str, float]]] = []
+    watch = watcher(lambda scalars, *, step: told.append((step, scalars)), "ils", held)
+    for loss in (0.5, 0.25):
+        watch(Iteration(0, 25, loss, np.array([1.0, 2.0, 3.0]), 0.1, 1e-9))
+    assert [step for step, _ in told] == [0, 1, 2]
+    fit = {"ils/loss": 0.25, "ils/step": 0.1, "ils/defect": 1e-9, "ils/window_stage": 25}
+    scalings = {"ils/scaling/x/x": 1.0, "ils/scaling/x/x.y": 2.0, "ils/scaling/y/y": 3.0}
+    assert told[2][1] == fit | scalings
+    assert told[0][1] == dict.fromkeys(scalings, 1.0)
+
+
+def test_weak_forms_find_predator_and_prey(predator_prey: Path, tmp_path: Path) -> None:
+    found = programs.computed(programs.composed(*weak(predator_prey, tmp_path)))
+    summary = found.summary
+    # Differences: as above. Trapezia: (omega dt)^2 / 12 = 0.13 % for a sine, and the wave has
+    # harmonics. Smooth windows: as good as exact.
+    errors = {"differential": 0.02, "n_points_10": 5e-3, "n_points_50": 5e-3, "automatic": 1e-4}
+    assert list(summary["fits"]) == [f"predator_prey_{n}" for n in errors] + ["thesis_differential"]
+    for name, rel in errors.items():
+        check_exact(summary["models"][f"predator_prey_{name}"]["equations"], rel=rel)
+        fit = summary["fits"][f"predator_prey_{name}"]
+        assert fit["f_error"] == pytest.approx(0.0, abs=0.01)
+        assert fit["r2"] == pytest.approx({"n_i": 1.0, "n_n": 1.0}, abs=2e-3)
+    automatic = summary["models"]["predator_prey_automatic"]  # its rows know their noise
+    for state, (low, high) in ((s, automatic["intervals"][s][s]) for s in STATES):
+        assert low < automatic["equations"][state][state] < high
+    assert found.page.count("95 % from") == 1
+    given = summary["models"]["thesis_differential"]["equations"]  # as it was given
+    assert given["n_n"] == {"n_n": 4.93e4, "n_i*n_n": -5.17e-14}
+    assert summary["fits"]["thesis_differential"]["n_free"] == 0
+
+
+def test_the_laws_own_structure_is_sustained_at_both_points(tmp_path: Path) -> None:
+    found = programs.computed(programs.composed(*theories(tmp_path)))
+    over = found.summary["over_points"]
+    assert over["law_refined"]["n_sustained"] == 2
+    assert over["law_refined"]["f_error"] < 1e-4
+    assert over["law_refined"]["amplitude_error"] < 1e-3
+    assert over["predator_prey_refined"]["n_sustained"] == 0
+    fits = found.report.tables["fits"].set_index("fit")
+    assert fits.loc["law_refined, V_D_V=0, mdot_mg_s=5", "status"] == "sustained"
+    faster = found.summary["models"]["law_refined_1"]["equations"]["n_n"]
+    assert faster["1"] == pytest.approx(1.1 * 2.31e23, rel=1e-3)
+    assert faster["n_n"] == pytest.approx(1.1 * -2.76e3, rel=1e-2)
+    assert "sustained at 2 of 2: law_refined" in found.log
+    (ways, _) = found.report.figures["sustained"].draw().axes
+    assert [text.get_text() for text in ways.get_yticklabels()] == ["law", "predator prey"]
+
+
+def test_a_balance_fit_needs_a_simulation(predator_prey: Path, tmp_path: Path) -> None:
+    toy = [*ils(predator_prey, tmp_path), "+fits.balance.form=balance"]
+    with pytest.raises(ValueError, match="coefficients of the balance need processes"):
+        programs.computed(programs.composed(*toy))
+
+
+def made_record() -> tuple[ep.Trajectory, Zones]:
+    """A record whose processes are exactly those of terms."""
+    time = 1.5e-6 * np.arange(2000)
+    states = law_states(1.0)
+    n_i, n_n = states.T
+    rates = {
+        "ionization": 1.7e-32 * n_i**2 * n_n + 5e-14 * n_i * n_n + 1e5 * n_i,
+        "returned": 1e5 * n_i, "exit_i": 3e5 * n_i, "exit_n": 3e3 * n_n,
+        "supply": 2e4 * n_n + 3e3 * n_n,
+    }  # fmt: skip
+    balance = xr.Dataset({k: ("time", v) for k, v in rates.items()}, coords={"time": time})
+    return ep.Trajectory(time, states, STATES), Zones({"": balance})
+
+
+def by_the_balance(roles: ep.Roles) -> tuple[SparseModel, dict[str, float]]:
+    run, zones = made_record()
+    structure = Structure(roles=roles)
+    library = structure.library("s", STATES)
+    held = structure.constraint(library, run, zones, relations=True)
+    return balance_model(library, held, run, zones)
+
+
+def test_the_balance_gives_every_process_its_coefficients() -> None:
+    """Where ions give nothing back, ionization is net; where none leave, the inflow is."""
+    law = ep.Roles(
+        exchange=[("n_n", "n_i", ["n_i^2*n_n", "n_i*n_n"])], outflow={"n_i": ["n_i"]},
+        inflow={"n_n": ["n_n"]},
+    )  # fmt: skip
+    model, fit_r2 = by_the_balance(law)
+    gained = {"n_i^2*n_n": 1.7e-32, "n_i*n_n": 5e-14}
+    assert model.terms("n_i") == pytest.approx(gained | {"n_i": -3e5}, rel=1e-6)
+    lost = {term: -value for term, value in gained.items()}
+    assert model.terms("n_n") == pytest.approx(lost | {"n_n": 2e4}, rel=1e-6)
+    assert set(fit_r2) == {
+        "neutrals that enter, less those that leave", "ions that leave",
+        "neutrals that become ions, less those that walls and anode give back",
+    }  # fmt: skip
+    assert list(fit_r2.values()) == pytest.approx([1.0] * 3)
+
+
+@pytest.mark.parametrize(
+    ("outflow", "inflow", "is_net"),
+    [
+        ({"n_i": ["n_i"], "n_n": ["n_i*n_n"]}, ["n_n"], False),  # what leaves stands apart
+        ({"n_i": ["n_i"]}, 2e23, False),  # what enters was told
+        ({"n_i": ["n_i"]}, ["n_n"], True),
+    ],
+)
+def test_what_enters_is_net_where_nothing_leaves(outflow, inflow, is_net: bool) -> None:
+    run, zones = made_record()
+    exchange = [("n_n", "n_i", ["n_i^2*n_n"])]
+    roles = ep.Roles(exchange=exchange, outflow=outflow, inflow={"n_n": inflow})
+    structure = Structure(roles=roles)
+    library = structure.library("s", STATES)
+    held = structure.constraint(library, run, zones, relations=True)
+    empty = model_of(library, {state: {} for state in STATES}, units=run.units)
+    (entering,) = [p for p in compared_processes(empty, held, run, zones) if not p.ends[0]]
+    balance = zones.balances[""]
+    left = balance["exit_n"].values if is_net else 0.0
+    np.testing.assert_array_equal(entering.recorded, balance["supply"].values - left)
+
+
+BOXES = ep.Weak(test_functions=ep.Boxes(n_windows=7), errors_in_variables=False)
+
+
+def test_fits_are_named_by_what_varies() -> None:
+    fits = {
+        "plain": Fit(),
+        "lengths": Fit(form="boxes", n_points=[5, 9]),
+        "both": Fit(form="boxes", n_points=[5], n_windows=[7, 8]),
+    }
+    ways = {way.name: way for way in expand(fits, {"boxes": BOXES}, ep.Differential())}
+    assert list(ways) == [
+        "plain", "n_points_5", "n_points_9", "n_windows_7_n_points_5", "n_windows_8_n_points_5",
+    ]  # fmt: skip
+    assert ways["n_windows_8_n_points_5"].form.test_functions == ep.Boxes(n_windows=8, n_points=5)
+    assert [way.of for way in ways.values()] == ["plain", *["lengths"] * 2, *["both"] * 2]
+
+
+@pytest.mark.parametrize(
+    ("fit", "message"),
+    [
+        (Fit(form="boxs"), r"fits.a.form must be null, balance or one of \['boxes'\]: got 'boxs'"),
+        (Fit(n_points=[5]), r"fits.a.n_points is for a form of random windows \(Weak with Boxes\)"),
+        (Fit(form="balance", n_points=[5]), "is for a form of random windows .*: got None"),
+    ],
+)
+def test_a_fit_that_cannot_be_made_is_refused(fit: Fit, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        expand({"a": fit}, {"boxes": BOXES}, ep.Differential())
+
+
+def test_a_structure_is_of_one_kind() -> None:
+    for given in ({}, {"terms": {"x": ["x"]}, "coefficients": {"x": {"x": 1.0}}}):
+        with pytest.raises(ValueError, match="by terms, by roles or by coefficients, one of them"):
+            Structure(**given)
+
+
+def test_the_constant_may_come_as_a_number(tmp_path: Path) -> None:
+    """As Hydra reads it from a command line."""
+    changed = "models.velocity.terms.n_n=[1,n_i*n_n*R_ion]"
+    config = programs.composed(*constrained(tmp_path / "none.nc", tmp_path), changed)
+    study = study_of(Study, config)
+    assert "1" in study._libraries["velocity"].names
