@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import pandas as pd
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
@@ -15,6 +17,7 @@ from ep2sindy.figures.style import (
     WIDTH,
     legend_above,
     make_panels,
+    name_label,
 )
 
 # Status -> marker, the best first; any other run has no cycle.
@@ -23,10 +26,11 @@ OTHER = "decays, diverges or turns negative"
 NORM = LogNorm(0.01, 1.0)  # of the amplitude's error
 
 
-def sustained_figure(rows: pd.DataFrame) -> Figure:
+def sustained_figure(rows: pd.DataFrame, *, labels: Mapping[str, str]) -> Figure:
     """A panel per way of fitting, a row per structure, a column per operating point.
 
     rows: structure, way, point, status, amplitude_error (relative, NaN for a run without one).
+    labels: of the parameters of points.
     """
     ways, points = (list(rows[key].unique()) for key in ("way", "point"))
     structures = list(rows["structure"].unique())
@@ -48,11 +52,13 @@ def sustained_figure(rows: pd.DataFrame) -> Figure:
             color=GREY, ms=6,
         )  # fmt: skip
         ax.set_title(way, fontsize=TITLE)
-        ax.set_xticks(range(len(points)), [_short(point) for point in points], fontsize=SMALL)
+        ax.set_xticks(
+            range(len(points)), ["\n".join(_split(point, 2)) for point in points], fontsize=SMALL
+        )
         ax.set_yticks(range(len(structures)), [name.replace("_", " ") for name in structures])
         ax.set_xlim(-0.5, len(points) - 0.5)
         ax.set_ylim(len(structures) - 0.5, -0.5)
-        ax.set_xlabel(", ".join(part.partition("=")[0] for part in points[0].split(", ")))
+        ax.set_xlabel("\n".join(name_label(name, labels) for name in _split(points[0], 0)))
     colours = figure.colorbar(marks, ax=list(axes), label="error of the amplitude", extend="max")
     colours.ax.set_yticks([0.01, 0.1, 1.0], ["1 %", "10 %", "100 %"])
     signs = {**{marker: status for status, marker in MARKERS.items()}, "x": OTHER}
@@ -63,6 +69,6 @@ def sustained_figure(rows: pd.DataFrame) -> Figure:
     return figure
 
 
-def _short(point: str) -> str:
-    """`V_D_V=300, mdot_mg_s=5` -> its values, one below the other."""
-    return "\n".join(part.partition("=")[2] for part in point.split(", "))
+def _split(point: str, part: int) -> list[str]:
+    """The names (part 0) or values (part 2) of a point's label, `V_D_V=300, mdot_mg_s=5`."""
+    return [each.partition("=")[part] for each in point.split(", ")]

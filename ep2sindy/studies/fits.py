@@ -100,7 +100,7 @@ class Study:
     n_windows, periods, window, n_reweights: of refinements, see `ep.RefinementSettings`. windows:
     lengths for loss against window length. n_draws: number of draws of windows, for the spread of
     the refinements. points: operating points, at each of which all is fitted; None for one record.
-    parameters: their places in the data group.
+    parameters: their places in the data group; labels: their names in figures.
     """
 
     source: Source
@@ -119,6 +119,7 @@ class Study:
     n_draws: ZeroOrMore = 0
     points: Points | None = None
     parameters: Mapping[str, str | None] = field(default_factory=dict)
+    labels: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _ = self._ways, self._libraries
@@ -140,7 +141,7 @@ class Study:
     def run(self, report: Report) -> None:
         if self.points is not None:
             at_points = {r.data.label: self._fit_all(r, report) for r in self._records(report)}
-            add_points(at_points, report)
+            add_points(at_points, self.labels, report)
             return
         field, data = self.source.opened(self._libraries.values(), report)
         record = self._parted(data, zones_of(self.source, field, report))
@@ -271,14 +272,16 @@ class Study:
         if any(each.model.covariance is not None for each in fits.values()):
             report.add(Text(INTERVALS, page_only=True))
         for name, each in fits.items():
-            report.section(name, *equations(each.model, clock), level=3)
+            held_to = each.first.held_to
+            report.section(name, *equations(each.model, clock, held=held_to), level=3)
             report.add(*interval_table(each.model, clock, page_only=True))
-            report.model(name, each.model, shown=False)
+            report.model(name, each.model, held=held_to, shown=False)
         best = best_run(runs)
         report.found(
             found_model(
                 f"Found by the fit {best}", runs[best], file=best, picture="trajectories",
                 more=[Text(f"the best of {len(fits)} fits")], where=where, seen=not self.held_out,
+                held=fits[best].first.held_to,
             )
         )  # fmt: skip
 

@@ -25,13 +25,13 @@ from ep2sindy.studies.fitted import (
 from ep2sindy.studies.views import largest
 
 NOTE = (
-    "Frequency, amplitude and waveform: the largest errors over the points that have a cycle. "
-    "Signs wrong: terms whose sign contradicts the recorded balance of the same process, and at "
-    "how many points."
+    "Frequency, amplitude and waveform: the largest errors over the points, the first and the last "
+    "where the model has a cycle. Signs wrong: terms whose sign contradicts the recorded balance "
+    "of the same process, and at how many points."
 )
 CAPTION = (
-    "What becomes of every model, run freely from one sample at every operating point. The colour "
-    "is the error of the amplitude, of the state that is farthest off."
+    "What becomes of every model, run freely from one sample at every operating point, by the way "
+    "its coefficients were found. Colour: error of the amplitude of the state that is farthest off."
 )
 
 
@@ -85,9 +85,12 @@ AT_POINTS: Metrics[AtPoints] = [
 ]  # fmt: skip
 
 
-def add_points(found: Mapping[str, Mapping[str, Fitted]], report: Report) -> None:
-    """Every fit over all points, and the models of each point. found: by point, then by fit.
+def add_points(
+    found: Mapping[str, Mapping[str, Fitted]], labels: Mapping[str, str], report: Report
+) -> None:
+    """Every fit over all points, and the models of each point.
 
+    found: by point, then by fit. labels: of parameters, for the figure.
     Raises ValueError if no point has a record.
     """
     if not found:
@@ -96,7 +99,8 @@ def add_points(found: Mapping[str, Mapping[str, Fitted]], report: Report) -> Non
     over = {name: AtPoints([fits[name] for fits in found.values()]) for name in names}
     sources = {fits[0].name: fits[0].structure.source for fits in (e.fits for e in over.values())}
     report.section(f"{len(names)} fits at {len(found)} operating points")
-    report.figure("sustained", partial(sustained_figure, _rows(found)), CAPTION)
+    draw = partial(sustained_figure, _rows(found), labels=labels)
+    report.figure("sustained", draw, CAPTION)
     report.table("over_points", ResultTable(over, AT_POINTS), heading="fit", note=NOTE)
     report.section("Structures", *(f"{key}: {text}" for key, text in sources.items() if text))
     rows = {f"{n}, {p}": fit for n in names for p, fit in zip(found, over[n].fits, strict=True)}
@@ -105,18 +109,20 @@ def add_points(found: Mapping[str, Mapping[str, Fitted]], report: Report) -> Non
     for number, (point, fits) in enumerate(found.items()):
         report.section(point, level=3)
         for name, fit in fits.items():
-            report.add(*equations(fit.model, lead=name, on_screen=False))
-            report.model(f"{name}_{number}", fit.model, shown=False)
+            held_to = fit.first.held_to
+            report.add(*equations(fit.model, held=held_to, lead=name, on_screen=False))
+            report.model(f"{name}_{number}", fit.model, held=held_to, shown=False)
     counts = {name: n_sustained(each.runs) for name, each in over.items()}
     lines = [
         Text(f"sustained at {n} of {len(found)}: {', '.join(names)}")
         for n in range(len(found), 0, -1)
         if (names := [name for name, count in counts.items() if count == n])
     ]
-    n_all = list(counts.values()).count(len(found))
+    structures = {over[name].fits[0].name for name, n in counts.items() if n == len(found)}
     report.found(
         Result(
-            f"Found: {n_all} of {len(over)} fits are sustained at all {len(found)} points",
+            f"Found: {len(structures)} of {len(sources)} structures are sustained at all "
+            f"{len(found)} points",
             lines or [Text("none is sustained at any point")],
             load='pandas.read_csv("{}/tables/over_points.csv")',
             picture="sustained",
