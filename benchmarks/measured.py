@@ -33,7 +33,7 @@ from ep2sindy.signals.spectrum import crossing_frequency
 FOLDER = Path(os.environ.get("EP2SINDY_DATA", "."))
 N_DRAWS, N_MOVED, N_SIMULATED = 10, 20, 3
 DRIFT_A, GAP, N_LONG, PROCESS = 0.4, 0.05, 1_000_000, 0.05
-SHOWN = ("status", "f_error", "amplitude_ratio", "waveform_error", "n_terms_searched")
+SHOWN = ("status", "f_error", "amplitude_ratio", "waveform_error")
 N_CYCLES = 2
 POINTS = ((300.0, 5.0), (300.0, 4.0), (300.0, 6.0), (400.0, 5.0))  # V and mg/s
 NOISE = 0.02  # of the simulator's current, as a share of its mean
@@ -81,14 +81,14 @@ def show(name: str, found: Traced | str, horizons: dict[str, float]) -> None:
     if isinstance(found, str):
         print(f"  refused: {found}")
         return
-    living, forecast = found.summary["living"], found.summary["forecast"]
-    number = found.summary["signal"]["n_states"]
-    print(f"  {number} states, {living['n_terms_searched']} terms: {living['status']}")
-    for state, terms in found.summary["model"]["equations"].items():
+    run, signal = found.summary["evaluations"]["trace"], found.summary["signal"]
+    n_terms = found.summary["headline"]["n_terms"]
+    print(f"  {signal['n_states']} states, {n_terms:g} terms: {run['status']}")
+    for state, terms in found.summary["models"]["trace"]["equations"].items():
         print(f"    {state}' = " + " ".join(f"{c:+.3g} {term}" for term, c in terms.items()))
     for words, horizon in horizons.items():
         print(f"  {words} ahead: {found.at(horizon)}")
-    if forecast:
+    if forecast := found.summary.get("forecasts", {}).get("trace"):
         print(f"  bands of 90 % hold {100 * forecast['coverage_90']:.0f} %", flush=True)
 
 
@@ -130,8 +130,12 @@ def pendulum() -> None:
     held_out = f"held_out={1.0 - 3.6 / 5.5}"
     for words, more in {
         "as it comes": [],
-        "dry friction, its width fitted": ["functions=['sign(?*v)']", "degree=1", "n_states=2"],
-        "dry friction, its width given": ["functions=['sign(200*v)']", "degree=1", "n_states=2"],
+        "dry friction, its width fitted": [
+            "tried=[{how: auto, degree: 1, functions: ['sign(?*v)']}]"
+        ],
+        "dry friction, its width given": [
+            "tried=[{how: auto, degree: 1, functions: ['sign(200*v)']}]"
+        ],
     }.items():
         found = trace(run.t, run.states[:, 0], held_out, *more)
         show(f"pendulum, {words}", found, {"0.1 s": 0.1, "0.4 s": 0.4})
@@ -175,7 +179,7 @@ def current() -> None:
         rows = []
         for seed in range(N_SIMULATED):
             found = trace(*spoil(np.random.default_rng(seed)), "unit=A", f"seed={seed}")
-            rows.append(found if isinstance(found, str) else found.summary["living"])
+            rows.append(found if isinstance(found, str) else found.summary["evaluations"]["trace"])
         lives = sum(isinstance(row, dict) and row["status"] == "sustained" for row in rows)
         print(f"\ncurrent, {words}: {lives} of {len(rows)} live")
         for row in rows:

@@ -123,7 +123,7 @@ def test_a_config_excludes_terms(tmp_path) -> None:
     texts = front.loc[front["equation"] == "x", "text"].str.removeprefix("x' = ")[1:]
     terms = {part.lstrip("-0123456789.e ") for text in texts for part in re.split(" [+-] ", text)}
     assert terms == {"x", "y", "x y", "y^2"}
-    with pytest.raises(ValueError, match="exclude.x must be a list: 'x' came"):
+    with pytest.raises(ValueError, match="exclude.x must be a list: got 'x'"):
         programs.computed(programs.composed(*given, "exclude={x: x}"))
     with pytest.raises(ValueError, match="exclude goes without living, .* take .exp=discover"):
         programs.computed(programs.composed("+exp=breathing", "+exclude={n_i: [n_i]}"))

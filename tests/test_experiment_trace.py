@@ -191,13 +191,13 @@ def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_p
     trace = computed(composed(*toy(record, tmp_path)))
     found = trace.summary
     assert found["signal"]["how"] == "hidden"
-    assert found["states"]["2"]["unexplained"] is None
-    assert not found["misfit"]
-    assert found["model"]["equations"]["I"] == pytest.approx({"I*g": 1.0})
-    assert found["model"]["equations"]["g"] == pytest.approx(CYCLE, rel=0.02)
-    for term, (low, high) in found["model"]["intervals"]["g"].items():
+    model = found["models"]["trace"]
+    assert not found["signal"]["misfit"]
+    assert model["equations"]["I"] == pytest.approx({"I*g": 1.0})
+    assert model["equations"]["g"] == pytest.approx(CYCLE, rel=0.02)
+    for term, (low, high) in model["intervals"]["g"].items():
         assert low < CYCLE[term] < high
-    assert found["living"]["status"] == "sustained"
+    assert found["evaluations"]["trace"]["status"] == "sustained"
     assert "explain the signal to its noise" in " ".join(trace.log.split())
     assert "smoothing" not in trace.log
 
@@ -211,8 +211,8 @@ def test_a_mean_that_was_lost_is_fitted_with_its_interval(tmp_path: Path) -> Non
     value, low, high = map(float, re.findall(r"-?\d+\.?\d*(?= A|(?: to)|\))", words))
     assert low < x.mean() < high
     assert value == pytest.approx(x.mean(), rel=0.05)
-    assert found["model"]["equations"]["I"] == pytest.approx({"I*g": 1.0})
-    assert found["living"]["status"].startswith(("sustained", "no cycle"))  # over three periods
+    assert found["models"]["trace"]["equations"]["I"] == pytest.approx({"I*g": 1.0})
+    assert found["signal"]["how"] == "hidden"
 
 
 def test_an_offset_that_no_equations_tell_is_refused(tmp_path: Path) -> None:

@@ -202,7 +202,7 @@ def test_points_of_a_thruster_are_proposed_to_both_studies_of_points(
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ([], "points of files need data that are read from files: .*simulate came .* data=recogni"),
+        ([], "points of files need data .* files: got .*simulate with .* data=recog"),
         (["data=recognised"], r"thesis must give \['a'\] and quantities at every point, or be"),
     ],
 )

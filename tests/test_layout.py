@@ -185,7 +185,7 @@ def test_files_and_functions_stay_short() -> None:
 
 
 def test_a_class_name_stands_once() -> None:
-    """But for the two that every study has."""
+    """But for the one that every experiment has."""
     names = Counter(
         node.name
         for path in PATHS.values()
@@ -193,7 +193,7 @@ def test_a_class_name_stands_once() -> None:
         if isinstance(node, ast.ClassDef)
     )
     twice = {name for name, count in names.items() if count > 1}
-    assert twice == {"Study", "Outcome"}
+    assert twice == {"Study"}
 
 
 def test_the_drawing_of_the_house_is_what_the_imports_say() -> None:

@@ -245,7 +245,7 @@ class Regression:
         if task.hidden:
             raise ValueError(
                 f"a regression needs samples of every state: {list(task.hidden)} came as hidden; "
-                "take TrajectorySearch(), or make states of a signal by ep.signals.embed"
+                "take TrajectorySearch(), or make states of a signal by ep.embed"
             )
         if any(run.missing is not None for run in task.runs):
             task = replace(task, runs=[run.complete() for run in task.runs])

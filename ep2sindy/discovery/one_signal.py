@@ -44,6 +44,8 @@ DEPTH_OF_BOTH = 2
 
 MAX_FITTED = 3000  # samples from the end of the fitted part that a search for hidden states sees
 
+EXPLAINED = "their equations explain the signal to its noise"
+
 MIN_FITTED = 4.0  # periods that a fitted part must have
 MIN_JUDGED = 1.5  # periods that a held-out part must have
 
@@ -72,29 +74,21 @@ class Preparation:
         self, past: Trace, method: AnyMethod, *, seed: int, progress: Progress, once: Once
     ) -> tuple[Embedded, Discovery]:
         """The states, and their equations. method: of smoothed states."""
+        make = partial(embed, past, n_states=self.n_states, harmonics=self.harmonics)
         with progress.stage(None, "", f"{self.n_states} states of the signal"):
-            states = embed(past, self.how, n_states=self.n_states, harmonics=self.harmonics)
+            states = make(self.how)
         run, functions = states.run, self.functions
         if any(FITTED in text for text in functions):
-            smoothed = states
-            if states.hidden:
-                smoothed = embed(past, n_states=self.n_states, harmonics=self.harmonics)
+            smoothed = make() if states.hidden else states
             off = partial(self._misfit, smoothed, method)
             functions = fit_functions(functions, smoothed.run, off)
         if states.hidden:
             run, method = end_of(run), by_trajectories(method)
         elif not states.known:
             method = replace(method, depth=min(method.depth, DEPTH_OF_BOTH))
-        search = partial(
-            discover,
-            run,
-            states.library(self.degree, functions, self.function_degree),
-            method,
-            hidden=states.hidden,
-            seed=seed,
-            progress=progress,
-        )
-        return states, once(search)
+        library = states.library(self.degree, functions, self.function_degree)
+        search = partial(discover, run, library, method, hidden=states.hidden, seed=seed)
+        return states, once(partial(search, progress=progress))
 
     def _misfit(self, states: Embedded, method: AnyMethod, functions: Sequence[str]) -> float:
         """Share of the derivatives that the largest candidates leave, the product over equations.
@@ -140,19 +134,13 @@ class Attempt:
                 run = estimate_states(found.model, run)
             else:
                 share = unexplained(states)
-            estimator = tune_estimator(
-                found.model, complete_states(past, run), measured=[past.name]
-            )
+            samples = complete_states(past, run)
+            estimator = tune_estimator(found.model, samples, measured=[past.name])
             skill = forecast_skill(
-                found.model,
-                past.run,
-                n_fitted=len(past.t) // 2,
-                starts=N_TRIED,
-                horizon_s=past.period_s,
-                states_of=states.along,
-                n_draws=N_DRAWS_TRIED,
+                found.model, past.run, n_fitted=len(past.t) // 2, starts=N_TRIED,
+                horizon_s=past.period_s, states_of=states.along, n_draws=N_DRAWS_TRIED,
                 estimator=estimator,
-            )
+            )  # fmt: skip
         error = float(skill.nrmse[MODEL].mean())
         return Attempt(preparation, states, found, run, estimator, error, share)
 
@@ -185,16 +173,17 @@ def try_in_turn(
     """
     if past.cycle is not None and past.cycle.share >= REPEATS:
         tried = [each for each in tried if each.n_states == 2] or tried
-    attempts, last = [], None
+    attempts, left_out = [], []
     for each in tried:
         states, found = each.search(past, method, seed=seed, progress=progress, once=once)
         if not states.hidden:
             attempts.append(Attempt.of(each, states, found, progress))
         elif explains(found, past.name):
+            states = replace(states, reason=EXPLAINED)
             return [Attempt.of(each, states, found, progress)]
         else:
-            last = each, states, found
-    return attempts or [Attempt.of(*last, progress)]
+            left_out.append((each, states, found))
+    return attempts or [Attempt.of(*left_out[-1], progress)]
 
 
 def best_of(attempts: Sequence[Attempt]) -> Attempt:
@@ -346,13 +335,11 @@ def fit_functions(
     whose numbers can be used.
     """
     known = [text for text in functions if FITTED not in text]
-    for text in functions:
-        if FITTED not in text:
-            continue
-        unit = _unit(text, run)
+    for text in (each for each in functions if FITTED in each):
+        fill_in = partial(_fill_in, text, unit=_unit(text, run))
 
-        def off(log_size: float, text: str = text, unit: float = unit) -> float:
-            return misfit([*known, _fill_in(text, np.exp(log_size), unit)])
+        def off(log_size: float, fill_in: Callable[[float], str] = fill_in) -> float:
+            return misfit([*known, fill_in(np.exp(log_size))])
 
         tried = np.array([off(log_size) for log_size in np.log(SIZES)])
         if not np.isfinite(tried).any():
@@ -361,7 +348,7 @@ def fit_functions(
                 "argument leaves the domain; write the number yourself, or another function"
             )
         log_size = least_beside_grid(off, np.log(SIZES), tried, tolerance=TOLERANCE)
-        known.append(_fill_in(text, np.exp(log_size), unit))
+        known.append(fill_in(np.exp(log_size)))
     return known
 
 

@@ -102,7 +102,7 @@ class Section:
 class Result:
     """What a run has found, in a few lines: the end of its screen, and the beginning of its page.
 
-    title: what was found, with the verdict on it. blocks: the model, law or map in short, and the
+    title: what was found, and how it does. blocks: the model, law or map in short, and the
     figures that say how good it is. load: Python expression that loads it, with `{}` for the run's
     folder. picture: name of the figure that shows it; empty if none does.
     """

@@ -188,7 +188,8 @@ class Embedded:
 
     def along(self, run: Trajectory) -> Trajectory:
         """The states along other samples of the signal, which are the first column of a run."""
-        return self.embedding.embed(self.signal.with_samples(run.t, run.states[:, 0])).run
+        own = replace(self.signal.run, t=run.t, states=run.states[:, :1], inputs=run.inputs[:, :0])
+        return self.embedding.embed(replace(self.signal, run=own)).run
 
 
 def embed(

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -11,8 +10,7 @@ from jaxtyping import Float
 from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.runtime.values import read_only
+from ep2sindy.library.units import Clock
 from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
 from ep2sindy.signals.spectrum import (
     crossing_frequency,
@@ -58,26 +56,38 @@ NOISE_BELOW, SHARE_BELOW = 6.0, 0.05
 class Trace:
     """An oscillating signal of at least six periods.
 
-    x: (samples,) in `unit`. frequency_Hz: of its cycle, or the mean rate at which it rises through
-    its mean. cycle: None for a signal that oscillates without repeating itself, such as chaos.
-    done: processing already applied to the samples, in words. advice: processing that is
-    recommended. parameters: the operating point.
+    run: the signal as a run of one state. frequency_Hz: of its cycle, or the mean rate at which it
+    rises through its mean. cycle: None for a signal that oscillates without repeating itself, such
+    as chaos. done: processing already applied to the samples, in words. advice: processing that is
+    recommended.
     """
 
-    t: Float[np.ndarray, " samples"]
-    x: Float[np.ndarray, " samples"]
-    name: str
-    unit: str
+    run: Trajectory
     frequency_Hz: float
     cycle: Cycle | None = None
     done: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
-    clock: Clock = SECONDS
-    parameters: Mapping[str, float] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "t", read_only(self.t))
-        object.__setattr__(self, "x", read_only(self.x))
+    @property
+    def t(self) -> Float[np.ndarray, " samples"]:
+        return self.run.t
+
+    @property
+    def x(self) -> Float[np.ndarray, " samples"]:
+        """The samples, in `unit`."""
+        return self.run.states[:, 0]
+
+    @property
+    def name(self) -> str:
+        return self.run.state_names[0]
+
+    @property
+    def unit(self) -> str:
+        return self.run.units[self.name]
+
+    @property
+    def clock(self) -> Clock:
+        return self.run.clock
 
     @property
     def period_s(self) -> float:
@@ -85,13 +95,7 @@ class Trace:
 
     def window(self, start: int, stop: int) -> Trace:
         """Samples from `start` to `stop` (exclusive), with the frequency of the whole."""
-        return self.with_samples(self.t[start:stop], self.x[start:stop])
-
-    def with_samples(
-        self, t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
-    ) -> Trace:
-        """Other samples of the same signal."""
-        return replace(self, t=t, x=x, done=(), advice=())
+        return replace(self, run=self.run.window(start, stop), done=(), advice=())
 
     @property
     def n_periods(self) -> float:
@@ -105,19 +109,6 @@ class Trace:
     @property
     def is_positive(self) -> bool:
         return is_positive(self.t, self.x)
-
-    @property
-    def run(self) -> Trajectory:
-        """The signal as a run of one state."""
-        return Trajectory(
-            t=self.t,
-            states=self.x[:, None],
-            state_names=(self.name,),
-            units={self.name: self.unit},
-            label=self.name,
-            clock=self.clock,
-            parameters=self.parameters,
-        )
 
 
 def prepare_signal(
@@ -155,18 +146,17 @@ def prepare_signal(
     if cycle is not None and cycle.std[0] < MIN_VISIBLE * x.std():
         cycle = None
     frequency_Hz = crossing_frequency(t, x) if cycle is None else cycle.frequency_Hz
-    found = Trace(
-        t,
-        x,
-        name,
-        run.units[name],
-        frequency_Hz,
-        cycle,
-        done=(*evened, *straightened, *averaged),
-        advice=drifting,
+    own = Trajectory(
+        t=t,
+        states=x[:, None],
+        state_names=(name,),
+        units={name: run.units[name]},
+        label=name,
         clock=run.clock,
         parameters=run.parameters,
     )
+    done = (*evened, *straightened, *averaged)
+    found = Trace(own, frequency_Hz, cycle, done, drifting)
     _check_oscillation(found)
     return found
 

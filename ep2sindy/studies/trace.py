@@ -49,6 +49,10 @@ NOT_EXPLAINED = (
     "states are made by smoothing"
 )
 
+ERRORS = (
+    "Forecasts: up to a period, where the model was fitted, in standard deviations. Unexplained: "
+    "share of the next derivative that neighbours in these states leave."
+)
 PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
 
 
@@ -116,7 +120,8 @@ class Study:
         if skill is not None:
             add_forecasts(report, NAME, signal.run, skill)
         _add_signal(report, signal, states, attempts, best)
-        add_candidates(report, NAME, best.found)
+        fronts = {state: best.found.fronts[state] for state in best.searched}
+        add_candidates(report, NAME, replace(best.found, fronts=fronts))
         if best.found.estimate is not None:
             add_estimate(report, signal.name, best.found)
 
@@ -169,7 +174,8 @@ def lost_mean(signal: Trace) -> str | None:
 def _add_model(report: Report, signal: Trace, best: Attempt, free: Evaluation, where: str) -> None:
     """Add the model, and how it runs over the samples that were not fitted."""
     model = best.found.model
-    report.section("The model", *([best.found.note] if best.found.note else []))
+    note = best.found.note
+    report.section("The model", *([note] if note != best.found.misfit else []))
     report.model(NAME, model, clock=signal.clock)
     draw = partial(free_run_figure, free.record, free.rollout, period_s=signal.period_s)
     report.figure(f"free_run_{NAME}", draw, CAPTIONS["free_run"])
@@ -194,6 +200,7 @@ def _add_signal(
     turns = "periods" if signal.cycle is not None else "turns, which do not repeat themselves,"
     too_fast = "" if embedding.how == "hidden" else ", and what is too fast to be followed"
     share = 100.0 * best.noise_std / signal.x.std()
+    noise = f"{best.noise_std:.3g} {signal.unit}".removesuffix(" 1")
     exact = ", ".join(f"{state}' = {term.replace('*', ' ')}" for state, term in known.items())
     report.section(
         f"The signal {signal.name}",
@@ -201,12 +208,12 @@ def _add_signal(
         f"{per_period:.0f} samples",
         f"states: {embedding.says}, {', '.join(states.state_names)} ({best.states.reason})"
         f"{'; known: ' if exact else ''}{exact}",
-        f"noise{too_fast}: {best.noise_std:.3g} {signal.unit}, {share:.2g} % of the standard "
-        "deviation",
+        f"noise{too_fast}: {noise}, {share:.2g} % of the standard deviation",
         *signal.done,
     )
     chosen = [attempts.index(best)]
-    report.table("tried", ResultTable(attempts, TRIED), title="states tried", bold=chosen)
+    title, rows = "states tried", ResultTable(attempts, TRIED)
+    report.table("tried", rows, title=title, note=ERRORS, bold=chosen)
     samples = dict(zip(states.state_names, states.states.T, strict=True))
     report.samples("states", pd.DataFrame({"t_s": states.t, **samples}))
     report.summary["data"] = data_summary(states)
@@ -231,12 +238,6 @@ TRIED: Metrics[Attempt] = [
     Metric("states", lambda tried: tried.states.embedding.says, View.SCREEN),
     Metric("n_states", lambda tried: tried.preparation.n_states),
     Metric("degree", lambda tried: tried.preparation.degree, View.SHOWN),
-    Metric(
-        "error", lambda tried: tried.error, View.SHOWN,
-        "error of forecasts up to a period, where fitted (standard deviations)", "{:.3f}",
-    ),
-    Metric(
-        "unexplained", lambda tried: tried.share, View.SHOWN,
-        "of the next derivative, neighbours leave", percent(2),
-    ),
-]  # fmt: skip
+    Metric("error", lambda tried: tried.error, View.SHOWN, "error of forecasts", "{:.3f}"),
+    Metric("unexplained", lambda tried: tried.share, View.SHOWN, format=percent(2)),
+]
