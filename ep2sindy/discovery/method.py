@@ -76,7 +76,7 @@ class TrajectorySearch:
     def __post_init__(self) -> None:
         set_counts(self, {"depth": 1, "max_terms": 1})
         check_limit_s(self.limit_s)
-        check_kind("selection", self.selection, Selection, "ep.Evidence()")
+        check_kind("selection", self.selection, Selection, "ep.discovery.Evidence()")
         if self.selection.basis == "rows":
             raise ValueError(
                 "a search of trajectories weighs models by their likelihood: selection must "
@@ -245,7 +245,7 @@ class Regression:
         if task.hidden:
             raise ValueError(
                 f"a regression needs samples of every state: {list(task.hidden)} came as hidden; "
-                "take TrajectorySearch(), or make states of a signal by ep.signals.embed"
+                "take TrajectorySearch(), or make states of a signal by ep.embed"
             )
         if any(run.missing is not None for run in task.runs):
             task = replace(task, runs=[run.complete() for run in task.runs])

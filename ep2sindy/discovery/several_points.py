@@ -55,7 +55,7 @@ class PointsTask:
         if self.asked.hidden:
             raise ValueError(
                 f"equations of several points need samples of every state: {self.asked.hidden} "
-                "came as hidden; make the same states of every run by ep.signals.embed"
+                "came as hidden; make the same states of every run by ep.embed"
             )
         check_shared(self.regression)
 

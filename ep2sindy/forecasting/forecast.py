@@ -153,7 +153,7 @@ def forecast(
     States of the model that it lacks are told from the others (`estimate_states`).
     horizon: duration in s, in steps of the history; or the times (samples,) themselves, in s.
     fitted_to: the record that the model was fitted to; None takes the history. measured: states
-    that were measured; others that the history has were made from them (`ep.signals.embed`), and
+    that were measured; others that the history has were made from them (`ep.embed`), and
     only start the fit.
     inputs: of a driven model over the horizon, as for `simulate`.
     Raises ValueError for a history without any state or some input of the model, or a horizon that

@@ -157,7 +157,7 @@ def forecast_skill(
     and also serve the baselines. starts: number of starts, evenly spread over the rest. horizon_s:
     the longest horizon; None takes four periods, or what half of the rest allows. measured: as for
     `forecast`. states_of: makes the states of a past whose first columns are the measured ones
-    (`ep.signals.embed`). estimator: calibrated on the fitted part. n_draws: of every forecast.
+    (`ep.embed`). estimator: calibrated on the fitted part. n_draws: of every forecast.
     Raises ValueError for a driven model, or a part that is too short.
     """
     record, watch = trajectory_of(run), as_progress(progress)
