@@ -58,7 +58,7 @@ def test_the_truth_is_found_refined_and_handed_on(found):
         assert low < chosen.coef[0] < high
     assert found.note.startswith("sustained, ")
     assert found.note in repr(found)
-    assert ep.evaluate(found.model, record()).status is ep.Status.SUSTAINED
+    assert ep.evaluate(found.model, record()).status is ep.model.Status.SUSTAINED
 
 
 def test_noise_is_no_obstacle():
@@ -66,7 +66,7 @@ def test_noise_is_no_obstacle():
     noisy = ep.discover(run, LIBRARY, recipe(formulation=ep.WeightedWeak()))
     judged = ep.evaluate(noisy.model, record())
     # On the data's cycle; from one sample its phase may be off by more than a first period allows.
-    assert judged.status in (ep.Status.SUSTAINED, ep.Status.WRONG_FREQUENCY)
+    assert judged.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
     assert abs(judged.f_error) < 0.01
     # It lives, and yet it is not the truth: it leaves more than noise, and has no intervals.
     assert noisy.misfit
@@ -87,9 +87,9 @@ def test_a_state_that_was_not_measured_need_not_keep_its_waveform(found):
     # What the model cannot follow, in the second state alone: ten times faster.
     wiggle = 0.4 * run.states[:, 1].std() * np.sin(10 * 2 * np.pi * run.t / 71.3e-6)
     spoilt = ep.Trajectory(run.t, run.states + np.outer(wiggle, [0, 1]), run.state_names)
-    assert ep.evaluate(found.model, spoilt).status is ep.Status.WRONG_CYCLE
+    assert ep.evaluate(found.model, spoilt).status is ep.model.Status.WRONG_CYCLE
     judged = ep.evaluate(found.model, spoilt, judged=["n_i"])
-    assert judged.status in (ep.Status.SUSTAINED, ep.Status.WRONG_FREQUENCY)
+    assert judged.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
     assert judged.waveform_error["n_n"] > 0.2
     with pytest.raises(ValueError, match=r"judged must name some of the states .*: \['T'\] came"):
         ep.evaluate(found.model, run, judged=["T"])
@@ -185,7 +185,7 @@ SHARED = "x: x*y == -1 * y: x*y"
 
 
 @pytest.mark.parametrize(
-    "rule", [ep.EBIC(), ep.RefinedScore(), ep.FreeRunScore(n_windows=4, n_folds=2)]
+    "rule", [ep.EBIC(), ep.discovery.RefinedScore(), ep.FreeRunScore(n_windows=4, n_folds=2)]
 )
 def test_relations_hold_to_the_last_digit(rule):
     run = PREY.trajectory(noise=0.02, rng=0)
@@ -294,7 +294,7 @@ def test_the_other_systems_that_live_are_kept() -> None:
     for other in found.others:
         assert sum(map(len, other.terms.values())) == size
         assert other.terms != ours
-        bounds = ep.FreeRunBounds()
+        bounds = ep.model.FreeRunBounds()
         shares = other.f_error / bounds.frequency, other.amplitude / bounds.amplitude
         assert other.deviation == max(*shares, other.waveform / bounds.waveform) <= 1.0
     assert [o.waveform for o in found.others] == sorted(o.waveform for o in found.others)

@@ -49,12 +49,12 @@ def fronts_of(
     return fronts
 
 
-def scores_by(rule: ep.RefinedScore, fronts: list[ParetoFront]) -> list[np.ndarray]:
+def scores_by(rule: ep.discovery.RefinedScore, fronts: list[ParetoFront]) -> list[np.ndarray]:
     rows = fronts[0].rows
     return list(rule.decide(fronts, Task(rows.trajectories, rows.library)).scores)
 
 
-def picked(rule: ep.RefinedScore, fronts: list[ParetoFront]) -> list[set[str]]:
+def picked(rule: ep.discovery.RefinedScore, fronts: list[ParetoFront]) -> list[set[str]]:
     scores = scores_by(rule, fronts)
     return [set(f.with_scores(s).best.terms) for f, s in zip(fronts, scores, strict=True)]
 
@@ -87,7 +87,7 @@ WRONG = {
 def test_the_truth_is_selected_from_exact_samples(system: System) -> None:
     run = system.trajectory().window(0, 600)
     fronts = fronts_of([run], system.model.library, next_to_truth(system, WRONG[system.name]))
-    found = scores_by(ep.RefinedScore(), fronts)
+    found = scores_by(ep.discovery.RefinedScore(), fronts)
     chosen = [f.with_scores(scores).best for f, scores in zip(fronts, found, strict=True)]
     assert [set(c.terms) for c in chosen] == supports(system)
     assert max(scores.min() for scores in found) <= EXACT
@@ -103,7 +103,7 @@ def test_biased_coefficients_of_the_truth_are_mended(noise: float) -> None:
     }
     good = {s: PREY.model.terms(s) | {"1": 1e-4} for s in PREY.model.states}
     fronts = fronts_of([run], PREY.model.library, {s: [poor[s], good[s]] for s in poor})
-    assert picked(ep.RefinedScore(), fronts) == supports(PREY)
+    assert picked(ep.discovery.RefinedScore(), fronts) == supports(PREY)
 
 
 def test_equations_without_terms_take_part_and_can_win() -> None:
@@ -113,9 +113,9 @@ def test_equations_without_terms_take_part_and_can_win() -> None:
     run = ep.Trajectory(t, states, ["x", "y"])
     choices = {"x": [{"x": 0.01}], "y": [{"y": -0.8}]}
     fronts = fronts_of([run], ep.polynomial(["x", "y"], degree=1), choices)
-    assert picked(ep.RefinedScore(), fronts) == [set(), {"y"}]
+    assert picked(ep.discovery.RefinedScore(), fronts) == [set(), {"y"}]
     nothing = fronts_of([run], ep.polynomial(["x", "y"], degree=1), {"x": [], "y": []})
-    x, y = scores_by(ep.RefinedScore(window_s=1.0), nothing)
+    x, y = scores_by(ep.discovery.RefinedScore(window_s=1.0), nothing)
     assert x == y
     assert 0.0 < float(x[0]) < MAX_ERROR
 
@@ -126,7 +126,7 @@ def test_inputs_drive_the_refinement() -> None:
     run = ep.Trajectory(t, (np.cos(t) + np.sin(t))[:, None], ["x"], 2.0 * np.cos(t)[:, None], ["u"])
     choices = {"x": [{"u": 1.0}, {"u": 0.7, "x": -1.2}]}
     library = ep.polynomial(["u", "x"], degree=1)  # the library's order is its own
-    assert picked(ep.RefinedScore(), fronts_of([run], library, choices)) == [{"u", "x"}]
+    assert picked(ep.discovery.RefinedScore(), fronts_of([run], library, choices)) == [{"u", "x"}]
 
 
 def test_units_do_not_matter_to_the_refined_score() -> None:
@@ -138,8 +138,8 @@ def test_units_do_not_matter_to_the_refined_score() -> None:
         s: [{n: c * 1e6 * 1e18 ** (1.0 - degree[n]) for n, c in terms.items()} for terms in given]
         for s, given in choices.items()
     }
-    plain = scores_by(ep.RefinedScore(), fronts_of([run], library, choices))
-    scaled = scores_by(ep.RefinedScore(), fronts_of([dense], library, converted))
+    plain = scores_by(ep.discovery.RefinedScore(), fronts_of([run], library, choices))
+    scaled = scores_by(ep.discovery.RefinedScore(), fronts_of([dense], library, converted))
     for a, b in zip(plain, scaled, strict=True):
         assert b == pytest.approx(a, rel=1e-4)
 
@@ -149,7 +149,7 @@ def test_a_combination_that_diverges_gets_the_largest_error() -> None:
     library = ep.polynomial(["x", "v"], degree=3)
     choices = {"x": [{"v": 1.0}, {"1": 1e200, "x^3": 1e200}], "v": [{"x": -9.0, "v": -0.6}]}
     run = system.trajectory().window(0, 600)
-    scores = scores_by(ep.RefinedScore(window_s=0.5), fronts_of([run], library, choices))
+    scores = scores_by(ep.discovery.RefinedScore(window_s=0.5), fronts_of([run], library, choices))
     assert scores[0][2] == MAX_ERROR
     assert scores[0][1] <= EXACT
 
@@ -167,7 +167,7 @@ def test_what_refines_does_not_judge(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = [run.window(0, 450), run.window(600, 990), run.window(990, 1000)]
     choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
     fronts = fronts_of(parts, PREY.model.library, choices)
-    assert picked(ep.RefinedScore(window_s=5.0, n_windows=10), fronts) == supports(PREY)
+    assert picked(ep.discovery.RefinedScore(window_s=5.0, n_windows=10), fronts) == supports(PREY)
     times = [np.concatenate([piece.t for piece in batch]) for batch in batches]
     for fitted, held in zip(times[::2], times[1::2], strict=True):
         assert len(np.unique(np.append(fitted, held))) == len(fitted) + len(held) == 10 * 51
@@ -178,7 +178,7 @@ def test_what_refines_does_not_judge(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_two_windows_refine_and_judge_by_turns() -> None:
     run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(1)).window(0, 400)
     fronts = fronts_of([run], PREY.model.library, next_to_truth(PREY, WRONG["Lotka-Volterra"]))
-    assert picked(ep.RefinedScore(n_windows=2), fronts) == supports(PREY)
+    assert picked(ep.discovery.RefinedScore(n_windows=2), fronts) == supports(PREY)
 
 
 @pytest.mark.parametrize("number", [2, pytest.param(5, marks=pytest.mark.slow)])
@@ -188,9 +188,9 @@ def test_windows_without_a_jump_do_not_decide_alone(number: int) -> None:
     system, (run,) = realization("van_der_pol", 0.05, number, seed=7)
     terms = {s: system.model.terms(s) for s in system.model.states}
     choices = {"x": [terms["x"]], "y": [terms["y"], {"x^3": 0.5 * terms["y"]["x"]}]}
-    assert picked(ep.RefinedScore(), fronts_of([run], system.model.library, choices)) == supports(
-        system
-    )
+    assert picked(
+        ep.discovery.RefinedScore(), fronts_of([run], system.model.library, choices)
+    ) == supports(system)
 
 
 def batch_of(run: ep.Trajectory, *, n_windows: int = 3, window: int = 50) -> WindowBatch:
@@ -210,7 +210,7 @@ def test_models_of_different_terms_refined_together_are_those_refined_alone() ->
         [{"x": 0.6, "x*y": -0.9}, {"1": 0.01, "y": -0.3, "x*y": 0.9}],
     ]
     models = [
-        ep.SparseModel(library, ["x", "y"], ep.coef_matrix(library, terms)) for terms in given
+        ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, terms)) for terms in given
     ]
     method = MultipleShooting()
     found = refine_batch(models, batch, method=method)
@@ -234,9 +234,9 @@ def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() 
     library = ep.polynomial(["x", "y"], degree=4)
     truth = {s: PREY.model.terms(s) for s in ("x", "y")}
     wild = ep.SparseModel(
-        library, ["x", "y"], ep.coef_matrix(library, [{"x^2*y^2": 1e200}, {"y": 1e3}])
+        library, ["x", "y"], ep.model.coef_matrix(library, [{"x^2*y^2": 1e200}, {"y": 1e3}])
     )
-    sound = ep.SparseModel(library, ["x", "y"], ep.coef_matrix(library, list(truth.values())))
+    sound = ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, list(truth.values())))
     batch = batch_of(PREY.trajectory())
     found = refine_batch([wild, sound], batch, method=MultipleShooting())
     kept, good = found.models
@@ -272,9 +272,9 @@ def test_what_cannot_be_judged_is_refused() -> None:
     choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
     fronts = fronts_of([run], PREY.model.library, choices)
     with pytest.raises(ValueError, match=r"every state needs one front: \['x'\] came"):
-        scores_by(ep.RefinedScore(), fronts[:1])
+        scores_by(ep.discovery.RefinedScore(), fronts[:1])
     short = fronts_of([run.window(0, 9)], PREY.model.library, choices)
     with pytest.raises(ValueError, match="2 x 4 were asked of at most 9; .* longer records"):
-        scores_by(ep.RefinedScore(), short)
+        scores_by(ep.discovery.RefinedScore(), short)
     with pytest.raises(ValueError, match="window_s must be positive: 0"):
-        ep.RefinedScore(window_s=0.0)
+        ep.discovery.RefinedScore(window_s=0.0)

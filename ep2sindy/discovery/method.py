@@ -76,7 +76,7 @@ class TrajectorySearch:
     def __post_init__(self) -> None:
         set_counts(self, {"depth": 1, "max_terms": 1})
         check_limit_s(self.limit_s)
-        check_kind("selection", self.selection, Selection, "ep.Evidence()")
+        check_kind("selection", self.selection, Selection, "ep.discovery.Evidence()")
         if self.selection.basis == "rows":
             raise ValueError(
                 "a search of trajectories weighs models by their likelihood: selection must "

@@ -199,7 +199,7 @@ class FreeRunScore:
     basis: ClassVar[Basis] = "runs"
 
     def __post_init__(self) -> None:
-        check_kind("bounds", self.bounds, FreeRunBounds, "ep.FreeRunBounds()")
+        check_kind("bounds", self.bounds, FreeRunBounds, "ep.model.FreeRunBounds()")
         least = dict.fromkeys(("n_windows", "n_confirmed", "max_combinations", "n_starts"), 1)
         set_counts(self, {"n_folds": 2} | least)
         if not self.window_periods > 0.0:
