@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from textwrap import wrap
 
 import numpy as np
@@ -18,6 +18,7 @@ from ep2sindy.figures.style import (
     TITLE,
     WIDTH,
     axis_label,
+    draw_over,
     frame_limits,
     legend_above,
     make_grid,
@@ -52,12 +53,9 @@ def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Fi
     for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
         model = rollout.states[:, rollout.state_names.index(name)]
         for ax, part in zip(row, parts, strict=True):
-            ax.plot(factor * since[part], run.states[part, k], color=GREY, lw=2.4, label="data")
-            reached = part[: len(model)]
-            ax.plot(
-                factor * since[: len(model)][reached], model[reached], color=COLOURS[0], lw=1.1,
-                label="model",
-            )  # fmt: skip
+            reached = part & (np.arange(len(part)) < len(model))
+            data = factor * since[part], run.states[part, k]
+            draw_over(ax, data, (factor * since[reached], model[reached[: len(model)]]))
         row[0].set_ylim(frame_limits(run.states[:, k], model))
         row[0].set_ylabel(axis_label(name, run.units[name]))
     for ax, words in zip(axes[0], ("first periods", "last periods"), strict=True):
@@ -80,33 +78,22 @@ def cycle_figure(run: Trajectory | None, cycle: LimitCycle) -> Figure:
         Line2D([], [], color=COLOURS[1], lw=2.0, label="the model's cycle"),
         Line2D([], [], color=COLOURS[5], marker="o", ms=4, lw=0.8, label="from other starts"),
     ]
-    closed = _columns(np.concatenate([cycle.states, cycle.states[:1]]), cycle.model.states, plane)
+    closed = np.concatenate([cycle.states, cycle.states[:1]])[:, :2]
     data = closed
     if run is not None:
-        data = _columns(run.states, run.state_names, plane)
+        data = run.columns(plane)
         ax.plot(*data.T, color=GREY, lw=0.6)
         handles.insert(0, Line2D([], [], color=GREY, lw=2.0, label="data"))
     for path in paths:
-        x, y = _columns(path.states, path.state_names, plane).T
-        ax.plot(x, y, color=COLOURS[5], lw=0.7)
-        ax.plot(x[0], y[0], "o", color=COLOURS[5], ms=4)
+        ax.plot(*path.states[:, :2].T, color=COLOURS[5], lw=0.7)
+        ax.plot(*path.states[0, :2], "o", color=COLOURS[5], ms=4)
     ax.plot(*closed.T, color=COLOURS[1], lw=2.0)
-    starts = [_columns(path.states[:1], path.state_names, plane) for path in paths]
-    shown = np.concatenate([closed, *starts])
-    ax.set(
-        xlim=frame_limits(data[:, 0], shown[:, 0]),
-        ylim=frame_limits(data[:, 1], shown[:, 1]),
-        xlabel=axis_label(plane[0], cycle.model.units[plane[0]]),
-        ylabel=axis_label(plane[1], cycle.model.units[plane[1]]),
-    )
+    shown = np.concatenate([closed, *(path.states[:1, :2] for path in paths)])
+    x_limits, y_limits = map(frame_limits, data.T, shown.T)
+    x_label, y_label = (axis_label(name, cycle.model.units[name]) for name in plane)
+    ax.set(xlim=x_limits, ylim=y_limits, xlabel=x_label, ylabel=y_label)
     legend_above(figure, handles)
     return figure
-
-
-def _columns(
-    states: Float[np.ndarray, "samples n_states"], names: Sequence[str], plane: Sequence[str]
-) -> Float[np.ndarray, "samples 2"]:
-    return states[:, [names.index(name) for name in plane]]
 
 
 def paths_off(cycle: LimitCycle) -> list[Rollout]:
@@ -164,19 +151,14 @@ def balance_figure(
 ) -> Figure:
     """A panel per process: its rate in the record and by the model's terms, in m^-3/s."""
     factor, unit = clock.scale(float(t[-1] - t[0]))
-    n_rows = -(-len(parts) // 2)
-    figure, axes = make_panels(n_rows, 2, (WIDTH, 2.2 * n_rows + 0.6), sharex=True)
-    for ax, (name, (recorded, modelled)) in zip(axes.flat, parts.items(), strict=False):
-        ax.plot(factor * (t - t[0]), recorded, color=GREY, lw=2.4, label="record")
-        ax.plot(factor * (t - t[0]), modelled, color=COLOURS[0], lw=1.1, label="model")
+    figure, axes = make_grid(
+        len(parts), width=WIDTH / 2, height=2.2, extra=0.6, sharex=True, x_label=f"time ({unit})"
+    )
+    time = factor * (t - t[0])
+    for ax, (name, (recorded, modelled)) in zip(axes, parts.items(), strict=True):
+        draw_over(ax, (time, recorded), (time, modelled))
+        ax.axhline(0.0, color=DATA, lw=0.5)
         ax.set_title("\n".join(wrap(name, 44)), fontsize=TITLE)
-        both = np.concatenate([recorded, modelled, [0.0]])
-        ax.set_ylim(1.1 * both.min(), 1.1 * both.max())
-    for ax in list(axes.flat)[len(parts) :]:
-        ax.set_visible(False)
-    for ax in axes[:, 0]:
-        ax.set_ylabel(axis_label("rate", "m^-3/s"))
-    for ax in axes[-1]:
-        ax.set_xlabel(f"time ({unit})")
-    legend_above(figure, axes[0, 0].lines[:2])
+    figure.supylabel(axis_label("rate", "m^-3/s"), fontsize=TITLE)
+    legend_above(figure, axes[0].lines[:2])
     return figure

@@ -6,6 +6,7 @@ A panel shows cells coloured over z and r. Over a single axis, values are points
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,14 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap, Normalize, to_rgb
+from matplotlib.colors import (
+    BoundaryNorm,
+    Colormap,
+    ListedColormap,
+    Normalize,
+    SymLogNorm,
+    to_rgb,
+)
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.typing import ColorType
@@ -29,6 +37,7 @@ from ep2sindy.figures.style import (
     TITLE,
     WIDTH,
     legend_above,
+    make_grid,
     make_panels,
     unit_text,
 )
@@ -66,7 +75,8 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
     coef, trust = result["coef"].sel(term=terms), _trust(result)
     flat = len(space_axes(coef)) == 1
     shape = coef.sizes["equation"], len(terms)
-    size = _fit_size(coef, *shape, extra=1.1)
+    width, height = _panel_size(coef, min(PANEL_WIDTH, (WIDTH - 0.8) / len(terms) - 0.35))
+    size = max(shape[1] * width + 0.8, 5.5), shape[0] * height + 1.1
     figure, axes = make_panels(*shape, size, sharex=True, sharey="col" if flat else True)
     for column, term in zip(axes.T, terms, strict=True):
         column[0].set_title(f"${latex_term_name(str(term))}$", fontsize=TITLE)
@@ -74,13 +84,13 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
             _draw_signed_points(list(column), coef.sel(term=term), trust.sel(term=term))
         else:
             _draw_signed_maps(figure, list(column), coef.sel(term=term), trust.sel(term=term))
+        column[-1].set_xlabel(f"{space_axes(coef)[0]} (cm)")
+    for ax in axes.flat:
+        _finish(ax, coef, outline)
+        if not flat:
+            ax.label_outer(remove_inner_ticks=False)
     for row, equation in zip(axes, coef["equation"].values, strict=True):
-        name = f"${latex_derivative(str(equation))}$"
-        row[0].annotate(
-            name, (-0.48 if flat else -0.42, 0.5), xycoords="axes fraction", fontsize=TITLE,
-            ha="right", va="center",
-        )  # fmt: skip
-    finish_panels(axes, coef, outline)
+        row[0].set_ylabel(f"${latex_derivative(str(equation))}$\n\n{row[0].get_ylabel()}")
     (half,) = _fade(SOURCE, np.array([0.5]))
     entries: dict[str, Any] = {"source (+)": SOURCE, "sink (−)": SINK, HALF: half}
     if not flat:
@@ -114,22 +124,20 @@ def _draw_signed_maps(
 ) -> None:
     """Draw one term in all equations, with a colour bar; its grey middle ends at +-10^low."""
     low, high = _decades(coef.values)
+    ends, middle = 10.0 ** np.arange(low, high + 1), 0.9 * GAP / (1.0 - GAP) * (high - low)
+    norm = SymLogNorm(ends[0], linscale=middle, vmin=-ends[-1], vmax=ends[-1])
     scale = _signed_colours()
     for ax, values, shown in zip(column, coef, opacity, strict=True):
-        signed = values.copy(data=_signed_log(values.values, low, high))
-        draw_map(ax, signed, scale.with_extremes(bad="white"), Normalize(-1, 1), opacity=shown)
+        least = np.copysign(np.maximum(np.abs(values), ends[0]), values).where(values != 0.0, 0.0)
+        draw_map(ax, least.where(values.notnull()), scale, norm, opacity=shown)
         ax.set_facecolor(ABSENT)
     bar = figure.colorbar(
-        ScalarMappable(Normalize(-1, 1), scale), ax=column, location="bottom", aspect=14,
-        pad=0.02, shrink=0.95,
-    )  # fmt: skip
-    units = dict.fromkeys(map(_coef_unit, coef))
-    bar.set_label(" / ".join(units), fontsize=SMALL, labelpad=1)
-    bar.set_ticks(
-        [-1.0, 0.0, 1.0], labels=[f"$-10^{{{high}}}$", rf"$\pm 10^{{{low}}}$", f"$10^{{{high}}}$"]
+        ScalarMappable(norm, scale), ax=column, location="bottom", aspect=14, pad=0.02, shrink=0.95
     )
-    inner = _place(np.arange(low + 1, high), low, high)
-    bar.set_ticks([*-inner, *inner], minor=True)
+    bar.set_label(" / ".join(dict.fromkeys(map(_coef_unit, coef))), fontsize=SMALL, labelpad=1)
+    labels = f"$-10^{{{high}}}$", rf"$\pm 10^{{{low}}}$", f"$10^{{{high}}}$"
+    bar.set_ticks([-ends[-1], 0.0, ends[-1]], labels=labels)
+    bar.set_ticks([*-ends[1:-1], *ends[1:-1]], minor=True)
     bar.ax.tick_params(labelsize=SMALL, length=2)
 
 
@@ -145,30 +153,12 @@ def _decades(coef: Float[np.ndarray, "*shape"]) -> tuple[int, int]:
     return int(np.floor(low)), max(int(np.ceil(high)), int(np.floor(low)) + 1)
 
 
-def _place(exponent: np.ndarray, low: int, high: int) -> np.ndarray:
-    """Position of a magnitude between the colour bar's middle and its end."""
-    return np.clip(GAP + (1.0 - GAP) * (exponent - low) / (high - low), GAP, 1.0)
-
-
-def _signed_log(
-    coef: Float[np.ndarray, "*shape"], low: int, high: int
-) -> Float[np.ndarray, "*shape"]:
-    """Map coefficients to -1 .. -GAP and GAP .. 1, and absent terms to 0; NaN stays NaN."""
-    exponent = np.log10(np.abs(coef), where=coef != 0.0, out=np.full(coef.shape, float(low)))
-    return np.sign(coef) * _place(exponent, low, high)
-
-
 def _signed_colours() -> ListedColormap:
     n = 200
     half = round((1.0 - GAP) * n) + 1  # the faintest shade begins before GAP, because of rounding
     shades = np.linspace(0.3, 1.0, half)
-    return ListedColormap(
-        [
-            *colormaps["Blues"](shades[::-1]),
-            *[ABSENT] * (2 * (n - half)),
-            *colormaps["Reds"](shades),
-        ]
-    )
+    blues, reds = colormaps["Blues"](shades[::-1]), colormaps["Reds"](shades)
+    return ListedColormap([*blues, *[ABSENT] * (2 * (n - half)), *reds]).with_extremes(bad="white")
 
 
 def _draw_signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.DataArray) -> None:
@@ -179,10 +169,8 @@ def _draw_signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.Da
     for ax, values, shown in zip(column, coef, trust, strict=True):
         ax.set_yscale(scale)
         if not (np.abs(values) > 0.0).any():
-            ax.text(
-                0.5, 0.5, "not selected", transform=ax.transAxes, ha="center", va="center",
-                color="#777777", fontsize=SMALL,
-            )  # fmt: skip
+            middle: dict[str, Any] = {"ha": "center", "va": "center", "transform": ax.transAxes}
+            ax.text(0.5, 0.5, "not selected", color="#777777", fontsize=SMALL, **middle)
         for sign, colour, marker in ((1, SOURCE, "^"), (-1, SINK, "v")):
             chosen = sign * values.values > 0
             at, magnitudes = CM * coef[axis].values[chosen], np.abs(values.values[chosen])
@@ -198,25 +186,14 @@ def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
     """
     n = regimes.n_regimes
     colours = MORE_COLOURS if n <= len(MORE_COLOURS) else colormaps["tab20"](np.arange(n) % 20)
-    flat = len(space_axes(regimes.labels)) == 1
-    n_columns = 1 if flat or n <= 3 else 2
-    text = 0.2 * -(-n // n_columns)
-    shape = (2, 1) if flat else (1, 2)
-    size = _fit_size(regimes.labels, *shape, scale=2.2, extra=text + 0.75)
-    heights = [1, 2] if flat else None
-    figure, axes = make_panels(*shape, size, sharex=True, sharey=not flat, heights=heights)
     labels = regimes.labels.where(regimes.labels >= 0)
-    norm = BoundaryNorm(np.arange(n + 1) - 0.5, n)
-    draw_map(axes.flat[0], labels, ListedColormap(list(colours[:n])), norm)
-    axes.flat[0].set_title("regime", fontsize=TITLE)
-    draw_values(axes.flat[1], regimes.confidence, SHARE_COLOURS, Normalize(0.0, 1.0))
-    axes.flat[1].set_title("confidence", fontsize=TITLE)
-    finish_panels(axes, regimes.labels, outline)
-    figure.legend(
-        handles=[Patch(color=colours[k], label=_regime_text(regimes, k)) for k in range(n)],
-        loc="outside lower center", ncols=n_columns, frameon=False, fontsize=SMALL,
-        handlelength=1.2, title="terms that act in each regime", title_fontsize=SMALL,
-    )  # fmt: skip
+    panels = [
+        Panel("regime", labels, ListedColormap(list(colours[:n])), _whole(n), bar=False),
+        Panel("confidence", regimes.confidence, SHARE_COLOURS),
+    ]
+    figure = _draw_panels(panels, outline, width=3.7, extra=0.75 + 0.2 * n)
+    patches = [Patch(color=colours[k], label=_regime_text(regimes, k)) for k in range(n)]
+    legend_above(figure, patches, title="terms that act in each regime")
     return figure
 
 
@@ -236,62 +213,76 @@ def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figu
     R2 is on the held-out rows, or on the training rows if none were held out. Values below 0 are
     drawn as 0.
     """
-    name = r2_name(result)
-    r2, held_out = result[name], name == "r2_test"
-    n_equations = result.sizes["equation"]
-    n_columns = 3 if (result["status"] != 0).any() else 2
-    size = _fit_size(r2, n_equations, n_columns, scale=1.4, extra=0.9)
-    figure, axes = make_panels(n_equations, n_columns, size, sharex=True)
-    most = max(1, int(result["n_terms"].max()))
-    counts = BoundaryNorm(np.arange(most + 2) - 0.5, 256)
-    for row, equation in zip(axes, result["equation"].values, strict=True):
-        name = latex_derivative(str(equation))
-        shown = r2.sel(equation=equation).clip(min=0.0)
-        draw_values(row[0], shown, SHARE_COLOURS, Normalize(0.0, 1.0))
-        row[0].set_title(
-            f"${name}$: $R^2$, {'held-out' if held_out else 'training'}", fontsize=TITLE
-        )
-        draw_values(row[1], result["n_terms"].sel(equation=equation), COUNT_COLOURS, counts)
-        row[1].set_title(f"${name}$: number of terms", fontsize=TITLE)
-    finish_panels(axes[:, :2], r2, outline)
-    if n_columns == 3:
-        _draw_status(figure, axes[0, 2], result["status"])
-        for ax in axes[1:, 2]:
-            ax.remove()
-        finish_panels(axes[:1, 2:], r2, outline)
+    name, panels = r2_name(result), []
+    rows = "held-out" if name == "r2_test" else "training"
+    counts = _whole(max(1, int(result["n_terms"].max())) + 1, 256)
+    for equation in result["equation"].values:
+        of, own = f"${latex_derivative(str(equation))}$", result.sel(equation=equation)
+        panels += [
+            Panel(f"{of}: $R^2$, {rows}", own[name].clip(min=0.0), SHARE_COLOURS),
+            Panel(f"{of}: number of terms", own["n_terms"], COUNT_COLOURS, counts),
+        ]
+    status, patches = result["status"], []
+    if (status != 0).any():
+        meanings = str(status.attrs["flag_meanings"]).split()
+        norm, statuses = _whole(len(meanings)), ListedColormap(list(STATUS_COLOURS))
+        panels.append(Panel("status of the points", status * 1.0, statuses, norm, bar=False))
+        for k, (meaning, colour) in enumerate(zip(meanings, STATUS_COLOURS, strict=False)):
+            if n := int((status == k).sum()):
+                text = f"{meaning.replace('_', ' ')} ({n})"
+                patches.append(Patch(facecolor=colour, edgecolor=DATA, lw=0.5, label=text))
+    figure = _draw_panels(panels, outline, width=2.7, extra=0.9)
+    legend_above(figure, patches)
     return figure
 
 
-def _draw_status(figure: Figure, ax: Axes, status: xr.DataArray) -> None:
-    meanings = str(status.attrs["flag_meanings"]).split()
-    found = [k for k in range(len(meanings)) if (status == k).any()]
-    norm = BoundaryNorm(np.arange(len(meanings) + 1) - 0.5, len(meanings))
-    draw_map(ax, status.astype(float), ListedColormap(list(STATUS_COLOURS)), norm)
-    ax.set_title("status of the points", fontsize=TITLE)
-    figure.legend(
-        handles=[
-            Patch(
-                facecolor=STATUS_COLOURS[k], edgecolor=DATA, lw=0.5,
-                label=f"{meanings[k].replace('_', ' ')} ({int((status == k).sum())})",
-            )
-            for k in found
-        ],
-        loc="outside lower center", ncols=len(found), frameon=False, fontsize=SMALL,
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A map with a title. bar: False for values that stand for kinds, which a legend names."""
+
+    title: str
+    values: xr.DataArray
+    colours: Colormap
+    norm: Normalize = field(default_factory=lambda: Normalize(0.0, 1.0))
+    bar: bool = True
+
+
+def _whole(n: int, n_colours: int | None = None) -> BoundaryNorm:
+    """Norm of the whole numbers below n."""
+    return BoundaryNorm(np.arange(n + 1) - 0.5, n_colours or n)
+
+
+def _draw_panels(
+    panels: Sequence[Panel], outline: Thruster | None, *, width: float, extra: float
+) -> Figure:
+    """Draw the maps, as many in a row as fit. width: of each, and extra: height, in inches."""
+    first = panels[0].values
+    size, x_label = _panel_size(first, width), f"{space_axes(first)[0]} (cm)"
+    figure, axes = make_grid(
+        len(panels), width=size[0], height=size[1], extra=extra, sharex=True,
+        sharey=len(space_axes(first)) == 2, x_label=x_label,
     )  # fmt: skip
+    for ax, panel in zip(axes, panels, strict=True):
+        (draw_values if panel.bar else draw_map)(ax, panel.values, panel.colours, panel.norm)
+        ax.set_title(panel.title, fontsize=TITLE)
+        _finish(ax, first, outline)
+        if not ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
+            ax.set_ylabel("")
+    return figure
 
 
 def space_axes(array: xr.DataArray | xr.Dataset) -> list[str]:
     return [axis for axis in SPACE if axis in array.dims]
 
 
-def _fit_size(
-    array: xr.DataArray, n_rows: int, n_columns: int, *, scale: float = 1.0, extra: float
-) -> tuple[float, float]:
-    """Size of a canvas whose panels keep the field's proportions; extra: margins in inches."""
+def _panel_size(array: xr.DataArray, width: float) -> tuple[float, float]:
+    """Size of a panel with its margins, so that a map of this width keeps the field's proportions.
+
+    All are in inches.
+    """
     spans = [float(np.ptp(_edges(array, axis))) for axis in space_axes(array)]
-    width = min(scale * PANEL_WIDTH, (WIDTH - 0.8) / n_columns - 0.35)
     height = width * min(max(spans[1] / spans[0], 0.25), 2.0) if len(spans) == 2 else 1.3
-    return max(n_columns * (width + 0.35) + 0.8, 5.5), n_rows * (height + 0.45) + extra
+    return width + 0.35, height + 0.45
 
 
 def _edges(array: xr.DataArray, axis: str) -> Float[np.ndarray, " edges"]:
@@ -346,20 +337,15 @@ def _middles(norm: BoundaryNorm) -> list[float]:
     return list(np.add(norm.boundaries[1:], norm.boundaries[:-1]) / 2)
 
 
-def finish_panels(axes: np.ndarray, array: xr.DataArray, outline: Thruster | None) -> None:
-    """Finish panels: outer labels, the channel's outline, and the full range of a single axis."""
+def _finish(ax: Axes, array: xr.DataArray, outline: Thruster | None) -> None:
+    """Draw the channel's outline; label r, or show the full range of a single axis."""
     space = space_axes(array)
-    for ax in axes.flat:
-        if len(space) == 1:
-            ax.set_xlim(*CM * _edges(array, space[0])[[0, -1]])
-        if outline is not None:
-            _draw_channel(ax, space, outline)
-    for ax in axes[-1]:
-        ax.tick_params(labelbottom=True)
-        ax.set_xlabel(f"{space[0]} (cm)")
-    if len(space) == 2:
-        for ax in axes[:, 0]:
-            ax.set_ylabel("r (cm)")
+    if len(space) == 1:
+        ax.set_xlim(*CM * _edges(array, space[0])[[0, -1]])
+    else:
+        ax.set_ylabel("r (cm)")
+    if outline is not None:
+        _draw_channel(ax, space, outline)
 
 
 def _draw_channel(ax: Axes, space: Sequence[str], thruster: Thruster) -> None:
@@ -374,10 +360,6 @@ def _draw_channel(ax: Axes, space: Sequence[str], thruster: Thruster) -> None:
     else:
         ax.plot([length, length], [inner, outer], color=DATA, lw=0.8, ls="--")
         bottom, top = limits[1]
-        ax.plot(
-            [length, length, 0.0, 0.0, length, length],
-            [min(bottom, inner), inner, inner, outer, outer, max(top, outer)],
-            color=DATA,
-            lw=1.2,
-        )
+        walls = [min(bottom, inner), inner, inner, outer, outer, max(top, outer)]
+        ax.plot([length, length, 0.0, 0.0, length, length], walls, color=DATA, lw=1.2)
     ax.set(xlim=limits[0], ylim=limits[1])

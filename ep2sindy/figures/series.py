@@ -6,10 +6,11 @@ preparation of curves: the part of a run to show, its limits and its labels.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import cycle
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -27,12 +28,12 @@ from ep2sindy.figures.style import (
     WIDTH,
     Limits,
     axis_label,
+    draw_over,
     frame_limits,
     legend_above,
     legend_curves,
     make_grid,
     make_panels,
-    mark_exits,
     slope_label,
     unit_text,
 )
@@ -84,13 +85,10 @@ def trajectory_figure(
     statuses: by name, how the run goes. since: the origin of the time axis, in words.
     """
     data = first_part(run.t, run.states, duration_s, run.clock)
-    models = {n: first_part(r.t, r.states, duration_s, run.clock) for n, r in rollouts.items()}
+    models = _runs(rollouts, statuses, duration_s, run.clock)
     titles = [axis_label(name, run.units[name]) for name in run.state_names]
-    return _draw_rows(
-        data, models, titles=titles, x_label=_time_label(run.clock, duration_s, since),
-        labels=run_labels(rollouts, statuses), limits=limits_of(data, models),
-        diverged=find_diverged(rollouts, duration_s),
-    )[0]  # fmt: skip
+    x_label = _time_label(run.clock, duration_s, since)
+    return _draw_rows(data, models, titles, x_label, limits=limits_of(data, models))[0]
 
 
 def derivative_figure(
@@ -104,16 +102,15 @@ def derivative_figure(
     slopes = np.concatenate([smoother.derivative(each.t, each.states) for each in pieces])
     times = np.concatenate([each.t for each in pieces])
     data = first_part(times, clock.seconds * slopes, duration_s, clock)
-    sides = {}
+    sides = []
     for name, model in models.items():
-        slopes = clock.seconds * model.derivative(
-            run.columns(model.states), run.columns(model.inputs)
-        )
-        order = [model.states.index(state) for state in run.state_names]
-        sides[name] = first_part(run.t, slopes[:, order], duration_s, clock)
+        slopes = model.derivative(run.columns(model.states), run.columns(model.inputs))
+        slopes = slopes[:, [model.states.index(state) for state in run.state_names]]
+        curves = first_part(run.t, clock.seconds * slopes, duration_s, clock)
+        sides.append(replace(curves, label=name))
     titles = [slope_label(name, clock.rate_unit(run.units[name])) for name in run.state_names]
     x_label, limits = _time_label(clock, duration_s), limits_of(data, sides, RARE)
-    return _draw_rows(data, sides, titles=titles, x_label=x_label, limits=limits)[0]
+    return _draw_rows(data, sides, titles, x_label, limits=limits)[0]
 
 
 def spectrum_figure(
@@ -130,67 +127,61 @@ def spectrum_figure(
     """
     n_samples = max(len(rollout.t) for rollout in rollouts.values())
     data = _spectra(run.t[:n_samples], run.states[:n_samples], f_max_Hz, run.clock)
-    models = {name: _spectra(r.t, r.states, f_max_Hz, run.clock) for name, r in rollouts.items()}
+    models = [
+        replace(_spectra(r.t, r.states, f_max_Hz, run.clock), label=_run_label(name, r, statuses))
+        for name, r in rollouts.items()
+    ]
     titles = [f"power of {axis_label(name, _power_unit(run, name))}" for name in run.state_names]
-    figure, axes = _draw_rows(
-        data, models, titles=titles, x_label=_frequency_label(run.clock, f_max_Hz),
-        labels=run_labels(rollouts, statuses),
-    )  # fmt: skip
-    for k, column in enumerate(axes.T):
-        peak = run.clock.frequency_scale(f_max_Hz)[0] * dominant_frequency(run.t, run.states[:, k])
-        column[0].set_yscale("log")
-        power = data.y[:, k]
-        column[0].set_ylim(0.3 * np.percentile(power, 2), 10.0 * power.max())
-        for ax, rollout in zip(column, rollouts.values(), strict=True):
+    figure, axes = _draw_rows(data, models, titles, _frequency_label(run.clock, f_max_Hz))
+    for column, power, values in zip(axes.T, data.y.T, run.states.T, strict=True):
+        peak = run.clock.frequency_scale(f_max_Hz)[0] * dominant_frequency(run.t, values)
+        ends = 0.3 * np.percentile(power, 2), 10.0 * power.max()
+        column[0].set(yscale="log", ylim=ends)
+        for ax in column:
             ax.axvline(peak, color=DATA, lw=0.8, ls="--")
-            if not rollout.diverged:
-                text = run.clock.frequency_text(dominant_frequency(rollout.t, rollout.states[:, k]))
-                ax.text(0.98, 0.82, text, transform=ax.transAxes, ha="right", fontsize=SMALL)
+    for row, rollout in zip(axes, rollouts.values(), strict=True):
+        for ax, values in zip(row, () if rollout.diverged else rollout.states.T, strict=False):
+            text = run.clock.frequency_text(dominant_frequency(rollout.t, values))
+            ax.text(0.98, 0.82, text, transform=ax.transAxes, ha="right", fontsize=SMALL)
     return figure
 
 
 def _draw_rows(
     data: Curves,
-    models: Mapping[str, Curves],
-    *,
+    models: Sequence[Curves],
     titles: Sequence[str],
     x_label: str,
-    labels: Mapping[str, str] = MappingProxyType({}),
+    *,
     limits: Sequence[Limits] = (),
-    diverged: Collection[str] = (),
 ) -> tuple[Figure, np.ndarray]:
     """Draw a row per model and a column per state, with the data in grey behind.
 
-    labels: row labels, by name. limits: of every column; marks show where curves leave them, and
-    which runs diverged.
+    limits: of every column; marks show where curves leave them, and which runs diverged.
     """
-    n_rows, n_columns = len(models), len(titles)
-    height = float(np.clip(5.0 / n_rows, 1.05, 2.2))
-    size = (WIDTH, height * n_rows + 1.2)
-    figure, axes = make_panels(n_rows, n_columns, size, sharex=True, sharey="col")
-    for row, colour, (name, curves) in zip(axes, cycle(MORE_COLOURS), models.items(), strict=False):
+    height = float(np.clip(5.0 / len(models), 1.05, 2.2))
+    size = (WIDTH, height * len(models) + 1.2)
+    figure, axes = make_panels(len(models), len(titles), size, sharex=True, sharey="col")
+    for row, colour, model in zip(axes, cycle(MORE_COLOURS), models, strict=False):
         for k, ax in enumerate(row):
-            # Wider than the model, so that it shows on both sides of one that follows it.
-            ax.plot(data.x, data.y[:, k], color=GREY, lw=2.4, label="data")
-            ax.plot(curves.x, curves.y[:, k], color=colour, lw=1.1)
-            for shown, shade in ((data, GREY), (curves, colour)):
-                if limits and len(shown.x):
-                    frame = (float(shown.x[0]), float(shown.x[-1])), limits[k]
-                    stops = name in diverged and shown is curves
-                    mark_exits(
-                        ax, shown.x, shown.y[:, k], colour=shade, limits=frame, diverged=stops
-                    )
-        text = labels.get(name, name).replace(", ", ",\n")
+            frame = (_reach([data.x, model.x]), limits[k]) if limits else None
+            draw_over(
+                ax, (data.x, data.y[:, k]), (model.x, model.y[:, k]), colour=colour, limits=frame,
+                diverged=model.stops,
+            )  # fmt: skip
+        text = model.label.replace(", ", ",\n")
         row[0].set_ylabel(text, rotation=0, ha="right", va="center", labelpad=10)
     for ax in axes[1:].flat:  # panels of a column share their axis and so the first row's factor
         ax.yaxis.get_offset_text().set_visible(False)
     for column, title in zip(axes.T, titles, strict=True):
         column[0].set_title(title, fontsize=TITLE)
         column[-1].set_xlabel(x_label)
-    for column, ends in zip(axes.T, limits, strict=False):
-        column[0].set_ylim(ends)
     legend_curves(figure, list(axes.flat))
     return figure, axes
+
+
+def _reach(parts: Sequence[Float[np.ndarray, " points"]]) -> Limits:
+    together = np.concatenate(parts)
+    return float(together.min()), float(together.max())
 
 
 def _spectra(
@@ -227,10 +218,15 @@ def _power_unit(run: Trajectory, name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """One curve per state over a shared abscissa, scaled to the axis's prefix."""
+    """One curve per state over a shared abscissa, scaled to the axis's prefix.
+
+    label: of the panels that show it. stops: whether it is that of a run that diverged at its end.
+    """
 
     x: Float[np.ndarray, " points"]
     y: Float[np.ndarray, "points n_states"]
+    label: str = ""
+    stops: bool = False
 
 
 def first_part(
@@ -245,26 +241,29 @@ def first_part(
     return Curves(clock.scale(duration_s)[0] * since[shown], values[shown])
 
 
-def limits_of(data: Curves, models: Mapping[str, Curves], rare: float = 0.0) -> list[Limits]:
-    together = np.concatenate([curves.y for curves in models.values()])
+def _runs(
+    rollouts: Mapping[str, Rollout], statuses: Mapping[str, str], duration_s: float, clock: Clock
+) -> list[Curves]:
+    """The first part of every run."""
+    return [
+        replace(
+            first_part(run.t, run.states, duration_s, clock),
+            label=_run_label(name, run, statuses),
+            stops=run.diverged and run.lasted_s <= duration_s,
+        )
+        for name, run in rollouts.items()
+    ]
+
+
+def limits_of(data: Curves, models: Sequence[Curves], rare: float = 0.0) -> list[Limits]:
+    together = np.concatenate([curves.y for curves in models])
     return [frame_limits(*pair, rare=rare) for pair in zip(data.y.T, together.T, strict=True)]
 
 
-def find_diverged(rollouts: Mapping[str, Rollout], duration_s: float) -> set[str]:
-    """Names of the runs that stop before the end of the shown time."""
-    return {name for name, r in rollouts.items() if r.diverged and r.lasted_s <= duration_s}
-
-
-def run_labels(rollouts: Mapping[str, Rollout], statuses: Mapping[str, str]) -> dict[str, str]:
-    """Row labels: the name, and below it the status if it is known.
-
-    statuses: by name; for a diverged run the label gives the time since its start instead.
-    """
-    found = {}
-    for name, rollout in rollouts.items():
-        status = when_it_diverges(rollout) if rollout.diverged else statuses.get(name)
-        found[name] = f"{name}\n({status})" if status else name
-    return found
+def _run_label(name: str, run: Rollout, statuses: Mapping[str, str]) -> str:
+    """The name, and below it the status if it is known; for a diverged run the time it lasted."""
+    status = when_it_diverges(run) if run.diverged else statuses.get(name)
+    return f"{name}\n({status})" if status else name
 
 
 def when_it_diverges(rollout: Rollout) -> str:
@@ -283,26 +282,22 @@ def phase_figure(
 
     The dot marks the start; other marks and statuses are as in `trajectory_figure`.
     """
-    data = first_part(run.t, run.states[:, :2], duration_s, run.clock)
-    models = {
-        n: first_part(r.t, r.states[:, :2], duration_s, run.clock) for n, r in rollouts.items()
-    }
-    diverged, labels = find_diverged(rollouts, duration_s), run_labels(rollouts, statuses)
+    data = first_part(run.t, run.states, duration_s, run.clock)
+    models = _runs(rollouts, statuses, duration_s, run.clock)
     x_label, y_label = (axis_label(name, run.units[name]) for name in run.state_names[:2])
     figure, axes = make_grid(
         len(models), width=2.75, height=2.75, extra=0.7, sharex=True, sharey=True, x_label=x_label
     )
-    limits = dict(enumerate(limits_of(data, models)))
-    for ax, colour, (name, curves) in zip(axes, cycle(MORE_COLOURS), models.items(), strict=False):
-        ax.plot(*data.y.T, color=GREY, lw=1.4, label="data")
-        ax.plot(*curves.y.T, color=colour, lw=1.1)
-        ax.plot(*curves.y[:1].T, "o", color=colour, ms=4)
-        ax.set_title(labels[name], fontsize=TITLE, pad=13.0)  # above the ordinate's factor
-        mark_exits(
-            ax, *curves.y.T, colour=colour, limits=(limits[0], limits[1]),
-            diverged=name in diverged,
+    x_limits, y_limits = limits_of(data, models)[:2]
+    for ax, colour, model in zip(axes, cycle(MORE_COLOURS), models, strict=False):
+        path, limits = (model.y[:, 0], model.y[:, 1]), (x_limits, y_limits)
+        draw_over(
+            ax, (data.y[:, 0], data.y[:, 1]), path, colour=colour, limits=limits,
+            diverged=model.stops,
         )  # fmt: skip
-    axes[0].set(xlim=limits[0], ylim=limits[1])
+        ax.plot(*model.y[:1, :2].T, "o", color=colour, ms=4)
+        ax.set_title(model.label, fontsize=TITLE, pad=13.0)  # above the ordinate's factor
+    axes[0].set_xlim(x_limits)
     for ax in axes:
         place = ax.get_subplotspec()
         if place is not None and place.is_first_col():
@@ -331,43 +326,33 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
     begin = run.t[max(0, int(np.searchsorted(run.t, ahead.t[0] - 1e-9 * run.dt_s)) - 1)]
     factor, unit = run.clock.scale(float(ahead.t[-1] - begin))
     shown = (run.t >= begin - HISTORY * (ahead.t[-1] - begin)) & (run.t <= ahead.t[-1])
+    since, later = factor * (run.t[shown] - begin), factor * (ahead.t - begin)
     for ax, name in zip(axes, names, strict=False):
         k = ahead.state_names.index(name)
-        since = factor * (run.t[shown] - begin)
-        values = run.columns([name])[shown, 0]
+        values, mean = run.columns([name])[shown, 0], ahead.states[:, k]
         ax.plot(since, values, ".", ms=3, color=DATA, label="samples")
-        later = factor * (ahead.t - begin)
-        ax.fill_between(
-            later, low[:, k], high[:, k], color=COLOURS[0], alpha=0.25, lw=0,
-            label=f"band of {100.0 * LEVEL:.0f} %",
-        )  # fmt: skip
-        ax.plot(later, ahead.states[:, k], color=COLOURS[0], lw=1.2, label="forecast")
+        band: dict[str, Any] = {"color": COLOURS[0], "alpha": 0.25, "lw": 0}
+        label = f"band of {100.0 * LEVEL:.0f} %"
+        ax.fill_between(later, low[:, k], high[:, k], label=label, **band)
+        ax.plot(later, mean, color=COLOURS[0], lw=1.2, label="forecast")
         ax.axvline(0.0, color=GREY, lw=0.8, ls="--")
-        ax.set_xlabel(f"time since the start ({unit})")
-        ax.set_ylabel(axis_label(name, run.units[name]))
-        ax.set_ylim(_limits(values))
+        ax.set(xlabel=f"time since the start ({unit})", ylabel=axis_label(name, run.units[name]))
+        ax.set_ylim(frame_limits(values, mean))
     _draw_errors(axes[-1], skill)
     baselines = axes[-1].lines[1 : len(skill.nrmse)]  # the first line is the model's
-    handles = [*axes[0].get_legend_handles_labels()[0], *baselines]
-    legend_above(figure, handles)
+    legend_above(figure, [*axes[0].get_legend_handles_labels()[0], *baselines])
     return figure
 
 
 def _draw_errors(ax: Axes, skill: ForecastSkill) -> None:
     in_periods = np.isfinite(skill.period_s)
     unit_s = skill.period_s if in_periods else float(skill.horizons_s[0])
-    colours = dict(zip(("persistence", "harmonics", "autoregression"), COLOURS[1:], strict=False))
+    names = (MODEL, "persistence", "harmonics", "autoregression")
+    colours = dict(zip(names, COLOURS, strict=False))
     for name, values in skill.nrmse.items():
-        ax.plot(
-            skill.horizons_s / unit_s, np.maximum(values, FLOOR), label=name,
-            color=COLOURS[0] if name == MODEL else colours[name], lw=1.8 if name == MODEL else 1.0,
-        )  # fmt: skip
+        style: dict[str, Any] = {"color": colours[name], "lw": 1.8 if name == MODEL else 1.0}
+        horizons = skill.horizons_s / unit_s
+        ax.plot(horizons, np.maximum(values, FLOOR), label=name, **style)
     ax.axhline(1.0, color=GREY, lw=0.8, ls="--")
-    ax.set_yscale("log")
+    ax.set(yscale="log", ylabel="error (standard deviations)")
     ax.set_xlabel(f"horizon ({'periods' if in_periods else 'samples'})")
-    ax.set_ylabel("error (standard deviations)")
-
-
-def _limits(values: Float[np.ndarray, " samples"]) -> tuple[float, float]:
-    room = 0.25 * float(np.ptp(values))
-    return float(values.min()) - room, float(values.max()) + room

@@ -35,6 +35,8 @@ WIDTH, TITLE, SMALL = 9.0, 10.0, 9.0
 
 Limits = tuple[float, float]
 
+Curve = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]  # abscissa, ordinate
+
 Sharing = bool | Literal["row", "col"]
 
 # Caret markers at the edge that a curve crosses: left, right, below, above.
@@ -108,20 +110,19 @@ def make_grid(
     return figure, axes
 
 
-def legend_above(figure: Figure, handles: Sequence[Artist]) -> None:
+def legend_above(figure: Figure, handles: Sequence[Artist], *, title: str = "") -> None:
     """A legend of the labelled artists over all panels, in as few lines as the figure's width has.
 
-    A label has some twelve letters to an inch; its sign takes half an inch.
+    A label has some twelve letters to an inch; its sign takes half an inch. Under a title every
+    entry has a line.
     """
-    longest = max(0.5 + 0.08 * len(str(each.get_label())) for each in handles)
-    n_lines = -(-len(handles) // max(1, int(figure.get_figwidth() / longest)))
+    longest = max((0.5 + 0.08 * len(str(each.get_label())) for each in handles), default=1.0)
+    n_columns = 1 if title else max(1, int(figure.get_figwidth() / longest))
+    n_lines = -(-len(handles) // n_columns) or 1
     figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=-(-len(handles) // n_lines),
-        frameon=False,
-        fontsize=SMALL,
-    )
+        handles=handles, loc="outside upper center", ncols=-(-len(handles) // n_lines) or 1,
+        frameon=False, fontsize=SMALL, title=title or None, title_fontsize=SMALL,
+    )  # fmt: skip
 
 
 def write_in_cell(ax: Axes, column: int, row: int, text: str, *, colour: str) -> Text:
@@ -220,30 +221,22 @@ def find_exits(
     """
     points, limits = np.column_stack([x, y]), np.array([x_limits, y_limits])
     points = points[np.isfinite(points).all(axis=1)]
-    inside = ((points >= limits[:, 0]) & (points <= limits[:, 1])).all(axis=1)
-    found = []
+    inside, middle = (
+        ((points >= limits[:, 0]) & (points <= limits[:, 1])).all(axis=1),
+        limits.mean(1),
+    )
+    steps = [(points[k], points[k + 1]) for k in np.flatnonzero(inside[:-1] & ~inside[1:])]
     if len(points) and not inside[0]:
-        found.append(_cross(limits.mean(axis=1), points[0], limits, nearest=True))
-    for k in np.flatnonzero(inside[:-1] & ~inside[1:]):
-        found.append(_cross(points[k], points[k + 1], limits))
+        steps.insert(0, (middle, points[0]))
+    found = []
+    for start, end in steps:
+        edge, step = np.clip(end, *limits.T), end - start
+        shares = np.divide(edge - start, step, out=np.full(2, np.inf), where=edge != end)
+        axis = int(shares.argmin())
+        place = edge if start is middle else start + shares[axis] * step
+        place[axis] = edge[axis]
+        found.append((float(place[0]), float(place[1]), CARETS[axis, int(step[axis] > 0.0)]))
     return found
-
-
-def _cross(
-    start: np.ndarray, end: np.ndarray, limits: np.ndarray, *, nearest: bool = False
-) -> tuple[float, float, int]:
-    """Exit of the line from an inner to an outer point, and the caret of the edge it crosses."""
-    shares = {
-        (axis, side): (limits[axis, side] - start[axis]) / (end[axis] - start[axis])
-        for axis in (0, 1)
-        for side, beyond in enumerate((end < limits[:, 0], end > limits[:, 1]))
-        if beyond[axis]
-    }
-    axis, side = min(shares, key=lambda edge: shares[edge])
-    place = end if nearest else start + shares[axis, side] * (end - start)
-    place = np.clip(place, limits[:, 0], limits[:, 1])
-    place[axis] = limits[axis, side]
-    return float(place[0]), float(place[1]), CARETS[axis, side]
 
 
 def mark_exits(
@@ -268,13 +261,36 @@ def mark_exits(
         ax.plot(x[-1], y[-1], "x", color=colour, ms=6, mew=1.6, zorder=5, label=f"_{STOPS}")
 
 
+def draw_over(
+    ax: Axes,
+    data: Curve,
+    model: Curve,
+    *,
+    colour: str = COLOURS[0],
+    limits: tuple[Limits, Limits] | None = None,
+    diverged: bool = False,
+) -> None:
+    """Draw a model over data, which are grey and wider, so that both show where they agree.
+
+    limits: of the panel, from which `mark_exits` takes where the curves leave it. diverged: whether
+    the model's run diverged where its curve ends.
+    """
+    ax.plot(*data, color=GREY, lw=2.4, label="data")
+    ax.plot(*model, color=colour, lw=1.1, label="model")
+    if limits is not None:
+        mark_exits(ax, *data, colour=GREY, limits=limits)
+        mark_exits(ax, *model, colour=colour, limits=limits, diverged=diverged)
+        ax.set_ylim(limits[1])
+
+
 def legend_curves(figure: Figure, axes: Sequence[Axes], n: int = 1) -> None:
     """Draw a legend of the first panel's first n curves, and of the marks in any panel."""
     there = {str(line.get_label()) for ax in axes for line in ax.lines}
-    signs: dict[str, Any] = {OFF_SCALE: 6, STOPS: "x"}
-    marks = [
-        Line2D([], [], ls="none", marker=marker, color=SIGN, label=label)
-        for label, marker in signs.items()
-        if f"_{label}" in there
-    ]
-    legend_above(figure, [*axes[0].lines[:n], *marks])
+    marks = [mark_sign(6, OFF_SCALE), mark_sign("x", STOPS)]
+    shown = [mark for mark in marks if f"_{mark.get_label()}" in there]
+    legend_above(figure, [*axes[0].lines[:n], *shown])
+
+
+def mark_sign(marker: Any, label: str, colour: str = SIGN, **style: Any) -> Line2D:
+    """An entry of a legend for marks: by itself, of any colour."""
+    return Line2D([], [], ls="none", marker=marker, color=colour, label=label, **style)
