@@ -50,7 +50,6 @@ from ep2sindy.regression.formulations import BlockSplit as BlockSplit  # for con
 from ep2sindy.selection.criteria import EBIC as EBIC  # for configs
 from ep2sindy.selection.criteria import Knee as Knee  # for configs
 from ep2sindy.selection.criteria import Evidence as Evidence  # for configs
-from ep2sindy.selection.refined import RefinedScore as RefinedScore  # for configs
 from ep2sindy.selection.free_run import FreeRunScore as FreeRunScore  # for configs
 from ep2sindy.model.comparison import FreeRunBounds as FreeRunBounds  # for configs
 

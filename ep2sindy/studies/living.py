@@ -144,7 +144,7 @@ class LivingSearch:
         from ep2sindy.selection.free_run import FreeRunScore  # loads torch, only for a search
 
         rule = self.selection
-        return rule.bounds if isinstance(rule, FreeRunScore) else FreeRunBounds()
+        return (isinstance(rule, FreeRunScore) and rule.bounds) or FreeRunBounds()
 
 
 @dataclass(frozen=True, eq=False)
