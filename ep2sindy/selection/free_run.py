@@ -165,7 +165,7 @@ class FreeRunScore:
         living = find_living(trials)
         ranked = order_equals(sorted(living, key=lambda trial: trial.rank(measure.margin)))
         by_error = sorted(trials, key=lambda trial: (trial.error, trial.loss))
-        confirmed = self._confirm(ranked or by_error, measure, progress)
+        confirmed = self._confirm(ranked or by_error, measure, runs, progress)
         won = min(confirmed, key=lambda each: each.rank)
         scores = found.score(np.array([t.error for t in trials]), trials.index(won.trial))
         note = f"{reason}{won.text(len(living), len(trials))}{found.left_out}"
@@ -205,13 +205,9 @@ class FreeRunScore:
         tried, found = [systems[k] for k in some], []
         for fold in measure.folds:
             fitted = cut_stretches(
-                measure.runs,
-                fold.fitted,
-                tried[0].model,
-                window=measure.window,
-                n_windows=self.n_windows,
-                seed=self.seed,
-            )
+                measure.runs, fold.fitted, tried[0].model, window=measure.window,
+                n_windows=self.n_windows, seed=self.seed,
+            )  # fmt: skip
             refined = refine_systems(tried, fitted, progress, n_reweights=measure.n_reweights)
             found.append(measure.judge(tried, refined, fitted, fold, progress))
         for k, figures in zip(some, measure.figures(found), strict=True):
@@ -219,7 +215,11 @@ class FreeRunScore:
         return trials
 
     def _confirm(
-        self, ranked: Sequence[Trial], measure: Measure, progress: Progress
+        self,
+        ranked: Sequence[Trial],
+        measure: Measure,
+        runs: Sequence[Trajectory],
+        progress: Progress,
     ) -> list[Confirmed]:
         """The systems, refined on all data in order, up to one that nothing after it can outdo."""
         found: list[Confirmed] = []
@@ -229,12 +229,9 @@ class FreeRunScore:
             if attracting and trial.system.n_free > attracting[0].trial.system.n_free + DEARER:
                 break
             model = trial.system.refine_on_all(
-                measure.runs,
-                window=measure.window_on_all,
-                n_windows=max(MIN_WINDOWS, self.n_windows),
-                n_reweights=measure.n_reweights,
-                seed=self.seed,
-            )
+                runs, self.seed, window=measure.window_on_all,
+                n_windows=max(MIN_WINDOWS, self.n_windows), n_reweights=measure.n_reweights,
+            )  # fmt: skip
             own = measure.confirm(trial, model)
             resting = [each for each in found if each.rests]
             if own.share and resting and not own.outdoes(resting[0]):

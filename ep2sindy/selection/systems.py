@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Unpack
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,6 +18,7 @@ from ep2sindy.library.roles import process_amounts
 from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.problem import RefinementChanges
 from ep2sindy.refinement.refine import BatchRefinement, refine, refine_batch, with_coef
 from ep2sindy.refinement.steps import fastest_step
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
@@ -105,33 +107,18 @@ class TrialSystem:
         return find_broken_demands(processes, values, self.means)
 
     def refine_on_all(
-        self,
-        runs: Sequence[Trajectory],
-        *,
-        window: int | None = None,
-        n_windows: int = 30,
-        n_reweights: int = 1,
-        seed: int = 0,
+        self, runs: Sequence[Trajectory], seed: int, **settings: Unpack[RefinementChanges]
     ) -> SparseModel:
         """Refine on windows spread over all the data, with the covariance of the coefficients.
 
-        window: in samples; None takes one and a half periods. n_windows, n_reweights and seed: as
-        for `refine`. A system without terms, or one whose refinement does not stay finite, is
-        returned unchanged, without covariance.
+        seed and settings: as for `refine`. A system without free coefficients, or one whose
+        refinement does not stay finite, is returned unchanged, without covariance.
         """
         if not len(self.constraint.free):
             return self.model
-        found = refine(
-            self.model,
-            runs,
-            n_windows=n_windows,
-            window=window,
-            method=MultipleShooting(step=fastest_step(self.model.library)),
-            constraint=self.constraint,
-            n_reweights=n_reweights,
-            seed=seed,
-        )
-        return found.model
+        settings["method"] = MultipleShooting(step=fastest_step(self.model.library))
+        settings["constraint"] = self.constraint
+        return refine(self.model, runs, seed=seed, **settings).model
 
 
 @dataclass(frozen=True, eq=False)
