@@ -41,7 +41,7 @@ HEAVY = {
     # In selection the rules that refine, and what they share.
     "torch": (
         "refinement",
-        "selection.refined",
+        "selection.by_windows",
         "selection.free_run",
         "selection.systems",
         "selection.conserving",

@@ -53,7 +53,7 @@ NO_COUNTS: dict[str, Callable[[object], object]] = {
     "n_steps": lambda n: ep.WeightedWeak(n_steps=n),
     "n_folds": lambda n: ep.FreeRunScore(n_folds=n),
     "n_starts": lambda n: ep.FreeRunScore(n_starts=n),
-    "n_windows": lambda n: ep.discovery.RefinedScore(n_windows=n),
+    "n_windows": lambda n: ep.FreeRunScore(n_windows=n),
     "degree": lambda n: ep.polynomial(["x"], degree=n),
     "function_degree": lambda n: ep.polynomial(
         ["x"], degree=1, functions=["sin"], function_degree=n

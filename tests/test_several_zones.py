@@ -170,7 +170,7 @@ def chain() -> ep.Trajectory:
 def refined(depth: int) -> ep.Regression:
     """A search whose systems are refined and judged whole."""
     search = ep.BestSubset(max_terms=6, n_best=100)
-    return ep.Regression(search=search, selection=ep.discovery.RefinedScore(), depth=depth)
+    return ep.Regression(search=search, selection=ep.FreeRunScore(bounds=None), depth=depth)
 
 
 def test_a_search_in_zones_finds_the_truth_and_conserves() -> None:

@@ -5,4 +5,3 @@ from ep2sindy.estimation.cost import SlowSearch as SlowSearch
 
 # Selection
 from ep2sindy.selection.criteria import Evidence as Evidence  # for configs
-from ep2sindy.selection.refined import RefinedScore as RefinedScore  # for configs
