@@ -11,10 +11,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from jaxtyping import Float
-from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
@@ -27,11 +24,11 @@ from ep2sindy.figures.style import (
     GREY,
     TITLE,
     WIDTH,
+    draw_cells,
     legend_above,
     make_grid,
     make_panels,
     unit_text,
-    write_in_cell,
 )
 from ep2sindy.signals.spectrum import power_spectrum
 
@@ -45,25 +42,22 @@ MS, KHZ = 1e3, 1e-3
 
 def current_figure(field: xr.Dataset, window: slice) -> Figure:
     """The discharge current over the whole record, and with the beam current over a few periods."""
-    figure, axes = make_panels(2, 1, (WIDTH, 4.8))
-    whole, part = axes.flat
-    time = MS * field["time"].values
+    figure, ((whole,), (part,)) = make_panels(2, 1, (WIDTH, 4.8))
+    time, shown = MS * field["time"].values, field.isel(time=window)
     whole.plot(time, field["I_d"].values, color=DATA, lw=0.5)
     if window.stop - window.start < time.size:
         whole.axvspan(time[window.start], time[window.stop - 1], color=COLOURS[4], alpha=0.35, lw=0)
-    shown = field.isel(time=window)
     part.plot(time[window], shown["I_d"].values, color=DATA, lw=1.3, label="discharge current")
-    highest = shown["I_d"].values
     if "I_beam" in field:
-        beam = shown["I_beam"].values
-        highest = np.maximum(highest, beam)
-        part.plot(time[window], beam, color=COLOURS[0], lw=1.3, ls="--", label="ion beam current")
-    for ax, values in ((whole, field["I_d"].values), (part, highest)):
+        beam: dict[str, Any] = {"color": COLOURS[0], "ls": "--", "label": "ion beam current"}
+        part.plot(time[window], shown["I_beam"].values, lw=1.3, **beam)
+    handles = list(part.lines)
+    for ax in (whole, part):
         ax.set_ylabel("current (A)")
-        _hold_zero(ax, values)
         ax.margins(x=0.0)
+        _show_zero(ax)
     part.set_xlabel("time after the warm-up (ms)")
-    legend_above(figure, part.lines)
+    legend_above(figure, handles)
     return figure
 
 
@@ -137,7 +131,7 @@ def space_time_figure(field: xr.Dataset, window: slice) -> Figure:
     axes = grid[:, 0]
     axes[0].plot(time, shown["I_d"].values, color=DATA, lw=1.3)
     axes[0].set_ylabel("discharge\ncurrent (A)")
-    _hold_zero(axes[0], shown["I_d"].values)
+    _show_zero(axes[0])
     edges = CM * cell_edges(field["z"].values.astype(float))
     for ax, name in zip(axes[1:], names, strict=True):
         values, unit = scale_to_prefix(along_z(shown[name]), field[name].attrs["units"])
@@ -172,10 +166,9 @@ def scale_to_prefix(
     return factor * values / 10.0**power, f"$10^{{{power}}}$ {unit_text(name)}"
 
 
-def _hold_zero(ax: Axes, values: Float[np.ndarray, " time"]) -> None:
-    """Set limits that include zero, so that a steady current does not look like a moving one."""
-    low, high = min(0.0, float(values.min())), max(0.0, float(values.max()))
-    ax.set_ylim(1.05 * low, (1.08 * high) or 1.0)
+def _show_zero(ax: Axes) -> None:
+    """Draw the line of zero, so that a steady current does not look like a moving one."""
+    ax.axhline(0.0, color=GREY, lw=0.8)
 
 
 def _words(array: xr.DataArray) -> str:
@@ -211,7 +204,6 @@ CURVES = {  # column -> title, factor
     "thrust_N": ("thrust (mN)", 1e3),
     "anode_efficiency": ("anode efficiency (%)", 100.0),
 }
-DARK = 0.6  # on the colour scale: text is black below, white above
 
 
 def stability_figure(
@@ -231,20 +223,18 @@ def stability_figure(
     )  # fmt: skip
     figure.set_figwidth(max(figure.get_figwidth() + 1.8, 5.5))
     known = points.loc[~points["status"].isin(WORTHLESS), "I_d_std"]
-    scale = Normalize(0.0, float(known.max()) if len(known) and known.max() > 0 else 1.0)
+    most = float(known.max()) if known.any() else 1.0
     for ax, (held, group) in zip(panels, groups, strict=True):
-        for row in group.to_dict("records"):
-            _draw_cell(ax, x.index(row[along]), y.index(row[up]), row, scale)
+        _draw_cells(ax, group.set_index([up, along]), y, x, most)
         title = [f"{labels[name]}: {value}" for name, value in zip(others, held, strict=True)]
         ax.set_title(", ".join(title), fontsize=TITLE)
         ax.set(xlim=(0, len(x)), ylim=(0, len(y)))
         ax.set_xticks(np.arange(len(x)) + 0.5, x)
         ax.set_yticks(np.arange(len(y)) + 0.5, y)
-        ax.tick_params(length=0)
     figure.supxlabel(labels[along], fontsize=TITLE)
     figure.supylabel(fill(labels[up], 26), fontsize=TITLE, multialignment="center")
-    bar = figure.colorbar(ScalarMappable(scale, colormaps["Blues"]), ax=panels, pad=0.02)
-    bar.set_label("standard deviation of the\ndischarge current (A)")
+    words = "standard deviation of the\ndischarge current (A)"
+    figure.colorbar(panels[0].collections[0], ax=panels, pad=0.02, label=words)
     seen = [name for name in HATCHES if (points["status"] == name).any()]
     if seen:
         style: dict[str, Any] = {"facecolor": "white", "edgecolor": DATA}
@@ -252,22 +242,22 @@ def stability_figure(
     return figure
 
 
-def _draw_cell(ax: Axes, column: int, row: int, point: Mapping[Any, Any], scale: Normalize) -> None:
-    """Draw one point: amplitude as colour, hatched and labelled if it does not breathe."""
-    status, std = point["status"], float(point["I_d_std"])
-    known = status not in WORTHLESS and np.isfinite(std)
-    colour = colormaps["Blues"](scale(std)) if known else "white"
-    hatch = HATCHES.get(status)
-    style: dict[str, Any] = {"facecolor": colour, "edgecolor": GREY, "lw": 0.8, "hatch": hatch}
-    ax.add_patch(Rectangle((column, row), 1, 1, **style))
-    lines = [f"{std:.2f} A"] if known else []
-    if np.isfinite(point["f_kHz"]) and known:
-        lines += [f"{point['f_kHz']:.1f} kHz"]
-    lines += [str(point["cycle"]) if status == BREATHES else status]
-    dark = known and hatch is None and scale(std) > DARK
-    text = write_in_cell(ax, column, row, "\n".join(lines), colour="white" if dark else "black")
-    if hatch:
-        text.set_bbox({"facecolor": "white", "alpha": 0.85, "lw": 0, "pad": 1.5})
+def _draw_cells(
+    ax: Axes, points: pd.DataFrame, rows: Sequence[str], columns: Sequence[str], most: float
+) -> None:
+    """Draw points by their place: amplitude as colour, hatched and labelled if one is quiet."""
+    cells = points.reindex(pd.MultiIndex.from_product([rows, columns]))
+    known = ~cells["status"].isin(WORTHLESS)
+    std, shape = cells["I_d_std"].where(known), (len(rows), len(columns))
+    lines = [std.map("{:.2f} A".format), cells["f_kHz"].where(known).map("{:.1f} kHz".format)]
+    lines += [cells["cycle"].where(cells["status"] == BREATHES, cells["status"]).fillna("nan")]
+    texts = ["\n".join(text for text in of if "nan" not in text) for of in zip(*lines, strict=True)]
+    written = draw_cells(ax, std.to_numpy(float).reshape(shape), np.reshape(texts, shape), most)
+    for k, (status, text) in enumerate(zip(cells["status"], written, strict=True)):
+        if hatch := HATCHES.get(status):
+            corner = (k % len(columns), k // len(columns))
+            ax.add_patch(Rectangle(corner, 1, 1, fill=False, ec=GREY, lw=0.8, hatch=hatch))
+            text.set(color="black", bbox={"facecolor": "white", "alpha": 0.85, "lw": 0, "pad": 1.5})
 
 
 def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:

@@ -14,6 +14,7 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
@@ -32,6 +33,10 @@ MORE_COLOURS = (*COLOURS, "#7F3C8D", "#666666")
 # One width in inches, of 96 px on a page, and two sizes of type in points: ticks, marks in panels
 # and legends are small; titles are as large as the labels of axes.
 WIDTH, TITLE, SMALL = 9.0, 10.0, 9.0
+
+# One hue from light to dark: legible with any colour vision, and in grey. A text on a shade beyond
+# DARK is white.
+CELLS, DARK = "Blues", 0.65
 
 Limits = tuple[float, float]
 
@@ -125,11 +130,25 @@ def legend_above(figure: Figure, handles: Sequence[Artist], *, title: str = "") 
     )  # fmt: skip
 
 
-def write_in_cell(ax: Axes, column: int, row: int, text: str, *, colour: str) -> Text:
-    """Write small text into the middle of a cell, on a map whose cells have unit sides."""
-    return ax.text(
-        column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=SMALL, color=colour
-    )
+def draw_cells(
+    ax: Axes, values: Float[np.ndarray, "rows columns"], texts: Sequence[Sequence[str]], most: float
+) -> list[Text]:
+    """Draw cells of unit sides with a text in each, blue by value from 0 to `most`, white for NaN.
+
+    Returns the texts by row and column.
+    """
+    scale = Normalize(0.0, most)
+    grid: dict[str, Any] = {"edgecolors": "white", "linewidth": 0.8}
+    ax.pcolormesh(np.ma.masked_invalid(values), cmap=CELLS, norm=scale, **grid)
+    ax.tick_params(length=0)
+    centre: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
+    return [
+        ax.text(
+            column + 0.5, row + 0.5, texts[row][column], **centre,
+            color="white" if scale(value) > DARK else "black",
+        )
+        for (row, column), value in np.ndenumerate(values)
+    ]  # fmt: skip
 
 
 def hover_spot(ax: Axes, x: float, y: float, text: str) -> None:
