@@ -16,23 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures import style
 from ep2sindy.figures.series import when_it_diverges
-from ep2sindy.figures.style import (
-    COLOURS,
-    DATA,
-    GREY,
-    SMALL,
-    TITLE,
-    WIDTH,
-    Curve,
-    Limits,
-    draw_cells,
-    frame_limits,
-    legend_above,
-    legend_curves,
-    make_panels,
-    mark_exits,
-)
+from ep2sindy.figures.style import COLOURS, DATA, GREY, SMALL, TITLE, WIDTH, Curve, Limits
 from ep2sindy.library.equations import latex_name
 from ep2sindy.model.rollout import Rollout
 
@@ -90,8 +76,7 @@ def frontier_figure(points: pd.DataFrame) -> Figure:
     points: from `Study.points` of `studies.frontier`.
     """
     variants = list(points["variant"].unique())
-    size = (min(WIDTH, 2.6 * len(variants) + 0.4), 3.5)
-    figure, (axes,) = make_panels(1, len(variants), size, sharex=True, sharey=True)
+    figure, axes = style.make_row(len(variants), width=2.6, height=3.5)
     kinds = points["identified"].map({True: "identified", False: "not identified"})
     kinds = kinds.where(points["reason"] == "", "too few samples to run")
     for ax, variant in zip(axes, variants, strict=True):
@@ -102,7 +87,7 @@ def frontier_figure(points: pd.DataFrame) -> Figure:
         ax.set_title(variant, fontsize=TITLE)
     axes[0].xaxis.set_minor_formatter("")  # decades alone: others overlap
     axes[0].set_ylabel("sampling rate (Hz)")
-    legend_above(figure, axes[0].lines)
+    style.legend_above(figure, axes[0].lines)
     return figure
 
 
@@ -115,12 +100,12 @@ def benchmark_figure(cells: pd.DataFrame, *, thesis: pd.DataFrame) -> Figure:
     rows, columns = tables["on_front"].axes
     width = max(0.36 * len(columns), MIN_WIDTH)
     size = (1.8 + 2 * (width + 0.1), 0.9 + 0.25 * len(rows))
-    figure, (axes,) = make_panels(1, len(PANELS), size, sharey=True)
+    figure, (axes,) = style.make_panels(1, len(PANELS), size, sharey=True)
     for ax, (merit, table) in zip(axes, tables.items(), strict=True):
         _draw_heat_map(ax, table)
         ax.set_title(f"{PANELS[merit]} (%)", fontsize=TITLE, pad=24)
     labels = ["thesis" if published else name.replace("_", " ") for name, published in rows]
-    axes[0].set_yticks(np.arange(len(rows)) + 0.5, labels, fontsize=SMALL)
+    style.name_ticks(axes[0].yaxis, np.arange(len(rows)) + 0.5, labels)
     for text, (_, published) in zip(axes[0].get_yticklabels(), rows, strict=True):
         text.set(style="italic" if published else "normal")
     return figure
@@ -128,16 +113,17 @@ def benchmark_figure(cells: pd.DataFrame, *, thesis: pd.DataFrame) -> Figure:
 
 def _draw_heat_map(ax: Axes, table: pd.DataFrame) -> None:
     """Draw percentages with noise levels below the columns, and system names above."""
-    texts = [["–" if np.isnan(x) else f"{x:.0f}" for x in row] for row in table.to_numpy(float)]
-    written = draw_cells(ax, table.to_numpy(float), texts, 100.0)
-    for row, (_, published) in enumerate(table.index):
+    values = table.to_numpy(float)
+    texts = ["–" if np.isnan(value) else f"{value:.0f}" for value in values.flat]
+    written, n_columns = style.draw_cells(ax, values, texts, 100.0), values.shape[1]
+    for row, published in enumerate(table.index.get_level_values(1)):
         if not published:
             ax.axhline(row, color="white", lw=3)  # gap between variants; thesis rows stay attached
-        for text in written[row * table.shape[1] : (row + 1) * table.shape[1]]:
+        for text in written[row * n_columns : (row + 1) * n_columns]:
             text.set_fontstyle("italic" if published else "normal")
-    noises = [f"{100 * noise:g}" for _, noise in table.columns]
-    ax.set_xticks(np.arange(len(noises)) + 0.5, noises, fontsize=SMALL)
-    ax.set(xlabel="noise (% of RMS)", ylim=(len(texts), 0.0))
+    noises = [f"{100 * noise:g}" for noise in table.columns.get_level_values(1)]
+    style.name_ticks(ax.xaxis, np.arange(len(noises)) + 0.5, noises)
+    ax.set(xlabel="noise (% of RMS)", ylim=(len(table), 0.0))
     ax.spines[:].set_visible(False)
     systems = table.columns.get_level_values(0)
     for system in systems.unique():
@@ -178,12 +164,14 @@ def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) ->
     noises = sorted({each.noise for each in found})
     width, height = (3.4, 1.7) if over_time else (2.6, 2.5)
     size = (min(WIDTH, width * len(systems) + 0.6), height * len(noises) + 0.9)
-    figure, axes = make_panels(len(noises), len(systems), size, sharex="col", sharey="col")
+    figure, axes = style.make_panels(len(noises), len(systems), size, sharex="col", sharey="col")
     curves = [each.curves(over_time) for each in found]
     for each, drawn in zip(found, curves, strict=True):
         ax = axes[noises.index(each.noise), systems.index(each.system)]
         alike = [of[0] for of, one in zip(curves, found, strict=True) if one.system == each.system]
-        x, y = (frame_limits(np.concatenate(of), np.empty(0)) for of in zip(*alike, strict=True))
+        x, y = (
+            style.frame_limits(np.concatenate(of), np.empty(0)) for of in zip(*alike, strict=True)
+        )
         _draw_one(ax, each, drawn, (x, y))
         first, last = (f"${latex_name(each.samples.state_names[k])}$" for k in (0, -1))
         ax.set_ylabel(first if over_time else last, labelpad=1)
@@ -193,7 +181,7 @@ def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) ->
         ax.set_title(f"{SYSTEM_LABELS.get(system, system)}\n{ax.get_title()}", fontsize=TITLE)
     for ax, noise in zip(axes[:, 0], noises, strict=True):
         ax.set_ylabel(f"noise {100 * noise:g} %\n\n{ax.get_ylabel()}")
-    legend_curves(figure, list(axes.flat), n=3)
+    style.legend_curves(figure, list(axes.flat), n=3)
     return figure
 
 
@@ -207,7 +195,7 @@ def _draw_one(
     ax.plot(*truth, color=DATA, lw=1.6, label="truth")
     ax.plot(*model, color=IDENTIFIED, lw=1.1, ls=(0, (4, 1.5)), label="identified model")
     ax.set(xlim=limits[0], ylim=limits[1])
-    mark_exits(ax, *model, colour=IDENTIFIED, limits=limits, diverged=each.rollout.diverged)
+    style.mark_exits(ax, *model, colour=IDENTIFIED, limits=limits, diverged=each.rollout.diverged)
     verdict = "true terms" if each.right else "other terms"
     if each.rollout.diverged:
         verdict += f", {when_it_diverges(each.rollout)}"

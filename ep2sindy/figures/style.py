@@ -6,7 +6,7 @@ A frame sets the range of a panel whose curves may leave it, and marks where the
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -86,6 +87,19 @@ def make_panels(
     return figure, axes
 
 
+def make_row(n: int, *, width: float, height: float) -> tuple[Figure, Sequence[Axes]]:
+    """A figure of n panels beside each other that share both axes, each of this width in inches."""
+    size = (min(WIDTH, width * n + 0.4), height)
+    figure, (axes,) = make_panels(1, n, size, sharex=True, sharey=True)
+    return figure, axes
+
+
+def name_ticks(axis: Axis, places: Iterable[float], names: Sequence[str]) -> None:
+    """Name these places of an axis, and no others."""
+    axis.set_ticks([*places], names, fontsize=SMALL)
+    axis.set_ticks([], minor=True)
+
+
 def make_grid(
     n: int,
     *,
@@ -131,11 +145,11 @@ def legend_above(figure: Figure, handles: Sequence[Artist], *, title: str = "") 
 
 
 def draw_cells(
-    ax: Axes, values: Float[np.ndarray, "rows columns"], texts: Sequence[Sequence[str]], most: float
+    ax: Axes, values: Float[np.ndarray, "rows columns"], texts: Sequence[str], most: float
 ) -> list[Text]:
     """Draw cells of unit sides with a text in each, blue by value from 0 to `most`, white for NaN.
 
-    Returns the texts by row and column.
+    texts: row by row. Returns them as drawn.
     """
     scale = Normalize(0.0, most)
     grid: dict[str, Any] = {"edgecolors": "white", "linewidth": 0.8}
@@ -143,12 +157,11 @@ def draw_cells(
     ax.tick_params(length=0)
     centre: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
     return [
-        ax.text(
-            column + 0.5, row + 0.5, texts[row][column], **centre,
-            color="white" if scale(value) > DARK else "black",
+        ax.text(column + 0.5, row + 0.5, text, color="white" if dark else "black", **centre)
+        for ((row, column), dark), text in zip(
+            np.ndenumerate(np.asarray(scale(values) > DARK)), texts, strict=True
         )
-        for (row, column), value in np.ndenumerate(values)
-    ]  # fmt: skip
+    ]
 
 
 def hover_spot(ax: Axes, x: float, y: float, text: str) -> None:
