@@ -20,11 +20,11 @@ import xarray as xr
 
 # Voltage (V), mass flow (mg/s) and the speed of the neutrals that is set (m/s).
 POINTS = [(300, 5, 338), (200, 5, 320), (300, 2, 195), (300, 4, 338), (300, 6, 338), (400, 5, 338)]
-NEUTRALS = "{_target_: ep2sindy.prepare.gradient, of: n_n, name: grad_n}"
-CHANNEL = '{_target_: ep2sindy.prepare.keep_where, condition: "z < 0.025"}'
-BY_CELLS = "{_target_: ep2sindy.prepare.gradient, of: flux_i, name: div_i}"
-FLUX = '{_target_: ep2sindy.prepare.derive, name: flux, expression: "n_i*u_iz", units: "m^-2/s"}'
-OF_AVERAGES = "{_target_: ep2sindy.prepare.gradient, of: flux, name: div_i}"
+NEUTRALS = "{_target_: ep2sindy.data.gradient, of: n_n, name: grad_n}"
+CHANNEL = '{_target_: ep2sindy.data.keep_where, condition: "z < 0.025"}'
+BY_CELLS = "{_target_: ep2sindy.data.gradient, of: flux_i, name: div_i}"
+FLUX = '{_target_: ep2sindy.data.derive, name: flux, expression: "n_i*u_iz", units: "m^-2/s"}'
+OF_AVERAGES = "{_target_: ep2sindy.data.gradient, of: flux, name: div_i}"
 NO_WALLS = "terms=[n_i,ionization,div_i,grad_n]"
 VARIANTS = {
     "with 1, n_i and n_n": ["terms=[1,n_i,n_n,ionization,wall_loss,div_i,grad_n]"],

@@ -59,7 +59,7 @@ def tube() -> list[Signal]:
             "p*v": -0.1 * w * power, "p^2*v": -w * (0.35 + 0.07 * (power - 1.0) ** 2),
             "p^3": -0.1 * w**2 * power,
         }  # fmt: skip
-        coef = ep.coef_matrix(library, [{"v": 1.0}, second])
+        coef = ep.model.coef_matrix(library, [{"v": 1.0}, second])
         model = ep.SparseModel(library, ["p", "v"], coef)
         x = model.simulate(np.arange(4200) / 10.8, [0.5, 0.0]).states[600:, 0]
         x = x + TUBE_NOISE * x.std() * rng.standard_normal(len(x))

@@ -48,6 +48,7 @@ from benchmarks.living import DOWNSTREAM, POINTS, parts, record
 from benchmarks.many_states import lorenz_96
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation import supports
+from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.model.inputs import COURSES, curve_through
@@ -58,7 +59,7 @@ from ep2sindy.systems.systems import System, lorenz
 from tests.models import model_of
 
 
-def judged(system: System, found: ep.discovery.Estimate, cpu_s: float) -> dict[str, float]:
+def judged(system: System, found: Estimate, cpu_s: float) -> dict[str, float]:
     """Whether the support is right, and of a right one errors and coverage."""
     true, coef = system.model.coef, found.model.coef
     right = bool(((coef != 0.0) == (true != 0.0)).all())
@@ -195,7 +196,7 @@ SHORT: dict[str, Callable[[int], list[ep.Trajectory]]] = {
 }
 
 
-def _largest_miss(found: ep.discovery.Estimate) -> float:
+def _largest_miss(found: Estimate) -> float:
     """RMS of what the model, run from each sample of its path, misses of the next, in noise."""
     squares, n_steps, own = np.zeros(len(found.noise_std)), 0, found.model
     for path, run in zip(found.paths, found.runs, strict=True):
@@ -279,7 +280,7 @@ def _large(system: System, library: ep.Library, number: int) -> None:
     run = system.trajectory(noise=0.05, rng=number)
     start = time.process_time()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ep.warnings.SlowSearch)
+        warnings.simplefilter("ignore", ep.discovery.SlowSearch)
         found = ep.estimate(run, library)
     cpu_s = time.process_time() - start
     truth = system.model
@@ -296,7 +297,7 @@ def thruster() -> None:
     """Six operating points: the estimator's own model, and what free runs choose of its fronts."""
     for label in POINTS:
         fitted, held = parts(record(label, DOWNSTREAM).run, "last")
-        for rule in (ep.Evidence(), ep.FreeRunScore()):
+        for rule in (ep.discovery.Evidence(), ep.FreeRunScore()):
             start = time.process_time()
             method = ep.TrajectorySearch(max_terms=4, selection=rule, depth=2)
             found = ep.discover(fitted, ep.polynomial(["n_i", "n_n"], degree=2), method)
@@ -332,7 +333,7 @@ def collected_draw(name: str, noise: float, number: int) -> Judged:
     return Judged(name, missed, false, failure, cpu_s, row.get("inside", np.nan))
 
 
-def _failure(system: System, runs: Sequence[ep.Trajectory], found: ep.discovery.Estimate) -> str:
+def _failure(system: System, runs: Sequence[ep.Trajectory], found: Estimate) -> str:
     """The class of a wrong model, see the module; with what the truth lacks in likelihood."""
     if found.misfit:
         return "flagged"
@@ -349,7 +350,7 @@ def _failure(system: System, runs: Sequence[ep.Trajectory], found: ep.discovery.
     return "near" if min(known) > 0.05 else f"less likely ({behind:.0f})"
 
 
-def _behind(system: System, runs: Sequence[ep.Trajectory], found: ep.discovery.Estimate) -> float:
+def _behind(system: System, runs: Sequence[ep.Trajectory], found: Estimate) -> float:
     """-2 log likelihood of the true terms minus that of those found, with the terms' prices."""
     problem = scale_problem(runs, system.model.library)
     scores = []

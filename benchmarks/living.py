@@ -101,7 +101,7 @@ class Case:
     share: of starts around the cycle that reach it. processes: name -> ratio to the record and R2.
     """
 
-    run: ep.Evaluation
+    run: ep.model.Evaluation
     n_free: int
     multiplier: float
     share: float
@@ -254,10 +254,10 @@ def case(
     cpu_s, model = time.process_time() - begun, found.model
     run = ep.evaluate(model, judged, initial=start_of(judged, model))
     multiplier = share = float("nan")
-    if run.status is ep.Status.SUSTAINED and (cycle := run.cycle) is not None:
+    if run.status is ep.model.Status.SUSTAINED and (cycle := run.cycle) is not None:
         multiplier = float(np.abs(cycle.multipliers[1:]).max())
         share = run.share_reaching
-    confirmed = run.status is not ep.Status.SUSTAINED or lives_on(model, judged)
+    confirmed = run.status is not ep.model.Status.SUSTAINED or lives_on(model, judged)
     held = found.constraint
     n_free = int(np.count_nonzero(model.coef)) if held is None else len(held.free)
     processes = {p.name: (p.ratio, p.r2) for p in whole.processes(model, held)}
@@ -290,7 +290,7 @@ def parts(run: ep.Trajectory, split: str) -> tuple[ep.Trajectory, ep.Trajectory]
 
 def line(name: str, cases: Sequence[Case]) -> str:
     """How many live, and the median and the worst of each figure of those that have it."""
-    living = [each for each in cases if each.run.status is ep.Status.SUSTAINED]
+    living = [each for each in cases if each.run.status is ep.model.Status.SUSTAINED]
     wrong = sum(not each.confirmed for each in cases)
     if not living:
         return f"{name:24s} 0 of {len(cases)} live: {[c.run.text for c in cases][:3]}"
@@ -303,7 +303,9 @@ def line(name: str, cases: Sequence[Case]) -> str:
     )
     shares = [c.share for c in living]
     cpu_s = np.median([c.cpu_s for c in cases])
-    lost = Counter(each.run.text for each in cases if each.run.status is not ep.Status.SUSTAINED)
+    lost = Counter(
+        each.run.text for each in cases if each.run.status is not ep.model.Status.SUSTAINED
+    )
     return (
         f"{name:24s} {len(living)} of {len(cases)} live ({wrong} refuted); f {f} %; "
         f"amplitude {amplitude} %; waveform {waveform}; free coefficients {n_free}; multiplier "
@@ -365,7 +367,7 @@ def print_law(search: Callable) -> None:
 
 def by_the_record(
     found: ep.Discovery, compared: Sequence[ComparedProcess], judged: ep.Trajectory
-) -> ep.Evaluation:
+) -> ep.model.Evaluation:
     """The terms of a model with the coefficients of the record, run freely."""
     held, model = found.constraint, found.model
     assert held is not None

@@ -126,7 +126,7 @@ def hallthruster() -> None:
 
 
 def pendulum() -> None:
-    run = ep.datasets.pendulum_swing()
+    run = ep.data.pendulum_swing()
     held_out = f"held_out={1.0 - 3.6 / 5.5}"
     for words, more in {
         "as it comes": [],
@@ -149,7 +149,7 @@ def pendulum() -> None:
 
 def populations() -> None:
     """Hare and lynx over 14 of 21 years, Gause over 12 of 18 days: all terms, and named ones."""
-    for run, n_fitted in ((ep.datasets.hare_lynx(), 14), (ep.datasets.gause(), 12)):
+    for run, n_fitted in ((ep.data.hare_lynx(), 14), (ep.data.gause(), 12)):
         first, second = run.state_names
         both = f"{first}*{second}"
         named = {first: (first, both), second: (second, both)}
@@ -158,7 +158,7 @@ def populations() -> None:
             found = ep.discover(run.window(0, n_fitted), library)
             print(f"\n{run.label}, {words}\n{found.model.text()}\n  {found.note}")
             if found.model.coef.any():
-                skill = ep.forecast_skill(found.model, run, n_fitted=n_fitted)
+                skill = ep.model.forecast_skill(found.model, run, n_fitted=n_fitted)
                 print(f"  {skill.text}; one step ahead {skill.at(run.dt_s)}")
                 print(f"  bands of 90 % hold {100 * skill.coverage_90:.0f} %", flush=True)
 
@@ -218,7 +218,7 @@ def bands() -> None:
                 run = system.trajectory(noise=noise, rng=seed)
                 n = round(0.75 * run.n_samples)
                 model = ep.discover(run.window(0, n), library_of(system)).model
-                held.append(ep.forecast_skill(model, run, n_fitted=n, starts=20).coverage_90)
+                held.append(ep.model.forecast_skill(model, run, n_fitted=n, starts=20).coverage_90)
             print(
                 f"{system.name}, {100 * noise:.0f} % noise: bands of 90 % hold "
                 f"{100 * np.mean(held):.1f} % ({100 * min(held):.0f} to {100 * max(held):.0f})",
@@ -316,7 +316,9 @@ def hidden() -> None:
                     if low < high  # the others set the scale of a hidden state
                 ]
             cycle_s = 1.0 / crossing_frequency(run.t, run.states[:, 0])
-            skill = ep.forecast_skill(found.model, run, n_fitted=n, horizon_s=N_CYCLES * cycle_s)
+            skill = ep.model.forecast_skill(
+                found.model, run, n_fitted=n, horizon_s=N_CYCLES * cycle_s
+            )
             nearer += bool(np.mean(skill.nrmse["model"]) < np.mean(skill.nrmse["autoregression"]))
             held.append(skill.coverage_90)
         print(
@@ -362,7 +364,7 @@ def neutrals(voltage: float, flow: float) -> None:
     run = ep.Trajectory(both.t, both.columns(["n_i"]), ["n_i"], units={"n_i": "m^-3"})
     n = round(0.75 * run.n_samples)
     found = ep.discover(run.window(0, n), hidden=["g"])
-    states = ep.estimate_states(found.model, run)
+    states = ep.model.estimate_states(found.model, run)
     free = ep.evaluate(found.model, states.window(n, run.n_samples))
     alike = np.corrcoef(states.columns(["g"])[n:, 0], both.columns(["n_n"])[n:, 0])[0, 1]
     print(

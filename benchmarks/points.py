@@ -51,7 +51,12 @@ ERRORS = ("error_alone", "error_law")
 # where a wrong support can lead its size by a hair; the criterion weighs them again under the
 # candidate.
 METHOD = ep.Regression(
-    ep.WeightedWeak(ep.Weak(test_functions=ep.Bumps(half_width_s=1.5), split=ep.RandomSplit(0.0))),
+    ep.WeightedWeak(
+        ep.Weak(
+            test_functions=ep.regression.Bumps(half_width_s=1.5),
+            split=ep.regression.RandomSplit(0.0),
+        )
+    ),
     ep.BestSubset(n_best=5),
     selection=ep.EBIC(),
     depth=5,
@@ -130,7 +135,7 @@ VOLTAGES, FLOWS = (290.0, 310.0, 330.0, 350.0, 370.0), (4.0, 4.375, 4.75, 5.125,
 N_BETWEEN = 20
 DEFAULT_SPEED = ep.thruster.OPERATING_POINTS[3].neutral_speed
 # Those of the study: 20 windows of two periods.
-HOW = FittingSettings(CUBIC, ep.Differential(split=ep.RandomSplit(0.0)), 20, 2.0)
+HOW = FittingSettings(CUBIC, ep.Differential(split=ep.regression.RandomSplit(0.0)), 20, 2.0)
 
 
 def recorded(point: tuple[float, float]) -> ep.Trajectory:

@@ -115,14 +115,14 @@ import ep2sindy as ep
 prey = ep.lotka_volterra()
 library = ep.named_terms(["x", "y"], ["x", "y"])
 rates = [{name: prey.model.terms(name)[name]} for name in ("x", "y")]
-known = ep.SparseModel(library, ["x", "y"], ep.coef_matrix(library, rates))
+known = ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, rates))
 torch.manual_seed(0)
 last = torch.nn.Linear(4, 2)
 torch.nn.init.zeros_(last.weight)
 torch.nn.init.zeros_(last.bias)
 network = torch.nn.Sequential(torch.nn.Linear(2, 4), torch.nn.Tanh(), last)
 run = prey.trajectory(noise=0.01, rng=0)
-fit = ep.refine_with_correction(
+fit = ep.refinement.refine_with_correction(
     known, [run], network, window=15, n_windows=4, seed=0,
     method=ep.refinement.GradientDescent(max_iter=4),
 )

@@ -58,7 +58,7 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
     n = round(0.75 * measured.n_samples)
     chosen = ep.embed(signal.window(0, n))
     states = chosen.along(signal.run)  # starts of other runs, and figures
-    bounds = ep.FreeRunBounds(frequency=0.005, amplitude=0.05)
+    bounds = ep.model.FreeRunBounds(frequency=0.005, amplitude=0.05)
     rule = FreeRunScore(bounds=bounds, n_windows=40, judged=(NAME,), n_starts=8, seed=seed)
     search = BestSubset(max_terms=5, n_best=8)
     method = Regression(search=search, selection=rule, bootstraps=Bootstraps(n=0), depth=8)
@@ -67,7 +67,7 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
     record = np.column_stack([clean.states[:, 0], states.states[:, 1]])
     held = Trajectory(states.t, record, states.state_names).window(n, states.n_samples)
 
-    def run_from(k: int) -> ep.Evaluation:
+    def run_from(k: int) -> ep.model.Evaluation:
         part = held.window(k, held.n_samples)
         return evaluate(model, part, initial=states.states[n + k], judged=(NAME,))
 

@@ -23,13 +23,12 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Loky
 from ep2sindy.selection.criteria import EBIC, Selection
 from ep2sindy.selection.free_run import FreeRunScore
-from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.systems.draws import realization
 
 SYSTEMS = ("lotka_volterra", "van_der_pol", "oscillator", "lorenz")
 NOISES = (0.0, 0.05, 0.2)
 RULES: dict[str, Selection] = {
-    "RefinedScore": RefinedScore(),
+    "windows": FreeRunScore(bounds=None),
     "FreeRunScore": FreeRunScore(),
     "EBIC": EBIC(),
 }

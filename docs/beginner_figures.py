@@ -34,7 +34,9 @@ def front_figure(found: ep.Discovery) -> Figure:
     return figure
 
 
-def runs_figure(held_out: ep.Trajectory, dead: ep.Evaluation, free: ep.Evaluation) -> Figure:
+def runs_figure(
+    held_out: ep.Trajectory, dead: ep.model.Evaluation, free: ep.model.Evaluation
+) -> Figure:
     figure, axes = make_panels(1, 1, (7.6, 2.6))
     ax, since = axes[0, 0], 1e3 * (held_out.t - held_out.t[0])
     n = int(SHOWN_S / held_out.dt_s)

@@ -5,22 +5,16 @@ __version__: str
 from ep2sindy.data.trajectory import Trajectory as Trajectory
 from ep2sindy.data.open import open_field as open_field  # for configs
 from ep2sindy.data.open import inspect_file as inspect_file
-from ep2sindy.data.open import read_field as read_field  # for configs
-from ep2sindy.data.open import write_field as write_field
 from ep2sindy.data.run_files import read_runs as read_runs
 from ep2sindy.data.zones import zone_average as zone_average
 from ep2sindy.data.sampling import zone_averages as zone_averages
-from ep2sindy.data.sampling import point_samples as point_samples
 from ep2sindy.data.zones import Zone as Zone  # for configs
-from ep2sindy.data.mapping import Variable as Variable  # for configs
-from ep2sindy.library.units import Clock as Clock
 
 # Libraries
 from ep2sindy.library.library import Library as Library
 from ep2sindy.library.library import polynomial as polynomial
 from ep2sindy.library.library import named_terms as named_terms
 from ep2sindy.library.roles import Roles as Roles  # for configs
-from ep2sindy.signals.delay import Delay as Delay
 
 # Discover
 from ep2sindy.discovery.discover import discover as discover
@@ -41,40 +35,21 @@ from ep2sindy.regression.bootstraps import Bootstraps as Bootstraps  # for confi
 from ep2sindy.regression.formulations import Differential as Differential  # for configs
 from ep2sindy.regression.formulations import Weak as Weak  # for configs
 from ep2sindy.regression.formulations import WeightedWeak as WeightedWeak  # for configs
-from ep2sindy.regression.windows import Bumps as Bumps  # for configs
-from ep2sindy.regression.windows import Boxes as Boxes  # for configs
-from ep2sindy.regression.formulations import RandomSplit as RandomSplit  # for configs
-from ep2sindy.regression.formulations import BlockSplit as BlockSplit  # for configs
 
 # Selection
 from ep2sindy.selection.criteria import EBIC as EBIC  # for configs
 from ep2sindy.selection.criteria import Knee as Knee  # for configs
-from ep2sindy.selection.criteria import Evidence as Evidence  # for configs
-from ep2sindy.selection.refined import RefinedScore as RefinedScore  # for configs
 from ep2sindy.selection.free_run import FreeRunScore as FreeRunScore  # for configs
-from ep2sindy.model.comparison import FreeRunBounds as FreeRunBounds  # for configs
 
 # Models
 from ep2sindy.model.model import SparseModel as SparseModel
 from ep2sindy.forecasting.evaluation import evaluate as evaluate
-from ep2sindy.forecasting.evaluation import Evaluation as Evaluation
-from ep2sindy.model.comparison import Status as Status
-from ep2sindy.model.model import coef_matrix as coef_matrix
 
 # Forecasts
 from ep2sindy.forecasting.forecast import forecast as forecast
-from ep2sindy.forecasting.forecast import Forecast as Forecast
-from ep2sindy.forecasting.skill import forecast_skill as forecast_skill
-from ep2sindy.forecasting.skill import ForecastSkill as ForecastSkill
-from ep2sindy.forecasting.state_estimation import estimate_states as estimate_states
 
 # Refinement
 from ep2sindy.refinement.refine import refine as refine
-from ep2sindy.refinement.refine import Refinement as Refinement
-from ep2sindy.refinement.problem import RefinementSettings as RefinementSettings
-from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
-from ep2sindy.library.relations import constraint as constraint
-from ep2sindy.library.relations import Constraint as Constraint
 
 # Systems
 from ep2sindy.systems.systems import lorenz as lorenz  # for configs
@@ -90,7 +65,6 @@ from ep2sindy.trust.user_code import for_configs as for_configs
 
 # Rooms
 from ep2sindy import data as data
-from ep2sindy import prepare as prepare
 from ep2sindy import library as library
 from ep2sindy import discovery as discovery
 from ep2sindy import regression as regression
@@ -100,7 +74,4 @@ from ep2sindy import signals as signals
 from ep2sindy import operating as operating
 from ep2sindy import thruster as thruster
 from ep2sindy import systems as systems
-from ep2sindy import datasets as datasets
 from ep2sindy import parallel as parallel
-from ep2sindy import sklearn as sklearn
-from ep2sindy import warnings as warnings

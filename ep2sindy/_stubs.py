@@ -77,7 +77,7 @@ def rooms() -> list[str]:
 
 @cache
 def dotted_names() -> dict[str, Entry]:
-    """All names, in full: `ep2sindy.EBIC`, `ep2sindy.prepare.crop`; but for the rooms."""
+    """All names, in full: `ep2sindy.EBIC`, `ep2sindy.data.crop`; but for the rooms."""
     return {
         f"{room}.{name}": entry
         for room in rooms()

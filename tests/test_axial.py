@@ -9,6 +9,7 @@ import ep2sindy as ep
 from benchmarks.hallthruster import calibrated_run
 from ep2sindy.thruster.axial.electron_kernels import solve_from_both_ends
 from ep2sindy.thruster.axial.model import cell_faces
+from ep2sindy.thruster.propellants import PropellantTable
 from ep2sindy.thruster.verdict import cycle_peaks, diagnose, judge_status, multiplicity
 from tests.thrusters import POINT, brief
 
@@ -236,7 +237,7 @@ def test_efficiency_is_by_the_mean_power(run):
 def cold_xenon(hottest_eV):
     T = np.linspace(1.0, hottest_eV, 30)
     xenon = ep.thruster.XenonFits()
-    table = ep.thruster.PropellantTable(
+    table = PropellantTable(
         name="cold xenon", mass=xenon.mass, ionization_eV=12.13, excitation_eV=8.32,
         T_e_eV=tuple(T),
         ionization_rate=tuple(xenon.ionization(T)),

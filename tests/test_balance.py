@@ -39,8 +39,8 @@ def test_the_balance_of_the_whole_channel_closes_term_by_term(exact: xr.Dataset)
 
 
 def test_continuity_closes_in_every_cell_with_gradients_by_faces(field: xr.Dataset) -> None:
-    ions = ep.prepare.gradient(field, of="n_i*u_iz", name="div")
-    neutrals = ep.prepare.gradient(field, of="face_flux_n", name="div")
+    ions = ep.data.gradient(field, of="n_i*u_iz", name="div")
+    neutrals = ep.data.gradient(field, of="face_flux_n", name="div")
     born = field["ionization"] - field["wall_loss"]
     for density, side, sign in (("n_i", ions, 1.0), ("n_n", neutrals, -1.0)):
         left = field[f"d{density}_dt"] - sign * born + side["div"]
@@ -100,7 +100,7 @@ def data(field: xr.Dataset) -> ep.Trajectory:
 
 def model_of(ions: dict[str, float], neutrals: dict[str, float]) -> ep.SparseModel:
     library = ep.polynomial(STATES, degree=2)
-    coef = ep.coef_matrix(library, [ions, neutrals])
+    coef = ep.model.coef_matrix(library, [ions, neutrals])
     return ep.SparseModel(library, STATES, coef, dict.fromkeys(STATES, "m^-3"))
 
 
@@ -183,7 +183,9 @@ def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exac
     }  # fmt: skip
     model, held_to = under(ROLES, values)
     parts = split_in_time(data, 0.25)
-    beside = model_balance(model, held_to, data, *parts, Zones({"": exact}), ep.FreeRunBounds())
+    beside = model_balance(
+        model, held_to, data, *parts, Zones({"": exact}), ep.model.FreeRunBounds()
+    )
     roles = {(each.part.split(",")[0], each.term): each for each in beside.terms}
     assert [each.term for each in beside.terms] == ["1", "n_i*n_n", "n_i", "n_n"]
     entering = roles["neutrals that enter", "1"]
@@ -204,7 +206,9 @@ def test_a_process_left_out_leaves_those_that_share_its_coefficient(data, exact,
     roles = replace(ROLES, exchange=[("n_n", "n_i"), ("n_i", "n_n", {"n_i": 1e5})])
     model, held_to = under(roles, values) if told else under(ROLES, values | {back: 1e5})
     parts = split_in_time(data, 0.25)
-    beside = model_balance(model, held_to, data, *parts, Zones({"": exact}), ep.FreeRunBounds())
+    beside = model_balance(
+        model, held_to, data, *parts, Zones({"": exact}), ep.model.FreeRunBounds()
+    )
     found = {(each.part.split(",")[0], each.term): each for each in beside.terms}
     returned = found["ions that become neutrals", "n_i"]
     assert returned.is_known == told
@@ -221,9 +225,9 @@ def test_a_process_left_out_leaves_those_that_share_its_coefficient(data, exact,
 
 def test_a_model_with_functions_has_no_processes(data: ep.Trajectory, exact: xr.Dataset) -> None:
     library = ep.polynomial(STATES, degree=1, functions=["sqrt(n_i)"])
-    coef = ep.coef_matrix(library, [{"n_i": -1e5, "sqrt(n_i)": 1e14}, {"n_n": -1e5}])
+    coef = ep.model.coef_matrix(library, [{"n_i": -1e5, "sqrt(n_i)": 1e14}, {"n_n": -1e5}])
     model = ep.SparseModel(library, STATES, coef, dict.fromkeys(STATES, "m^-3"))
     parts = split_in_time(data, 0.25)
-    beside = model_balance(model, None, data, *parts, Zones({"": exact}), ep.FreeRunBounds())
+    beside = model_balance(model, None, data, *parts, Zones({"": exact}), ep.model.FreeRunBounds())
     assert not beside.processes
     assert {each.part for each in beside.terms} == {*STATES}

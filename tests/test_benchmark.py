@@ -49,8 +49,7 @@ def benchmark(
     progress: Callable[[int], None] = lambda n_more: None,
     **settings,
 ) -> pd.DataFrame:
-    defaults = {"n_trajectories": 1, "degree": None, "parallel": Serial()}
-    defaults |= {"definitions": {}, "thesis": {}}
+    defaults = {"n_trajectories": 1, "degree": None, "parallel": Serial(), "definitions": {}}
     study = Study(variants=list(variants), **(defaults | settings))
     return study.outcomes(variants, seed=seed, progress=progress)
 

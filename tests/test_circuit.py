@@ -12,6 +12,7 @@ from ep2sindy.thruster.axial.model import build_model, cell_faces, lengths_and_c
 from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.axial.starts import GuessedStart
 from ep2sindy.thruster.axial.state_kernels import CURRENT, SUPPLY, VOLTAGE
+from ep2sindy.thruster.plane.simulate import OPERATING_POINT_2D, THRUSTER_2D
 from tests.thrusters import POINT, brief
 
 COIL = ep.thruster.Circuit(inductance=1e-4)
@@ -163,7 +164,7 @@ def bohm(z, t, plasma):
     ],
 )
 def test_the_z_r_model_refuses_what_it_does_not_solve(thruster, point, words):
-    shaped = replace(ep.thruster.THRUSTER_2D, **thruster)
-    driven_so = replace(ep.thruster.OPERATING_POINT_2D, **point)
+    shaped = replace(THRUSTER_2D, **thruster)
+    driven_so = replace(OPERATING_POINT_2D, **point)
     with pytest.raises(ValueError, match=f"does not solve {words}"):
         ep.thruster.simulate_2d(shaped, driven_so, progress=False)

@@ -21,7 +21,7 @@ CONFIG = (
 def model(slope: float, width: float, *more: str) -> ep.SparseModel:
     """x' = slope x, known to within `width`, and 1 for every other term."""
     library = ep.polynomial(["x", "y"], degree=2)
-    coef = ep.coef_matrix(library, [{"x": slope}, dict.fromkeys(more, 1.0)])
+    coef = ep.model.coef_matrix(library, [{"x": slope}, dict.fromkeys(more, 1.0)])
     n = int(np.count_nonzero(coef))
     covariance = np.diag(np.full(n, (width / 1.96) ** 2))
     return ep.SparseModel(library, ["x", "y"], coef, {"x": "m", "y": "1"}, {}, covariance)
@@ -122,7 +122,7 @@ def test_the_jobs_of_a_sweep_are_compared_but_for_those_that_failed(
 def test_runs_in_years_are_compared_in_years(
     runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    year = ep.Clock.of("year").seconds
+    year = ep.library.Clock.of("year").seconds
     for folder in runs:
         summary = json.loads((folder / "summary.json").read_text())
         summary |= {"data": {"time_unit": "year"}, "headline": {"one/f_kHz": 0.1e-3 / year}}

@@ -24,7 +24,7 @@ CASES = {
 def test_fused_steps_are_those_of_torchdiffeq(case: str, n_substeps: int) -> None:
     rng, variables = np.random.default_rng(0), sorted({*"xy", *("u" if case == "an input" else "")})
     library = ep.polynomial(variables, degree=3)
-    coef = ep.coef_matrix(library, [*CASES[case].values()])
+    coef = ep.model.coef_matrix(library, [*CASES[case].values()])
     scale, n_inputs = np.array([2.0, 0.5, 3.0])[: len(variables)], len(variables) - 2
     model = ep.SparseModel(library, ["x", "y"], coef)
     ode = ODE.of([ScaledEquations.of(model, scale=scale, step_s=0.2)] * 3)

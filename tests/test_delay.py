@@ -6,7 +6,7 @@ from scipy.stats import gamma
 
 import ep2sindy as ep
 
-RATE, DELAY = 1.3, ep.Delay("x", 2.0, n_stages=4)
+RATE, DELAY = 1.3, ep.signals.Delay("x", 2.0, n_stages=4)
 
 
 def logistic(t: np.ndarray) -> ep.Trajectory:
@@ -14,7 +14,7 @@ def logistic(t: np.ndarray) -> ep.Trajectory:
     names = ["x", *DELAY.names]
     library = ep.polynomial(names, degree=2)
     terms = [{"x": RATE, "x*x_lag4": -RATE}, *DELAY.equations.values()]
-    model = ep.SparseModel(library, names, ep.coef_matrix(library, terms))
+    model = ep.SparseModel(library, names, ep.model.coef_matrix(library, terms))
     return ep.Trajectory(t, model.simulate(t, [0.5] * 5).states[:, :1], ["x"])
 
 
@@ -36,7 +36,7 @@ def test_the_start_is_left_out_until_it_is_forgotten() -> None:
 
 
 def test_a_zone_keeps_its_place_in_the_name() -> None:
-    delay = ep.Delay("n_n@exit", 1.0, n_stages=2)
+    delay = ep.signals.Delay("n_n@exit", 1.0, n_stages=2)
     assert delay.names == ("n_n_lag1@exit", "n_n_lag2@exit")
     assert delay.last == "n_n_lag2@exit"
     assert delay.equations == {
@@ -45,7 +45,7 @@ def test_a_zone_keeps_its_place_in_the_name() -> None:
     }
 
 
-def found_with(run: ep.Trajectory, delay: ep.Delay) -> tuple[ep.Discovery, ep.Trajectory]:
+def found_with(run: ep.Trajectory, delay: ep.signals.Delay) -> tuple[ep.Discovery, ep.Trajectory]:
     long = delay.along(run)
     method = ep.Regression(
         ep.Differential(ep.signals.NoSmoothing()), ep.BestSubset(max_terms=2), ep.FreeRunScore()
@@ -61,13 +61,15 @@ def test_a_search_finds_what_is_delayed_and_leaves_the_stages_as_they_are() -> N
     for state, terms in DELAY.equations.items():
         assert found.model.terms(state) == terms  # to the last digit
     run = ep.evaluate(found.model, long)
-    assert run.status is ep.Status.SUSTAINED
+    assert run.status is ep.model.Status.SUSTAINED
     assert ep.model.limit_cycle(found.model, long.states[-1], period_s=1.0 / run.frequency_Hz["x"])
 
 
 def test_another_delay_does_not_live() -> None:
-    found, long = found_with(logistic(np.arange(0.0, 90.0, 0.05)), ep.Delay("x", 1.0, n_stages=4))
-    assert ep.evaluate(found.model, long).status is not ep.Status.SUSTAINED
+    found, long = found_with(
+        logistic(np.arange(0.0, 90.0, 0.05)), ep.signals.Delay("x", 1.0, n_stages=4)
+    )
+    assert ep.evaluate(found.model, long).status is not ep.model.Status.SUSTAINED
 
 
 @pytest.mark.parametrize(
@@ -83,12 +85,12 @@ def test_runs_without_a_delay_are_refused(state, delay_s, t, message) -> None:
     names = ["z", "u"] if state == "z" else ["x", "x_lag1"]
     run = ep.Trajectory(t, np.column_stack([np.sin(t), np.cos(t)]), names)
     with pytest.raises(ValueError, match=message):
-        ep.Delay(state, delay_s).along(run)
+        ep.signals.Delay(state, delay_s).along(run)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, -1.0, np.inf, np.nan])
 def test_a_delay_is_positive(delay_s: float) -> None:
     with pytest.raises(ValueError, match="delay_s must be positive and finite"):
-        ep.Delay("x", delay_s)
+        ep.signals.Delay("x", delay_s)
     with pytest.raises(ValueError, match="n_stages must be"):
-        ep.Delay("x", 1.0, n_stages=0)
+        ep.signals.Delay("x", 1.0, n_stages=0)

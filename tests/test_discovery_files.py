@@ -50,7 +50,7 @@ def test_a_constraint_that_was_stored_serves_a_refinement() -> None:
     known = found("regression")
     again = ep.Discovery.from_json(known.to_json())
     assert again.constraint is not None
-    settings = ep.RefinementSettings(n_windows=3, window=30)
+    settings = ep.refinement.RefinementSettings(n_windows=3, window=30)
     one, other = (
         ep.refine(each.model, record(), settings, constraint=each.constraint).model
         for each in (known, again)
@@ -66,7 +66,7 @@ def test_rows_are_not_stored_and_who_needs_them_is_told() -> None:
 
 
 class Own:
-    selection = ep.Evidence()
+    selection = ep.discovery.Evidence()
 
     def identify(self, task: Any, *, rng: Any, progress: Any) -> Any:
         return ep.TrajectorySearch(max_terms=2).identify(task, rng=rng, progress=progress)
@@ -91,7 +91,10 @@ METHOD = {"class": "ep2sindy.Regression"}
 BAD: list[tuple[dict[str, Any], str]] = [
     ({"format": "ep2sindy.SparseModel/1"}, "format 'ep2sindy.SparseModel/1'"),
     ({"model": {}}, "a model file must hold"),
-    ({"method": {"class": "ep2sindy.write_field"}}, "no class 'ep2sindy.write_field' may stand"),
+    (
+        {"method": {"class": "ep2sindy.data.write_field"}},
+        "no class 'ep2sindy.data.write_field' may stand",
+    ),
     ({"method": {"class": "os.system"}}, "no class 'os.system' may stand"),
     ({"method": {"class": "ep2sindy.EBIC"}}, "method of another kind: EBIC"),
     ({"method": {**METHOD, "selection": "x"}}, "selection must be a Selection"),

@@ -517,11 +517,11 @@ def method_with(search: ep.TrajectorySearch, selection: object, depth: int) -> o
 
 def test_settings_of_a_given_search_hold_and_none_is_given_twice() -> None:
     deep = ep.TrajectorySearch(depth=3)
-    assert method_with(deep, ep.Evidence(), 1) == deep
+    assert method_with(deep, ep.discovery.Evidence(), 1) == deep
     assert method_with(ep.TrajectorySearch(), RULE, 2) == RULED
-    assert method_with(RULED, ep.Evidence(), 2) == RULED
+    assert method_with(RULED, ep.discovery.Evidence(), 2) == RULED
     with pytest.raises(ValueError, match=r"must be set once: .*search.depth\), and 2 beside"):
-        method_with(deep, ep.Evidence(), 2)
+        method_with(deep, ep.discovery.Evidence(), 2)
     with pytest.raises(ValueError, match="search.selection.*; leave one of them out"):
         method_with(RULED, ep.FreeRunScore(n_folds=3), 1)
 
@@ -529,7 +529,9 @@ def test_settings_of_a_given_search_hold_and_none_is_given_twice() -> None:
 def test_evidence_is_refused_for_fronts_of_rows() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     with pytest.raises(ValueError, match="Evidence weighs what a search of trajectories found"):
-        ep.discover(run, method=ep.Regression(search=ep.BestSubset(), selection=ep.Evidence()))
+        ep.discover(
+            run, method=ep.Regression(search=ep.BestSubset(), selection=ep.discovery.Evidence())
+        )
 
 
 def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
@@ -648,15 +650,15 @@ def test_a_long_search_is_told_of_with_its_time() -> None:
     long = ep.Trajectory(t, np.tile(np.sin(t)[:, None], 7), run.state_names)
     large = ep.polynomial(run.state_names, degree=3)
     said = r"840 coefficients .*, of which 140 .* some 2 minutes of one core and 2.6 GB"
-    with pytest.warns(ep.warnings.SlowSearch, match=said):
+    with pytest.warns(ep.discovery.SlowSearch, match=said):
         cost.check_size([long], large, {})
-    with pytest.warns(ep.warnings.SlowSearch, match="of which 840 .* some 60 minutes"):
+    with pytest.warns(ep.discovery.SlowSearch, match="of which 840 .* some 60 minutes"):
         cost.check_size([long], large, {}, tied=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cost.check_size([run], large, {})
         cost.check_size([long], large, {}, limit_s=200.0)
-    with pytest.warns(ep.warnings.SlowSearch, match="limit_s ends it"):
+    with pytest.warns(ep.discovery.SlowSearch, match="limit_s ends it"):
         cost.check_size([long], large, {}, limit_s=20.0)
 
 

@@ -279,7 +279,7 @@ def test_what_enters_is_net_where_nothing_leaves(outflow, inflow, is_net: bool) 
     np.testing.assert_array_equal(entering.recorded, balance["supply"].values - left)
 
 
-BOXES = ep.Weak(test_functions=ep.Boxes(n_windows=7), errors_in_variables=False)
+BOXES = ep.Weak(test_functions=ep.regression.Boxes(n_windows=7), errors_in_variables=False)
 
 
 def test_fits_are_named_by_what_varies() -> None:
@@ -292,7 +292,9 @@ def test_fits_are_named_by_what_varies() -> None:
     assert list(ways) == [
         "plain", "n_points_5", "n_points_9", "n_windows_7_n_points_5", "n_windows_8_n_points_5",
     ]  # fmt: skip
-    assert ways["n_windows_8_n_points_5"].form.test_functions == ep.Boxes(n_windows=8, n_points=5)
+    assert ways["n_windows_8_n_points_5"].form.test_functions == ep.regression.Boxes(
+        n_windows=8, n_points=5
+    )
     assert [way.of for way in ways.values()] == ["plain", *["lengths"] * 2, *["both"] * 2]
 
 

@@ -81,7 +81,7 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
         ("weak", ["fits.boxes.form=box"], "fits.boxes.form must be null, balance or one of ['boxe"),
         ("weak", ["models.predator_prey.terms.n_n=[q]"], "unknown variables ['q']"),
         ("weak", ["fits.boxes.n_points=[1201]"], "1201 samples were asked of 1200; lower n_points"),
-        ("weak_windows", ["fits.boxes.n_points=[3001]"], "3001 samples were asked of 3000; lower n_points"),
+        ("weak_windows", ["fits.boxes.n_points=[3001]"], "3001 samples were asked of 3000; lower"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(

@@ -17,7 +17,7 @@ CYCLE = {"1": 7.93e9, "I": -2.44e9, "I*g": 1.07e4, "g^3": -1.47e-6}
 @cache
 def signal(n_periods: float) -> tuple[np.ndarray, np.ndarray]:
     library = ep.polynomial(["I", "g"], degree=3)
-    coef = ep.coef_matrix(library, [{"I*g": 1.0}, CYCLE])
+    coef = ep.model.coef_matrix(library, [{"I*g": 1.0}, CYCLE])
     model = ep.SparseModel(library, ["I", "g"], coef)
     t = 1.5e-6 * np.arange(round(54 * (n_periods + 10)))
     return t[:-540], model.simulate(t, [2.0, 1e5]).states[540:, 0]

@@ -46,7 +46,9 @@ def test_a_dataset_keeps_units_and_comes_back_as_a_run() -> None:
 
 
 def test_a_dataset_keeps_the_unit_in_which_times_are_shown() -> None:
-    run = ep.Trajectory(86400.0 * np.arange(40.0), RUN.states, ["x", "y"], clock=ep.Clock.of("day"))
+    run = ep.Trajectory(
+        86400.0 * np.arange(40.0), RUN.states, ["x", "y"], clock=ep.library.Clock.of("day")
+    )
     (again,) = trajectories_of(run.to_xarray())
     assert again.clock == run.clock
     ahead = ep.lotka_volterra().model.simulate(np.linspace(0.0, 20.0, 500), [1.0, 1.0])
@@ -71,7 +73,7 @@ def test_an_index_of_dates_is_time(name: str | None) -> None:
     (run,) = trajectories_of(table)
     assert run.state_names == ("x", "y")
     assert run.t[:3].tolist() == [0.0, 21600.0, 43200.0]
-    assert run.clock == ep.Clock.of("h")
+    assert run.clock == ep.library.Clock.of("h")
 
 
 @pytest.mark.parametrize(
@@ -85,7 +87,7 @@ def test_a_time_column_may_be_called_by_its_unit(
     table = pd.DataFrame({name: np.arange(40.0), "x": RUN.states[:, 0]})
     (run,) = trajectories_of(table.set_index(name) if is_index else table)
     assert run.state_names == ("x",)
-    assert run.clock == ep.Clock.of(unit)
+    assert run.clock == ep.library.Clock.of(unit)
     np.testing.assert_allclose(run.t, seconds * np.arange(40.0), rtol=1e-12)
 
 
@@ -99,7 +101,7 @@ def test_a_field_keeps_the_unit_of_time_of_its_file(tmp_path: Path) -> None:
     table = pd.DataFrame({"day": np.arange(40.0), "x": RUN.states[:, 0]})
     table.to_csv(tmp_path / "a.csv", index=False)
     (run,) = trajectories_of(ep.open_field(tmp_path / "a.csv"))
-    assert run.clock == ep.Clock.of("day")
+    assert run.clock == ep.library.Clock.of("day")
 
 
 def test_a_field_over_a_grid_is_no_run_and_the_error_says_what_makes_one() -> None:

@@ -50,9 +50,9 @@ def test_editors_and_type_checkers_see_the_names(tmp_path: Path) -> None:
         copy.write_bytes(path.read_bytes())
     (tmp_path / "code.py").write_text(
         "import ep2sindy as ep\n"
-        "from ep2sindy.prepare import crop\n"
-        "from ep2sindy.discovery import Estimate\n"
-        "ep.inspect_file, ep.thruster.Thruster, ep.warnings.SlowSearch, ep.__version__\n"
+        "from ep2sindy.data import crop\n"
+        "from ep2sindy.discovery import PointSearch\n"
+        "ep.inspect_file, ep.thruster.Thruster, ep.discovery.SlowSearch, ep.__version__\n"
         "ep.discovre\n"
         "ep.thruster.Thrster\n"
         "ep.crop\n"
@@ -76,7 +76,7 @@ def test_editors_and_type_checkers_see_the_names(tmp_path: Path) -> None:
             "Eebic",
             r"no attribute 'Eebic'; see dir\(ep2sindy\); near it (is|are) ep2sindy.EBIC",
         ),
-        ("ep2sindy.thruster", "crop", r"see dir\(ep2sindy.thruster\); near it is .*prepare.crop$"),
+        ("ep2sindy.thruster", "crop", r"see dir\(ep2sindy.thruster\); near it is .*data.crop$"),
         ("ep2sindy", "_nothing", r"no attribute '_nothing'; see dir\(ep2sindy\)$"),
     ],
 )

@@ -16,7 +16,7 @@ from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
 from tests.models import model_of
 
 LINEAR = ep.polynomial(["x", "v"], degree=1)
-SPRING = ep.SparseModel(LINEAR, ["x", "v"], ep.coef_matrix(LINEAR, [{"v": 1.0}, {"x": -1.0}]))
+SPRING = ep.SparseModel(LINEAR, ["x", "v"], ep.model.coef_matrix(LINEAR, [{"v": 1.0}, {"x": -1.0}]))
 LORENZ = ep.lorenz()
 
 
@@ -69,7 +69,7 @@ def test_nothing_but_the_past_enters() -> None:
     )
     np.testing.assert_array_equal(ours.draws, theirs.draws)
     skills = [
-        ep.forecast_skill(LORENZ.model, each, n_fitted=600, starts=1, horizon_s=0.2)
+        ep.model.forecast_skill(LORENZ.model, each, n_fitted=600, starts=1, horizon_s=0.2)
         for each in (run, other)
     ]
     np.testing.assert_array_equal(skills[0].example.states, skills[1].example.states)
@@ -79,7 +79,7 @@ def test_nothing_but_the_past_enters() -> None:
 def test_bands_hold_what_they_say(system, noise) -> None:
     run = system.trajectory(noise=noise, rng=1)
     n = round(0.75 * run.n_samples)
-    skill = ep.forecast_skill(system.model, run, n_fitted=n, starts=20)
+    skill = ep.model.forecast_skill(system.model, run, n_fitted=n, starts=20)
     assert 0.85 <= skill.coverage_90 <= 0.95
     assert (skill.nrmse["model"] < skill.nrmse["autoregression"]).mean() > 0.9
     furthest = skill.horizons_s[-1] / skill.period_s
@@ -95,7 +95,9 @@ def test_bands_grow_where_the_record_is_pushed() -> None:
     width = (high - low)[:, 0]
     assert width[-20:].mean() > 3.0 * width[:5].mean()
     runs = (spring(0.02, push=0.05, seed=seed) for seed in range(2))
-    held = [ep.forecast_skill(SPRING, run, n_fitted=900, starts=30).coverage_90 for run in runs]
+    held = [
+        ep.model.forecast_skill(SPRING, run, n_fitted=900, starts=30).coverage_90 for run in runs
+    ]
     assert 0.82 <= np.mean(held) <= 0.97  # 300 samples are few when pushes last
 
 
@@ -160,7 +162,7 @@ def test_a_simulation_shows_what_the_coefficients_leave_open() -> None:
 
 def test_a_run_that_diverges_is_not_a_number_and_counts_as_such() -> None:
     library = ep.polynomial(["x"], degree=2)
-    model = ep.SparseModel(library, ["x"], ep.coef_matrix(library, [{"x^2": 1.0}]))
+    model = ep.SparseModel(library, ["x"], ep.model.coef_matrix(library, [{"x^2": 1.0}]))
     coef = draw_coef(model, None, 2, np.random.default_rng(0))
     runs = draw_runs(
         model, np.linspace(0.0, 2.0, 21), np.array([[1.0], [0.1]]), coef, reach=np.ones(1)
@@ -204,7 +206,7 @@ def test_the_other_baselines_go_on_as_they_say() -> None:
 
 def test_where_the_mean_cycle_is_nearer_it_is_said() -> None:
     slow = replace(SPRING, coef=0.97 * SPRING.coef)
-    skill = ep.forecast_skill(slow, spring(0.02), n_fitted=900, starts=20)
+    skill = ep.model.forecast_skill(slow, spring(0.02), n_fitted=900, starts=20)
     assert "the mean cycle, going on, is nearer" in skill.text
 
 
@@ -212,7 +214,7 @@ def test_a_gap_is_no_obstacle() -> None:
     run = spring(0.05)
     kept = np.delete(np.arange(1200), slice(500, 560))
     gappy = Trajectory(run.t[kept], run.states[kept], run.state_names)
-    skill = ep.forecast_skill(SPRING, gappy, n_fitted=800, starts=10)
+    skill = ep.model.forecast_skill(SPRING, gappy, n_fitted=800, starts=10)
     assert "autoregression" not in skill.nrmse
     assert skill.text.startswith("better than persistence for")
     assert 0.8 <= skill.coverage_90 <= 1.0
@@ -224,9 +226,9 @@ def test_a_gap_is_no_obstacle() -> None:
         (lambda: ep.forecast(SPRING, spring(0.05), -1.0), "a positive duration in s, or incr"),
         (lambda: ep.forecast(SPRING, spring(0.05), [5.0, 6.0]), "after the history's end at 119.9"),
         (lambda: ep.forecast(SPRING, spring(0.05), 1.0, measured=["z"]), "measured must name some"),
-        (lambda: ep.forecast_skill(SPRING, spring(0.05), n_fitted=1200), "and leave four"),
+        (lambda: ep.model.forecast_skill(SPRING, spring(0.05), n_fitted=1200), "and leave four"),
         (
-            lambda: ep.forecast_skill(SPRING, spring(0.05), n_fitted=900, horizon_s=40.0),
+            lambda: ep.model.forecast_skill(SPRING, spring(0.05), n_fitted=900, horizon_s=40.0),
             "the horizon must leave room for starts: 40 s came, and 30 s are held out",
         ),
     ],
@@ -256,7 +258,7 @@ def test_rounded_samples_are_compared_as_they_are() -> None:
     fit = estimator.fit_path(record, record.samples)
     residuals = linearise(fit).residuals
     np.testing.assert_allclose(residuals, record.samples - fit.path, rtol=1e-12)
-    skill = ep.forecast_skill(SPRING, rounded, n_fitted=900, starts=10)
+    skill = ep.model.forecast_skill(SPRING, rounded, n_fitted=900, starts=10)
     assert np.mean(skill.nrmse["model"]) < 0.1
 
 

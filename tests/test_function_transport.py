@@ -9,6 +9,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.thruster.axial.settings import to_json
+from ep2sindy.thruster.transport import Plasma
 from tests.thrusters import brief
 
 BRIEF = {"duration_s": 9e-5, "warm_up_s": 3e-5, "n_cells": 30}
@@ -113,7 +114,7 @@ def test_a_config_names_a_marked_function():
     text += "def bare(z, t, plasma):\n    return 1.0\n"
     Path("bohm_of_mine.py").write_text(text.format(0.02))
     made = ep.thruster.FunctionTransport("bohm_of_mine.c")
-    plasma = ep.thruster.Plasma(*np.zeros((6, 2)))
+    plasma = Plasma(*np.zeros((6, 2)))
     np.testing.assert_array_equal(made.at(np.zeros(2), 0.0, plasma), [0.02, 0.02])
     assert made.identity.startswith("bohm_of_mine.c ")
     with pytest.raises(ValueError, match=r"bohm_of_mine\.bare must be for configs: mark it with"):

@@ -186,7 +186,7 @@ def test_equations_are_written_in_every_language() -> None:
 def test_relations_name_terms_with_functions() -> None:
     library = named_terms(["x", "v"], ["1", "1/x", "sin(2*x)*v"])
     both = {"x": ["1", "1/x", "sin(2*x)*v"], "v": ["1/x"]}
-    held = ep.constraint(library, both, ["x: 1/x == -2 * v: 1/x", "x: v*sin(2*x) == 1.5"])
+    held = ep.library.constraint(library, both, ["x: 1/x == -2 * v: 1/x", "x: v*sin(2*x) == 1.5"])
     coef = dict(zip(held.coefficients, held.coef(np.array([7.0, 3.0])), strict=True))
     assert coef[("x", "1/x")] == -2 * coef[("v", "1/x")]
     assert coef[("x", "sin(2*x)*v")] == 1.5
@@ -415,7 +415,7 @@ def test_leaving_a_domain_is_a_verdict() -> None:
     model = model_of({"x": {"1": -1.0, "log(x)": 0.1}})
     run = ep.Trajectory(T, (np.cos(T) + 1.2)[:, None], ["x"])
     judged = ep.evaluate(model, run)
-    assert judged.status is ep.Status.LEAVES_DOMAIN
+    assert judged.status is ep.model.Status.LEAVES_DOMAIN
     assert judged.text.startswith("leaves the domain of log(x) after 2.1")
 
 
@@ -432,7 +432,7 @@ def test_only_functions_that_end_somewhere_have_edges() -> None:
 def test_terms_that_a_model_does_not_have_need_no_domain() -> None:
     """A library may hold log(x) where the model that was chosen runs below zero."""
     library = polynomial(["x"], degree=1, functions=["log"])
-    model = ep.SparseModel(library, ["x"], ep.coef_matrix(library, [{"x": -1.0}]))
+    model = ep.SparseModel(library, ["x"], ep.model.coef_matrix(library, [{"x": -1.0}]))
     below = np.array([[-2.0], [0.0]])
     np.testing.assert_array_equal(model.predict(below), -below)
     run = model.simulate(T, [-1.0])
@@ -494,7 +494,7 @@ def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(
     energy = 0.5 * speed * w**2 + restoring * np.cos(theta)
     assert np.ptp(energy) < 1e-4  # of some 4
     judged = ep.evaluate(found.model, truth)
-    assert judged.status in (ep.Status.SUSTAINED, ep.Status.WRONG_FREQUENCY)
+    assert judged.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
 
 
 def test_intervals_hold_the_truth_where_functions_bend_in_noise() -> None:
@@ -532,7 +532,9 @@ def test_saturation_is_found_in_units_far_from_one() -> None:
 def test_rules_that_run_models_take_functions() -> None:
     run = ep.pendulum().trajectory(noise=0.02, rng=0)
     library = polynomial(run.names, degree=1, functions=["sin(theta)"])
-    recipe = ep.Regression(search=ep.BestSubset(max_terms=1), selection=ep.RefinedScore())
+    recipe = ep.Regression(
+        search=ep.BestSubset(max_terms=1), selection=ep.FreeRunScore(bounds=None)
+    )
     found = ep.discover(run, library, recipe).model
     assert set(found.terms("w")) == {"sin(theta)"}
 

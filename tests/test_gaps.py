@@ -97,7 +97,7 @@ def test_the_noise_that_a_tracker_finds_does_not_know_of_a_gap() -> None:
 
 
 def test_states_that_nobody_measured_follow_the_model_on_both_sides_of_a_gap() -> None:
-    found = ep.estimate_states(LV, Trajectory(GAPPY.t, GAPPY.columns(["x"]), ["x"]))
+    found = ep.model.estimate_states(LV, Trajectory(GAPPY.t, GAPPY.columns(["x"]), ["x"]))
     assert found.n_samples == GAPPY.n_samples
     off = found.columns(["y"]) - GAPPY.columns(["y"])
     assert off.std() < 0.15 * WHOLE.columns(["y"]).std()

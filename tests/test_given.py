@@ -166,14 +166,14 @@ def test_arrays_lack_samples_as_tables_do() -> None:
     holes[9] = np.nan
     table = pd.DataFrame({"time": TIMES, "x0": holes[:, 0], "x1": holes[:, 1]})
     for partial in (False, True):
-        with pytest.warns(ep.warnings.MissingSamples, match="NaN"):
+        with pytest.warns(ep.data.MissingSamples, match="NaN"):
             (ours,) = trajectories_of((TIMES, holes), partial=partial)
-        with pytest.warns(ep.warnings.MissingSamples):
+        with pytest.warns(ep.data.MissingSamples):
             (theirs,) = trajectories_of(table, partial=partial)
         assert ours.n_samples == len(TIMES) - (1 if partial else 2)
         np.testing.assert_array_equal(ours.states, theirs.states)
     with (
-        pytest.warns(ep.warnings.MissingSamples),
+        pytest.warns(ep.data.MissingSamples),
         pytest.raises(ValueError, match=r"an input needs a value at every sample: \['x0'\] lack"),
     ):
         trajectories_of(table, inputs=["x0"], partial=True)

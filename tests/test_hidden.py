@@ -65,7 +65,7 @@ def test_the_model_tells_the_hidden_states_of_a_record() -> None:
     system = ep.lorenz()
     truth, states = (
         system.trajectory(),
-        ep.estimate_states(system.model, only("x", system=system).window(0, 1500)),
+        ep.model.estimate_states(system.model, only("x", system=system).window(0, 1500)),
     )
     assert states.state_names == ("x", "y", "z")
     for name in "yz":
@@ -81,7 +81,7 @@ def test_forecasts_need_the_measured_states_alone(found: ep.Discovery) -> None:
     after = run.states[800 : 800 + len(low), 0]
     assert 0.8 < np.mean((low <= after) & (after <= high)) <= 1.0
     assert np.isnan(ahead.noise_std[1])
-    skill = ep.forecast_skill(found.model, run, n_fitted=750, starts=10)
+    skill = ep.model.forecast_skill(found.model, run, n_fitted=750, starts=10)
     assert np.mean(skill.nrmse["model"]) < 0.5 * np.mean(skill.nrmse["persistence"])
     assert 0.75 <= skill.coverage_90 <= 1.0
 
@@ -225,9 +225,12 @@ def test_what_was_not_measured_counts_nothing() -> None:
             lambda: ep.discover(only("x"), method=ep.Regression(), hidden=["g"]),
             "a regression needs samples of every state",
         ),
-        (lambda: ep.estimate_states(ep.pendulum().model, only("x")), "some of the model's states"),
         (
-            lambda: ep.estimate_states(ep.lorenz().model, only("z", system=ep.lorenz())),
+            lambda: ep.model.estimate_states(ep.pendulum().model, only("x")),
+            "some of the model's states",
+        ),
+        (
+            lambda: ep.model.estimate_states(ep.lorenz().model, only("z", system=ep.lorenz())),
             "none of .'x', 'y'. does in those of .'z'.; measure one",
         ),
     ],

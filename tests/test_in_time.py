@@ -35,7 +35,7 @@ def test_resampling_finer_follows_a_smooth_signal_to_fourth_order() -> None:
     errors = []
     for n in (50, 100, 200):
         t = np.linspace(0.0, 1.0, n + 1)
-        fine = ep.prepare.resample(field_of(t, x=np.sin(OMEGA * t)), dt_s=0.37 / n)
+        fine = ep.data.resample(field_of(t, x=np.sin(OMEGA * t)), dt_s=0.37 / n)
         errors.append(np.abs(fine["x"].values - np.sin(OMEGA * fine["time"].values)).max())
         assert np.ptp(np.diff(fine["time"].values)) < 1e-12
     slopes = np.diff(np.log2(errors))
@@ -44,7 +44,7 @@ def test_resampling_finer_follows_a_smooth_signal_to_fourth_order() -> None:
 
 def test_resampling_coarser_takes_means_of_what_lies_between() -> None:
     t = np.linspace(0.0, 1.0, 1001)
-    coarse = ep.prepare.resample(
+    coarse = ep.data.resample(
         field_of(t, line=2 + 3 * t, fast=np.sin(2 * np.pi * 250 * t)), dt_s=0.1
     )
     at = coarse["time"].values
@@ -54,13 +54,13 @@ def test_resampling_coarser_takes_means_of_what_lies_between() -> None:
 
 
 def test_resampling_takes_unequal_steps_and_leaves_masks_and_maps(tmp_path: Path) -> None:
-    even = ep.prepare.resample(plane(T), dt_s=0.001)
+    even = ep.data.resample(plane(T), dt_s=0.001)
     assert even["x"].dims == ("time", "z")
     np.testing.assert_allclose(even["x"].values[:, 1], 2 * even["time"].values, atol=1e-12)
     assert np.isnan(even["x"].values[:, 2]).all()
     assert list(even.data_vars) == ["x", "B", "I_d"]
     np.testing.assert_array_equal(even["B"].values, [1.0, 2.0, 3.0])
-    ep.write_field(even, tmp_path / "even.nc")  # which checks that it is a field
+    ep.data.write_field(even, tmp_path / "even.nc")  # which checks that it is a field
 
 
 def gappy() -> xr.Dataset:
@@ -71,21 +71,21 @@ def gappy() -> xr.Dataset:
 
 
 def test_interpolation_fills_gaps_by_straight_lines() -> None:
-    np.testing.assert_allclose(ep.prepare.interpolate(gappy())["x"].values, 2 * np.arange(11.0))
-    outside = ep.prepare.interpolate(plane(T))
+    np.testing.assert_allclose(ep.data.interpolate(gappy())["x"].values, 2 * np.arange(11.0))
+    outside = ep.data.interpolate(plane(T))
     assert np.isnan(outside["x"].values[:, 2]).all()
 
 
 def test_gaps_too_long_or_at_an_end_are_refused() -> None:
     with pytest.raises(ValueError, match="max_gap_s = 2 s: x is missing from 2 to 5 s"):
-        ep.prepare.interpolate(gappy(), max_gap_s=2.0)
+        ep.data.interpolate(gappy(), max_gap_s=2.0)
     with pytest.raises(ValueError, match="x holds numbers from 5 to 10 s, .*; crop it first"):
-        ep.prepare.interpolate(gappy().isel(time=slice(3, None)))
+        ep.data.interpolate(gappy().isel(time=slice(3, None)))
 
 
 def test_a_delay_is_the_signals_past() -> None:
     t = np.linspace(0.0, 1.0, 101)
-    field = ep.prepare.delay(field_of(t, x=np.sin(3 * t)), variable="x", delay_s=0.105)
+    field = ep.data.delay(field_of(t, x=np.sin(3 * t)), variable="x", delay_s=0.105)
     later = field["time"].values
     assert later[0] == pytest.approx(0.11)
     # straight lines over 0.01 s: x'' h^2 / 8
@@ -95,7 +95,7 @@ def test_a_delay_is_the_signals_past() -> None:
 
 
 def test_derivatives_at_unequal_steps_are_exact_for_parabolas() -> None:
-    field = ep.prepare.derivative(plane(T), variable="I_d")
+    field = ep.data.derivative(plane(T), variable="I_d")
     np.testing.assert_allclose(field["dI_d_dt"].values, 2 * T, atol=1e-9)
     assert field["dI_d_dt"].attrs["units"] == "A s^-1"
 
@@ -103,10 +103,10 @@ def test_derivatives_at_unequal_steps_are_exact_for_parabolas() -> None:
 @pytest.mark.parametrize("degree", [1, 2])
 def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> None:
     field = field_of(T, x=5 + (T**degree - (T**degree).mean()) * 7, y=T)
-    flat = ep.prepare.detrend(field, variables=["x"], degree=degree)
+    flat = ep.data.detrend(field, variables=["x"], degree=degree)
     np.testing.assert_allclose(flat["x"].values, 5.0, atol=1e-10)
     np.testing.assert_array_equal(flat["y"].values, T)
-    both = ep.prepare.detrend(plane(T), degree=degree)
+    both = ep.data.detrend(plane(T), degree=degree)
     assert np.isnan(both["x"].values[:, 2]).all()
     np.testing.assert_allclose(both["x"].values[:, 1], 2 * T.mean(), atol=1e-10)
 
@@ -114,14 +114,14 @@ def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> No
 @pytest.mark.parametrize(
     ("step", "settings", "message"),
     [
-        (ep.prepare.resample, {"dt_s": 2.0},
+        (ep.data.resample, {"dt_s": 2.0},
          "leave two samples or more: 2 s came for a record of 1 s"),
-        (ep.prepare.delay, {"variable": "q", "delay_s": 0.1},
+        (ep.data.delay, {"variable": "q", "delay_s": 0.1},
          r"unknown variable .*'q'; .*\['x', 'I_d'\]"),
-        (ep.prepare.delay, {"variable": "x", "delay_s": -0.1}, "delay_s must be positive"),
-        (ep.prepare.delay, {"variable": "x", "delay_s": 0.1, "name": "I_d"},
+        (ep.data.delay, {"variable": "x", "delay_s": -0.1}, "delay_s must be positive"),
+        (ep.data.delay, {"variable": "x", "delay_s": 0.1, "name": "I_d"},
          "a new name: the field already has 'I_d'"),
-        (ep.prepare.detrend, {"degree": 0}, "degree must be 1 or more, .*: 0 came"),
+        (ep.data.detrend, {"degree": 0}, "degree must be 1 or more, .*: 0 came"),
     ],
 )  # fmt: skip
 def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: str) -> None:
@@ -132,15 +132,15 @@ def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: st
 def test_a_step_takes_a_field_and_no_trajectory() -> None:
     run = ep.lotka_volterra().trajectory()
     with pytest.raises(ValueError, match=r"must be an xarray\.Dataset, .*: Trajectory came"):
-        ep.prepare.crop(run, start_s=5.0)
+        ep.data.crop(run, start_s=5.0)
 
 
 def test_steps_that_need_every_sample_name_a_gap() -> None:
     for step, settings in (
-        (ep.prepare.resample, {"dt_s": 0.5}),
-        (ep.prepare.delay, {"variable": "x", "delay_s": 1.0}),
-        (ep.prepare.derivative, {"variable": "x"}),
-        (ep.prepare.detrend, {}),
+        (ep.data.resample, {"dt_s": 0.5}),
+        (ep.data.delay, {"variable": "x", "delay_s": 1.0}),
+        (ep.data.derivative, {"variable": "x"}),
+        (ep.data.detrend, {}),
     ):
         with pytest.raises(ValueError, match=r"x = nan at time = 3 s \(3 such values\)"):
             step(gappy(), **settings)

@@ -184,8 +184,8 @@ def test_columns_of_one_array_are_signals_of_their_own(tmp_path: Path) -> None:
     np.testing.assert_array_equal(field["probe_1"].values, WAVE[:, 1, 0])
     one = ep.open_field(
         tmp_path / "a.mat",
-        variables={"I_d": ep.Variable("probe[:, 1]", "mA")},
-        time=ep.Variable("t_s", "s"),
+        variables={"I_d": ep.data.Variable("probe[:, 1]", "mA")},
+        time=ep.data.Variable("t_s", "s"),
     )
     np.testing.assert_allclose(one["I_d"].values, 1e-3 * WAVE[:, 1, 0])
 
@@ -204,8 +204,8 @@ def test_parts_that_are_not_there_are_refused(tmp_path: Path, name: str, message
     with pytest.raises(ValueError, match=message):
         ep.open_field(
             tmp_path / "a.mat",
-            variables={"I_d": ep.Variable(name, "A")},
-            time=ep.Variable("t", "s"),
+            variables={"I_d": ep.data.Variable(name, "A")},
+            time=ep.data.Variable("t", "s"),
         )
 
 
@@ -219,7 +219,7 @@ def test_a_scalar_may_say_the_step(tmp_path: Path, name: str, value: float) -> N
 @pytest.mark.parametrize(("factor", "unit"), [(1.0, "s"), (1e3, "ms"), (1e6, "us"), (7.0, "s")])
 def test_a_rate_beside_a_time_says_its_unit(tmp_path: Path, factor: float, unit: str) -> None:
     savemat(tmp_path / "a.mat", {"signal": WAVE[:, 0, 0], "t": factor * T, "fs": 1 / 1.5e-6})
-    assert ep.inspect_file(tmp_path / "a.mat").time == ep.Variable("t", unit)
+    assert ep.inspect_file(tmp_path / "a.mat").time == ep.data.Variable("t", unit)
 
 
 def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
@@ -282,13 +282,13 @@ def test_all_that_is_wrong_with_a_mapping_is_told_at_once(tmp_path: Path) -> Non
         ep.open_field(
             tmp_path / "a.npz",
             variables={
-                "n_i": ep.Variable("nii", "m^-3"),
-                "n_n": ep.Variable("nn", "m^-3"),
-                "u_iz": ep.Variable("ni", "kg"),
-                "T_e_eV": ep.Variable("Te", "eV"),
+                "n_i": ep.data.Variable("nii", "m^-3"),
+                "n_n": ep.data.Variable("nn", "m^-3"),
+                "u_iz": ep.data.Variable("ni", "kg"),
+                "T_e_eV": ep.data.Variable("Te", "eV"),
             },
-            time=ep.Variable("t", "s"),
-            z=ep.Variable("z", "m"),
+            time=ep.data.Variable("t", "s"),
+            z=ep.data.Variable("z", "m"),
         )
     text = str(caught.value)
     for part in (

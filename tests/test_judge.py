@@ -36,7 +36,7 @@ def rows_of_lorenz(steps: str, functions: Sequence[str] = ()) -> RegressionRows:
         kept = np.sort(rng.choice(400, size=300, replace=False))
         run = ep.Trajectory(run.t[kept], run.states[kept], run.state_names)
     library = ep.polynomial(run.state_names, degree=2, functions=functions)
-    return ep.Weak(split=ep.RandomSplit(0.0)).assemble([run], library, rng=rng)[1]
+    return ep.Weak(split=ep.regression.RandomSplit(0.0)).assemble([run], library, rng=rng)[1]
 
 
 @pytest.mark.parametrize("order", ["as they come", "shuffled"])
@@ -125,7 +125,7 @@ def test_steps_that_are_left_out_hardly_change_the_residuals() -> None:
     """Least squares at the coefficients, so their last digits do not show in chi-squared."""
     run = ep.lorenz().trajectory(noise=0.1, rng=1).window(0, 1500)
     library = ep.named_terms(run.state_names, ["x", "y", "x*z"])
-    form, rng = ep.Weak(split=ep.RandomSplit(0.0)), np.random.default_rng(0)
+    form, rng = ep.Weak(split=ep.regression.RandomSplit(0.0)), np.random.default_rng(0)
     for problem in form.assemble([run], library, rng=rng):
         (state,) = problem.equations
         fit = Candidate.of(state, dict(zip(library.names, [10.0, 28.0, -1.0], strict=True)))

@@ -11,6 +11,7 @@ from ep2sindy.model.comparison import Status
 from ep2sindy.operating.law import LawConstraint, constrain_law, law_of_constraint
 from ep2sindy.operating.left_out import LawTrial, run_left_out
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
+from ep2sindy.operating.records import OperatingRecord
 from tests.test_operating_law import GRID, LIBRARY, LINEAR, SHORT, STATES, STRUCTURE
 
 # What leaves x enters y, and the growth of x is known; its square is beyond a law of degree one.
@@ -23,11 +24,11 @@ BETWEEN = {"a": 0.8, "b": 0.3}
 def model_at(a: float, b: float) -> ep.SparseModel:
     turn = 1.0 + 0.2 * a + 0.1 * b
     terms = [{"x": 0.7 + 0.2 * a**2, "y": -turn, "x^3": -0.4 + 0.1 * b}, {"x": turn}]
-    return ep.SparseModel(LIBRARY, STATES, ep.coef_matrix(LIBRARY, terms))
+    return ep.SparseModel(LIBRARY, STATES, ep.model.coef_matrix(LIBRARY, terms))
 
 
 @cache
-def records() -> tuple[ep.operating.OperatingRecord, ...]:
+def records() -> tuple[OperatingRecord, ...]:
     t = np.arange(0.0, 50.0, 0.1)
     rng = np.random.default_rng(0)
     found = []
@@ -36,7 +37,7 @@ def records() -> tuple[ep.operating.OperatingRecord, ...]:
         # A little noise: relations hold where the data do not obey them by themselves.
         states = states + 1e-3 * rng.normal(size=states.shape)
         run = ep.Trajectory(t, states, STATES, parameters=point)
-        found.append(ep.operating.OperatingRecord(run))
+        found.append(OperatingRecord(run))
     return tuple(found)
 
 
@@ -45,7 +46,10 @@ def held(relations: list[str] = RELATIONS, known: Known = KNOWN) -> LawConstrain
 
 
 def by_rows(relations: LawConstraint) -> PointFits:
-    weak, points = ep.Weak(split=ep.RandomSplit(0.0)), np.array([list(p.values()) for p in GRID])
+    weak, points = (
+        ep.Weak(split=ep.regression.RandomSplit(0.0)),
+        np.array([list(p.values()) for p in GRID]),
+    )
     rows = [
         weak.assemble([record.run], LIBRARY, rng=np.random.default_rng(k))
         for k, record in enumerate(records())
@@ -152,7 +156,7 @@ def test_relations_that_cannot_hold_are_refused(
 
 
 def test_a_constraint_of_one_point_holds_at_all_of_them() -> None:
-    one = ep.constraint(LIBRARY, STRUCTURE, ["x: x^3 == -0.3", *RELATIONS])
+    one = ep.library.constraint(LIBRARY, STRUCTURE, ["x: x^3 == -0.3", *RELATIONS])
     relations = law_of_constraint(one, ["a", "b"])
     for each in relations.at(np.array([[0.5, 0.0], [1.0, 2.0]])):
         np.testing.assert_array_equal(each.C, one.C)

@@ -13,10 +13,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
 # From the ground up: a room may import only from itself and from those before it.
 ROOMS = [
     "_stubs",
-    "prepare",  # this and the next three are stubs alone
-    "parallel",
-    "warnings",
-    "sklearn",
+    "parallel",  # a stub alone
     "trust",
     "runtime",
     "library",
@@ -44,7 +41,7 @@ HEAVY = {
     # In selection the rules that refine, and what they share.
     "torch": (
         "refinement",
-        "selection.refined",
+        "selection.by_windows",
         "selection.free_run",
         "selection.systems",
         "selection.conserving",

@@ -33,10 +33,10 @@ def test_in_noise_the_mean_cycle_is_searched_and_said() -> None:
         "found in the mean cycle, without intervals, since the white noise of "
     )
     assert found.model.covariance is None
-    assert ep.evaluate(found.model, record(0.0)).status is ep.Status.SUSTAINED
+    assert ep.evaluate(found.model, record(0.0)).status is ep.model.Status.SUSTAINED
 
 
 @pytest.mark.parametrize(("noise", "limit"), [(0.5, None), (0.02, 0.3)])
 def test_below_the_limit_the_samples_are_searched(noise: float, limit: float | None) -> None:
-    quick = replace(SETTINGS, selection=ep.RefinedScore(), depth=1, noise_limit=limit)
+    quick = replace(SETTINGS, selection=ep.FreeRunScore(bounds=None), depth=1, noise_limit=limit)
     assert "mean cycle" not in searched(record(noise), quick).note

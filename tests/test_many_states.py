@@ -16,7 +16,7 @@ def test_true_terms_that_are_off_come_back(number: int) -> None:
     run = record(case)
     truth = case.truth
     for found in ep.refine(
-        starts(case, run)[:3], [[run]] * 3, ep.RefinementSettings(n_windows=10), seed=0
+        starts(case, run)[:3], [[run]] * 3, ep.refinement.RefinementSettings(n_windows=10), seed=0
     ):
         assert found.status == "converged"
         assert not found.message
@@ -38,7 +38,7 @@ def lacking() -> tuple[list[ep.SparseModel], ep.Trajectory]:
 def test_models_that_miss_hidden_states_follow_what_they_can(lacking) -> None:
     """Most of these ended without a finite trajectory before steps were damped."""
     models, run = lacking
-    settings = ep.RefinementSettings(n_windows=5, n_reweights=0)
+    settings = ep.refinement.RefinementSettings(n_windows=5, n_reweights=0)
     for found in ep.refine(models[:3], [[run]] * 3, settings, seed=0):
         assert found.status not in ("non_finite", "flat")
 
@@ -46,7 +46,7 @@ def test_models_that_miss_hidden_states_follow_what_they_can(lacking) -> None:
 def test_a_failure_says_where(lacking) -> None:
     models, run = lacking
     method = MultipleShooting(first_memory=1000, max_iter=1)
-    settings = ep.RefinementSettings(n_windows=5, method=method, n_reweights=0)
+    settings = ep.refinement.RefinementSettings(n_windows=5, method=method, n_reweights=0)
     found = ep.refine(models[1], [run], settings, periods=8.0, seed=0)
     assert found.status in ("non_finite", "flat", "max_iter")
     assert "the longest memory without gaps was 1 of " in found.message
@@ -58,8 +58,10 @@ def test_every_model_of_a_list_keeps_its_own_constraint() -> None:
     model = ep.SparseModel(truth.library, truth.states, 1.1 * truth.coef)
     support = {state: tuple(model.terms(state)) for state in model.states}
     (term, *_), row = support["x"], model.library.index(support["x"][0])
-    known = [ep.constraint(model.library, support, [f"x: {term} == {v}"]) for v in (0.7, 0.6)]
-    settings = ep.RefinementSettings(window=60, n_windows=6)
+    known = [
+        ep.library.constraint(model.library, support, [f"x: {term} == {v}"]) for v in (0.7, 0.6)
+    ]
+    settings = ep.refinement.RefinementSettings(window=60, n_windows=6)
     together = ep.refine([model] * 3, [[run]] * 3, settings, constraints=[*known, None], seed=0)
     held = [found.model.coef[row, 0] for found in together[:2]]
     np.testing.assert_allclose(held, [0.7, 0.6], rtol=1e-12)

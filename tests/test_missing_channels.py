@@ -56,13 +56,13 @@ def test_a_table_may_lack_single_values() -> None:
     rng = np.random.default_rng(0)
     for name in run.state_names:
         table.loc[rng.random(len(table)) < 0.2, name] = np.nan
-    with pytest.warns(ep.warnings.MissingSamples, match=r"of 3000 samples are missing \(NaN\): x "):
+    with pytest.warns(ep.data.MissingSamples, match=r"of 3000 samples are missing \(NaN\): x "):
         found = ep.discover(table, LIBRARY)
     assert found.estimate is not None
     kept = int(table[list(run.state_names)].notna().any(axis=1).sum())
     assert len(found.estimate.paths[0]) == kept
     assert set(found.model.terms("z")) == {"x*y", "z"}
-    with pytest.warns(ep.warnings.MissingSamples):
+    with pytest.warns(ep.data.MissingSamples):
         rows = ep.discover(table, LIBRARY, ep.Regression())
     assert set(rows.model.terms("z")) == {"x*y", "z"}
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-import ep2sindy as ep
 from benchmarks.regions import three_regions
+from ep2sindy._stubs import read_stub
 from ep2sindy.app.arguments import mend, options_first
 from ep2sindy.app.runner import study_class
 from ep2sindy.app.schema import bind, plain, study_of
@@ -96,12 +96,15 @@ STEPS = {
 
 
 def test_every_step_is_called_here() -> None:
-    assert set(STEPS) == {*dir(ep.prepare), "ionization_rate"}
+    steps = [
+        name for name, entry in read_stub("ep2sindy.data").items() if entry.heading == "Preparation"
+    ]
+    assert set(STEPS) == {*steps, "ionization_rate"}
 
 
 @pytest.mark.parametrize("name", STEPS)
 def test_a_step_that_a_config_names_is_composed_and_called(name: str) -> None:
-    room = "thruster" if name == "ionization_rate" else "prepare"
+    room = "thruster" if name == "ionization_rate" else "data"
     text = f"prepare=[{{_target_: ep2sindy.{room}.{name}, {STEPS[name]}}}]"
     step = bind(plain(composed("+exp=breathing", mend(text)).prepare[0]), "prepare[0]", None)
     field = three_regions(n_z=6, n_r=5, n_samples=64).field
@@ -113,9 +116,9 @@ def test_a_step_that_a_config_names_is_composed_and_called(name: str) -> None:
 
 
 def test_a_step_that_is_misspelt_names_the_nearest() -> None:
-    config = composed("+exp=breathing", "prepare=[{_target_: ep2sindy.prepare.crp, start_s: 0}]")
-    with pytest.raises(ValueError, match=r"near it: ep2sindy\.prepare\.crop"):
+    config = composed("+exp=breathing", "prepare=[{_target_: ep2sindy.data.crp, start_s: 0}]")
+    with pytest.raises(ValueError, match=r"near it: ep2sindy\.data\.crop"):
         programs.computed(config)
-    config = composed("+exp=breathing", "prepare=[{_target_: ep2sindy.prepare.crop, strt_s: 0}]")
+    config = composed("+exp=breathing", "prepare=[{_target_: ep2sindy.data.crop, strt_s: 0}]")
     with pytest.raises(ValueError, match="near it are start_s, stop_s; it takes"):
         study_of(study_class(config.study), config)

@@ -14,13 +14,13 @@ UNITS = {"n_i": "m^-3", "n_n": "m^-3", "R_ion": "m^3/s"}
 def breathing() -> ep.SparseModel:
     library = ep.named_terms(VARIABLES, ["1", "n_i", "n_n", "n_i*n_n", "n_i*n_n*R_ion"])
     equations = [{"n_i": -2.62e5, "n_i*n_n": 5.481e-14}, {"1": 1.83e23, "n_i*n_n*R_ion": -0.77}]
-    return ep.SparseModel(library, ["n_i", "n_n"], ep.coef_matrix(library, equations), UNITS)
+    return ep.SparseModel(library, ["n_i", "n_n"], ep.model.coef_matrix(library, equations), UNITS)
 
 
 def driven(rate: float = 2.0) -> tuple[ep.SparseModel, ep.Trajectory]:
     """x' = -rate x + u with u = sin t, whose solution is known."""
     library = ep.polynomial(["x", "u"], degree=1)
-    model = ep.SparseModel(library, ["x"], ep.coef_matrix(library, [{"x": -rate, "u": 1.0}]))
+    model = ep.SparseModel(library, ["x"], ep.model.coef_matrix(library, [{"x": -rate, "u": 1.0}]))
     t = np.linspace(0.0, 5.0, 201)
     exact = np.exp(-rate * t) * (1 + 1 / (rate**2 + 1))
     exact += (rate * np.sin(t) - np.cos(t)) / (rate**2 + 1)

@@ -17,7 +17,7 @@ def driven_model() -> ep.SparseModel:
     """x' = -x u + 3, y' = x^2 y - y: powers, a constant and an input."""
     library = ep.named_terms(["u", "x", "y"], ["1", "y", "u*x", "x^2*y"])
     equations = [{"1": 3.0, "u*x": -1.0}, {"y": -1.0, "x^2*y": 0.4}]
-    return ep.SparseModel(library, ["x", "y"], ep.coef_matrix(library, equations))
+    return ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, equations))
 
 
 def module(model: ep.SparseModel, scale: np.ndarray, step_s: float) -> ODE:
@@ -43,7 +43,7 @@ def test_rate_is_the_models_in_scaled_states_and_time() -> None:
 
 def test_relations_hold_to_rounding_for_any_scaling() -> None:
     model = ep.lotka_volterra().model
-    relations = ep.constraint(
+    relations = ep.library.constraint(
         model.library,
         {s: tuple(model.terms(s)) for s in model.states},
         ["x: x*y == -1 * y: x*y", "y: y == -0.5"],
@@ -132,9 +132,9 @@ def test_bad_models_are_refused() -> None:
     empty = replace(model, coef=np.zeros_like(model.coef))
     with pytest.raises(ValueError, match="at least one term"):
         ScaledEquations.of(empty, scale=SCALE, step_s=0.1)
-    narrow = ep.constraint(model.library, {"x": ("x",), "y": ("y", "x*y")})
+    narrow = ep.library.constraint(model.library, {"x": ("x",), "y": ("y", "x*y")})
     with pytest.raises(ValueError, match=r"must cover every term .*\('x', 'x\*y'\)"):
         ScaledEquations.of(model, scale=SCALE, step_s=0.1, constraint=narrow)
-    wide = ep.constraint(model.library, {"x": ("x", "x^2", "x*y"), "y": ("y", "x*y")})
+    wide = ep.library.constraint(model.library, {"x": ("x", "x^2", "x*y"), "y": ("y", "x*y")})
     with pytest.raises(ValueError, match=r"free coefficient must start away from zero.*x\^2"):
         ScaledEquations.of(model, scale=SCALE, step_s=0.1, constraint=wide)

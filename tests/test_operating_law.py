@@ -29,7 +29,7 @@ STRUCTURE = {"x": ["x", "y", "x^3"], "y": ["x"]}
 # Lienard's van der Pol at two parameters, every coefficient linear in them.
 LAW = {"x": {"x": (0.8, 0.3, 0.0), "y": (-1.0, 0.0, -0.2), "x^3": (-0.4, 0.0, 0.1)},
        "y": {"x": (1.0, 0.2, 0.1)}}  # fmt: skip
-SHORT = ep.RefinementSettings(n_windows=3, periods=1.0, n_reweights=0)
+SHORT = ep.refinement.RefinementSettings(n_windows=3, periods=1.0, n_reweights=0)
 GRID = [{"a": a, "b": b} for a in (0.5, 1.0, 1.5) for b in (0.0, 0.5, 1.0)]
 LINEAR = ep.polynomial(["a", "b"], degree=1)
 LINE = (0.5, 0.75, 1.0, 1.25, 1.5)
@@ -37,7 +37,7 @@ LINE = (0.5, 0.75, 1.0, 1.25, 1.5)
 
 def model_at(a: float, b: float) -> ep.SparseModel:
     terms = [{t: c[0] + c[1] * a + c[2] * b for t, c in LAW[s].items()} for s in STATES]
-    return ep.SparseModel(LIBRARY, STATES, ep.coef_matrix(LIBRARY, terms))
+    return ep.SparseModel(LIBRARY, STATES, ep.model.coef_matrix(LIBRARY, terms))
 
 
 @cache

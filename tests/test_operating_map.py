@@ -9,6 +9,7 @@ import ep2sindy as ep
 from ep2sindy.model.comparison import Status
 from ep2sindy.model.fixed_point import rest_point
 from ep2sindy.operating.map import law_map
+from ep2sindy.operating.records import OperatingRecord
 from tests.models import model_of
 from tests.test_operating_law import recorded
 from tests.test_stability import HOPF
@@ -16,8 +17,8 @@ from tests.test_stability import HOPF
 ONES = np.ones(2)
 
 
-def at_one() -> ep.operating.OperatingRecord:
-    return ep.operating.OperatingRecord(replace(recorded(1.0, 0.0).run, parameters={"a": 1.0}))
+def at_one() -> OperatingRecord:
+    return OperatingRecord(replace(recorded(1.0, 0.0).run, parameters={"a": 1.0}))
 
 
 def hopf() -> ep.operating.OperatingLaw:

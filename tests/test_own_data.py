@@ -215,9 +215,9 @@ def test_a_step_that_contradicts_the_files_times_is_told(
 
 def test_a_step_that_contradicts_a_mapping_is_told(folder: Path) -> None:
     lorenz_csv(folder / "a.csv")
-    mapping = {"variables": {"x": ep.Variable("x", "1")}, "dt_s": 3.0}
+    mapping = {"variables": {"x": ep.data.Variable("x", "1")}, "dt_s": 3.0}
     with pytest.warns(DoubtfulUnit, match="dt_s=3 is taken"):
-        ep.open_field("a.csv", time=ep.Variable("Time", "s"), **mapping)
+        ep.open_field("a.csv", time=ep.data.Variable("Time", "s"), **mapping)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ep.open_field("a.csv", **mapping)

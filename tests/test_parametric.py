@@ -47,7 +47,7 @@ MODELS = {
         {"L": LENGTH, "g": INJECTED, "eps": Quantity("x: x*y*R")},
     ),
 }
-EVERY = ep.RandomSplit(0.0)
+EVERY = ep.regression.RandomSplit(0.0)
 WEAK = ep.Weak(split=EVERY)
 
 
@@ -214,7 +214,9 @@ def test_the_covariance_of_blocks_is_a_sandwich_of_their_scores() -> None:
     """By hand, from the rows of both equations in units of their residuals."""
     run, rng = forced(**TRUTHS[0]), np.random.default_rng(1)
     noisy = replace(run, states=run.states * (1 + 0.01 * rng.normal(size=run.states.shape)))
-    problems = ep.Differential(split=ep.RandomSplit(0.25)).assemble([noisy], LIBRARY, rng=rng)
+    problems = ep.Differential(split=ep.regression.RandomSplit(0.25)).assemble(
+        [noisy], LIBRARY, rng=rng
+    )
     (constraint,) = MODELS["constrained"].relations.at(np.array([[100.0, 1.0]]))
     root = solve_constrained(problems, constraint).clustered_root(50)
     (problem,) = problems
@@ -254,7 +256,7 @@ def correlated_problem(rng: np.random.Generator, *, n_rows: int) -> RegressionRo
 def coverage(*, block: int, n_seeds: int) -> float:
     """Share of 95 % intervals that hold the true coefficient."""
     library = ep.named_terms(["a", "b"], ["a", "b"])
-    relations = ep.constraint(library, {"z": ["a", "b"]})
+    relations = ep.library.constraint(library, {"z": ["a", "b"]})
     quantities = {"p": Quantity("z: a"), "q": Quantity("z: b", -1.0)}
     inside = []
     for rng in np.random.default_rng(0).spawn(n_seeds):
@@ -281,7 +283,7 @@ def test_a_quantity_is_a_coefficient_or_its_reciprocal() -> None:
 
 
 def model_of(covariance: np.ndarray | None = None) -> ep.SparseModel:
-    coef = ep.coef_matrix(LIBRARY, [{"x*u": -40.0, "x*y*R": 0.8}, {"1": 2.0, "x*y*R": -0.6}])
+    coef = ep.model.coef_matrix(LIBRARY, [{"x*u": -40.0, "x*y*R": 0.8}, {"1": 2.0, "x*y*R": -0.6}])
     return ep.SparseModel(LIBRARY, ["x", "y"], coef, UNITS, {}, covariance)
 
 

@@ -23,7 +23,7 @@ def exact_problem(system: System) -> RegressionRows:
         library=system.model.library,
         equations=run.state_names,
         groups=np.arange(run.n_samples),
-        test=ep.RandomSplit().held_out(run.n_samples, np.random.default_rng(0)),
+        test=ep.regression.RandomSplit().held_out(run.n_samples, np.random.default_rng(0)),
     )
 
 

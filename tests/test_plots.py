@@ -9,6 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import ep2sindy as ep
+from ep2sindy.signals.spectrum import dominant_frequency
 from tests.models import model_of
 
 UNITS = {"x": "A", "y": "m"}
@@ -40,7 +41,7 @@ def test_a_record_is_drawn_with_its_units_and_its_frequency() -> None:
     assert figure.axes[2].get_xlabel() == "time (s)"
     shown = figure.axes[0].lines[0]
     assert np.array_equal(shown.get_ydata(), run.states[: len(shown.get_xdata()), 0])
-    frequency = ep.signals.dominant_frequency(run.t, run.states[:, 0])
+    frequency = dominant_frequency(run.t, run.states[:, 0])
     assert shown.get_xdata()[-1] == pytest.approx(min(20.0 / frequency, run.t[-1]), rel=0.01)
     assert figure.axes[3].get_xlabel() == "frequency (Hz)"
     assert figure.axes[1].lines[1].get_xdata()[0] == pytest.approx(frequency)

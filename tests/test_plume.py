@@ -21,6 +21,7 @@ from ep2sindy.thruster.axial.state_kernels import CELL_SUMS, new_sums, new_work
 from ep2sindy.thruster.balance import zone_balance
 from ep2sindy.thruster.constants import E_CHARGE, M_XENON
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.plane.simulate import THRUSTER_2D
 from ep2sindy.thruster.plume import ConicalPlume, Plume, ThermalPlume
 from ep2sindy.thruster.propellant_files import propellant
 
@@ -64,7 +65,7 @@ def test_an_angle_out_of_range_is_refused(degrees: float) -> None:
 
 
 def test_the_z_r_model_refuses_a_plume() -> None:
-    spread = replace(ep.thruster.THRUSTER_2D, plume=ep.thruster.ThermalPlume())
+    spread = replace(THRUSTER_2D, plume=ep.thruster.ThermalPlume())
     with pytest.raises(ValueError, match=r"\(z, r\) model does not solve a plume that spreads"):
         ep.thruster.simulate_2d(spread, progress=False)
 

@@ -80,7 +80,9 @@ def test_every_point_gets_its_own_exact_equation(exact: xr.Dataset) -> None:
 
 
 def test_weights_are_shares_of_the_root_mean_square() -> None:
-    found = searching(formulation=ep.Differential(split=ep.RandomSplit(test_fraction=0.0)))
+    found = searching(
+        formulation=ep.Differential(split=ep.regression.RandomSplit(test_fraction=0.0))
+    )
     result = ep.pointwise(parabolas(), found, workers=Serial()).isel(z=1, r=2, equation=0)
     one, u = 1.0 + 100.0 * Z[1], -50.0 * R[2] * np.sqrt(np.square(T).mean())
     weight = result["weight"].sel(term=["1", "u"]).values
@@ -96,7 +98,7 @@ def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
     search = searching(formulation=formulation, search=ep.AdaptiveLasso(), bootstraps=draws)
     field = noisy()
     result = ep.pointwise(field, search, workers=Serial()).isel(z=2, r=1)
-    run = ep.point_samples(
+    run = ep.data.point_samples(
         field.isel(z=[2], r=[1]), z=Z[2], r=R[1], states=["x"], inputs=["u", "w"]
     )
     found = ep.discover([run], LIBRARY, search.method, seed=search.seed)
@@ -209,14 +211,19 @@ def test_what_makes_no_sense_is_refused() -> None:
 
 def test_rules_that_refine_all_equations_serve_every_point() -> None:
     field = parabolas(Z[:1], R[:1])
-    result = ep.pointwise(field, searching(selection=ep.RefinedScore()), workers=Serial())
+    result = ep.pointwise(
+        field, searching(selection=ep.FreeRunScore(bounds=None)), workers=Serial()
+    )
     assert result["n_terms"].item() == 2
 
 
 EXACT = [
     ep.Differential(smoother=NoSmoothing()),
     ep.Weak(
-        ep.Bumps(half_width_s=0.1), NoSmoothing(), smooth_library=False, errors_in_variables=False
+        ep.regression.Bumps(half_width_s=0.1),
+        NoSmoothing(),
+        smooth_library=False,
+        errors_in_variables=False,
     ),
 ]
 
@@ -283,7 +290,9 @@ def test_relations_tie_equations_at_every_point_and_in_every_draw() -> None:
 def test_a_draw_of_all_rows_is_the_fit_of_all_rows() -> None:
     """Blocks as long as the rows draw each of them once."""
     whole = ep.Bootstraps(n=2, n_culled=0, smallest=1.0, largest=1.0, block=len(T))
-    form = ep.Differential(smoother=NoSmoothing(), split=ep.RandomSplit(test_fraction=0.0))
+    form = ep.Differential(
+        smoother=NoSmoothing(), split=ep.regression.RandomSplit(test_fraction=0.0)
+    )
     search = sharing(SHARED, formulation=form, bootstraps=whole)
     result = ep.pointwise(exchanging(0.05), search, workers=Serial())
     same = np.broadcast_arrays(result["coef_draws"], result["coef"])

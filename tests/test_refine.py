@@ -14,6 +14,7 @@ from ep2sindy.refinement.judge import is_stationary
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import Iteration, Method
+from ep2sindy.refinement.refine import Refinement
 from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
 from ep2sindy.refinement.windows import cut_windows, dominant_window
 from ep2sindy.systems.systems import System
@@ -42,7 +43,7 @@ def noisy(system: System, noise: float, rng: np.random.Generator) -> ep.Trajecto
     )
 
 
-def errors(found: ep.Refinement, truth: ep.SparseModel) -> np.ndarray:
+def errors(found: Refinement, truth: ep.SparseModel) -> np.ndarray:
     used = truth.coef.T != 0.0
     return found.model.coef.T[used] / truth.coef.T[used] - 1.0
 
@@ -73,7 +74,7 @@ def test_methods_agree_on_the_minimiser() -> None:
     data = noisy(PREY, 0.05, rng)
     start = spread(PREY.model, 0.1, rng)
 
-    def fitted(method: object, **settings: bool) -> ep.Refinement:
+    def fitted(method: object, **settings: bool) -> Refinement:
         return ep.refine(
             start, [data], window=15, n_windows=3, method=method, n_reweights=0,
             seed=np.random.default_rng(1), **settings,
@@ -145,7 +146,7 @@ def test_rescaled_units_change_the_coefficients_and_nothing_else() -> None:
 def test_constraint_holds_after_refinement_and_shapes_the_covariance() -> None:
     rng = np.random.default_rng(0)
     model = PREY.model
-    relations = ep.constraint(
+    relations = ep.library.constraint(
         model.library, {s: tuple(model.terms(s)) for s in model.states},
         ["x: x*y == -1 * y: x*y"],
     )  # fmt: skip
@@ -160,7 +161,7 @@ def test_constraint_holds_after_refinement_and_shapes_the_covariance() -> None:
 def test_covariance_follows_the_order_of_the_model() -> None:
     rng = np.random.default_rng(0)
     model = PREY.model
-    swapped = ep.constraint(model.library, {s: tuple(model.terms(s)) for s in ("y", "x")})
+    swapped = ep.library.constraint(model.library, {s: tuple(model.terms(s)) for s in ("y", "x")})
     data = noisy(PREY, 0.05, rng)
     plain, other = (
         ep.refine(
@@ -215,13 +216,15 @@ def test_window_is_one_and_a_half_periods_of_the_sharpest_peak() -> None:
 
 def test_keywords_stand_for_what_settings_say() -> None:
     data = noisy(PREY, 0.05, np.random.default_rng(0))
-    settings = ep.RefinementSettings(n_windows=3, window=30, n_reweights=0)
+    settings = ep.refinement.RefinementSettings(n_windows=3, window=30, n_reweights=0)
     by_settings = ep.refine(PREY.model, [data], settings, seed=1)
     by_keywords = ep.refine(PREY.model, [data], n_windows=3, window=30, n_reweights=0, seed=1)
     np.testing.assert_array_equal(by_settings.model.coef, by_keywords.model.coef)
     longer = ep.refine(PREY.model, [data], settings, window=40, seed=1)
     assert longer.trajectories.shape == (3, 40, 2)
-    by_periods = ep.RefinementSettings(periods=2.0).override({"window": 40, "n_windows": None})
+    by_periods = ep.refinement.RefinementSettings(periods=2.0).override(
+        {"window": 40, "n_windows": None}
+    )
     assert (by_periods.window, by_periods.periods, by_periods.n_windows) == (40, None, 30)
     assert ep.refine([], [], seed=1) == []
     (first, second) = ep.refine([PREY.model] * 2, [[data]] * 2, settings, seed=1)
@@ -235,10 +238,10 @@ def test_windows_are_as_many_periods_as_are_asked_for() -> None:
     model = ep.SparseModel(ep.named_terms(["x"], ["x"]), ["x"], np.array([[0.1]]))
     rng = np.random.default_rng(0)
     for periods, window in ((None, 75), (2.0, 100), (0.5, 25)):
-        (batch,) = ep.RefinementSettings(periods=periods).cut([model], [[run]], rng)
+        (batch,) = ep.refinement.RefinementSettings(periods=periods).cut([model], [[run]], rng)
         assert batch.data.shape[1] == pytest.approx(window, abs=2)
     short = run.window(0, 120)
-    batches = ep.RefinementSettings(periods=2.0).cut([model] * 2, [[run], [short]], rng)
+    batches = ep.refinement.RefinementSettings(periods=2.0).cut([model] * 2, [[run], [short]], rng)
     assert [batch.data.shape[1] for batch in batches] == [60, 60]  # half of the shorter record
 
 
@@ -255,7 +258,7 @@ def test_settings_that_say_nothing_or_two_things_are_refused(
     settings: dict[str, float], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        ep.RefinementSettings(**settings)
+        ep.refinement.RefinementSettings(**settings)
     with pytest.raises(ValueError, match=message):
         ep.refine(PREY.model, [clean(PREY)], seed=0, **settings)
 
@@ -327,10 +330,11 @@ def test_models_of_different_terms_are_refined_and_judged_as_if_alone(method: Me
     terms = [PREY.model.terms(state) for state in PREY.model.states]
     wider = [terms[0] | {"x^2": 0.01}, terms[1] | {"1": 0.01, "y^2": -0.01}]
     models = [
-        ep.SparseModel(library, ["x", "y"], ep.coef_matrix(library, t)) for t in (wider, terms)
+        ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, t))
+        for t in (wider, terms)
     ]
     data = [[noisy(PREY, noise, rng)] for noise in (0.05, 0.1)]
-    settings = ep.RefinementSettings(window=40, n_windows=6, method=method)
+    settings = ep.refinement.RefinementSettings(window=40, n_windows=6, method=method)
     together = ep.refine(models, data, settings, seed=np.random.default_rng(1))
     alone = ep.refine(models, data, settings, points_per_batch=1, seed=np.random.default_rng(1))
     for one, other in zip(together, alone, strict=True):
@@ -352,12 +356,14 @@ def test_models_of_different_states_are_refused_in_one_batch() -> None:
         for a, b in (("x", "y"), ("y", "x"))
     ]
     with pytest.raises(ValueError, match="must share their states and inputs"):
-        ep.refine(models, data, ep.RefinementSettings(window=50), seed=np.random.default_rng(0))
+        ep.refine(
+            models, data, ep.refinement.RefinementSettings(window=50), seed=np.random.default_rng(0)
+        )
 
 
 def test_one_run_is_a_list_of_one_and_the_seed_is_zero() -> None:
     data = noisy(PREY, 0.02, np.random.default_rng(0))
-    settings = ep.RefinementSettings(n_windows=3, window=30)
+    settings = ep.refinement.RefinementSettings(n_windows=3, window=30)
     known = ep.refine(PREY.model, [data], settings, seed=0).model
     arrays = {"t": data.t, **dict(zip(data.state_names, data.states.T, strict=True))}
     for run in (data, pd.DataFrame(arrays)):
@@ -374,7 +380,7 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one run is needed"):
         ep.refine(model, [], window=50)
     with pytest.raises(ValueError, match="a list of trajectories of its own: 2 models and 1 lists"):
-        ep.refine([model] * 2, [[data]], ep.RefinementSettings(window=50), seed=rng)
+        ep.refine([model] * 2, [[data]], ep.refinement.RefinementSettings(window=50), seed=rng)
     for runs, came in ((data, "one run"), ([data], "a list of runs")):
         with pytest.raises(ValueError, match=f"as in refine.* 1 models came with {came}"):
             ep.refine([model], runs, window=50, seed=rng)
@@ -390,7 +396,7 @@ def stiff(k_dt: float) -> tuple[ep.SparseModel, ep.Trajectory]:
         {"y": -1 / 3, "x*y": 1.0},
         {"x": k, "z": -k},
     ]
-    model = ep.SparseModel(library, ["x", "y", "z"], ep.coef_matrix(library, equations))
+    model = ep.SparseModel(library, ["x", "y", "z"], ep.model.coef_matrix(library, equations))
 
     def rhs(_: float, x: np.ndarray) -> tuple[float, float, float]:
         prey = x[0] * x[1]
@@ -523,7 +529,7 @@ def test_a_model_that_leaves_more_than_noise_says_so(wrong: bool) -> None:
     """Limited growth of the prey, which the wrong model lacks: its windows are followed poorly."""
     library = ep.polynomial(["x", "y"], degree=2)
     prey = {"x": 1.0, "x*y": -1.0, "x^2": -0.2}
-    coef = ep.coef_matrix(library, [prey, {"y": -1.0, "x*y": 1.0}])
+    coef = ep.model.coef_matrix(library, [prey, {"y": -1.0, "x*y": 1.0}])
     truth = ep.SparseModel(library, ["x", "y"], coef)
     clean = truth.simulate(np.linspace(0.0, 20.0, 401), [3.0, 0.5]).trajectory()
     noise = 0.01 * np.random.default_rng(0).standard_normal(clean.states.shape)

@@ -41,18 +41,24 @@ def test_raw_and_smoothed_libraries_differ_only_in_theta() -> None:
     assert np.abs(raw.theta - smooth.theta).max() > 1e-3
 
 
-@pytest.mark.parametrize("split", [ep.RandomSplit(0.25), ep.BlockSplit(0.25, n_blocks=20)])
-def test_splits_hold_out_the_asked_share(split: ep.RandomSplit | ep.BlockSplit) -> None:
+@pytest.mark.parametrize(
+    "split", [ep.regression.RandomSplit(0.25), ep.regression.BlockSplit(0.25, n_blocks=20)]
+)
+def test_splits_hold_out_the_asked_share(
+    split: ep.regression.RandomSplit | ep.regression.BlockSplit,
+) -> None:
     held_out = split.held_out(400, np.random.default_rng(0))
     assert held_out.sum() == 100
 
 
 def test_block_split_holds_out_whole_blocks() -> None:
-    held_out = ep.BlockSplit(0.25, n_blocks=20).held_out(400, np.random.default_rng(0))
+    held_out = ep.regression.BlockSplit(0.25, n_blocks=20).held_out(400, np.random.default_rng(0))
     assert np.all(np.ptp(held_out.reshape(20, 20).astype(int), axis=1) == 0)
 
 
-@pytest.mark.parametrize(("split", "share"), [(ep.RandomSplit, 1.0), (ep.BlockSplit, -0.1)])
+@pytest.mark.parametrize(
+    ("split", "share"), [(ep.regression.RandomSplit, 1.0), (ep.regression.BlockSplit, -0.1)]
+)
 def test_impossible_shares_are_refused(split: type, share: float) -> None:
     with pytest.raises(ValueError, match=r"test_fraction must lie in \[0, 1\)"):
         split(share)

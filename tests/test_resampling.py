@@ -4,6 +4,7 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.regression import bootstraps
 from ep2sindy.regression.bootstraps import Bootstraps, count_block_draws
+from ep2sindy.regression.rows import RegressionRows
 
 
 @pytest.mark.parametrize("block", [0, 31])
@@ -35,13 +36,13 @@ def test_weights_of_a_long_record_are_held_for_some_draws_at_once(
     )
     terms, held = np.ones(len(system.model.library), dtype=np.bool_), []
     together = Bootstraps(n=7).draw(problem, terms, np.random.default_rng(0))
-    resampled_products = ep.regression.RegressionRows.resampled_products
+    resampled_products = RegressionRows.resampled_products
 
-    def tell(problem: ep.regression.RegressionRows, weights: np.ndarray) -> np.ndarray:
+    def tell(problem: RegressionRows, weights: np.ndarray) -> np.ndarray:
         held.append(weights.size)
         return resampled_products(problem, weights)
 
-    monkeypatch.setattr(ep.regression.RegressionRows, "resampled_products", tell)
+    monkeypatch.setattr(RegressionRows, "resampled_products", tell)
     monkeypatch.setattr(bootstraps, "MOST_WEIGHTS", 2 * problem.n_train)
     in_parts = Bootstraps(n=7).draw(problem, terms, np.random.default_rng(0))
     assert max(held) <= 2 * problem.n_train

@@ -89,7 +89,7 @@ def record() -> ep.Trajectory:
 def refined(max_terms: int) -> ep.Regression:
     """A search whose systems are refined and judged whole."""
     search = ep.BestSubset(max_terms=max_terms, n_best=60)
-    return ep.Regression(search=search, selection=ep.RefinedScore(), depth=6)
+    return ep.Regression(search=search, selection=ep.FreeRunScore(bounds=None), depth=6)
 
 
 def test_a_search_under_roles_finds_the_truth_and_conserves(record):

@@ -152,13 +152,13 @@ def test_files_that_tell_no_run_are_refused_by_name(
     monkeypatch.chdir(tmp_path / "here")
     write_table("a.csv", V=300.0)
     write_table("a1.csv")
-    ep.write_field(FIELD, "field.nc")
+    ep.data.write_field(FIELD, "field.nc")
     with pytest.raises(ValueError, match=message):
         ep.read_runs(settings.pop("files", "a.csv"), **settings)
 
 
 def test_a_field_is_averaged_over_the_zone(here: Path) -> None:
-    ep.write_field(FIELD, here / "m5.nc")
+    ep.data.write_field(FIELD, here / "m5.nc")
     zone = ep.Zone(z=(0.005, 0.025))
     (run,) = ep.read_runs("m{m}.nc", inputs=["n_n"], zone=zone)
     assert run.names == ("n_i", "n_n")

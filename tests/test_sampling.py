@@ -9,7 +9,7 @@ from ep2sindy.regression.whitening import whiten_rows
 from ep2sindy.regression.windows import even_grid, is_even, keep_one_per_sample
 from ep2sindy.systems.systems import System, van_der_pol
 
-EVERY_ROW = ep.Weak(split=ep.RandomSplit(0.0))
+EVERY_ROW = ep.Weak(split=ep.regression.RandomSplit(0.0))
 RANDOM = np.cumsum(np.random.default_rng(3).exponential(size=400))
 
 
@@ -30,7 +30,7 @@ def test_rounded_times_count_as_even() -> None:
     assert not is_even(np.delete(t, 100))
     x = np.sin(t)
     exact, rounded = (
-        ep.Bumps().windows(s, x, rng=np.random.default_rng(0)) for s in (t, t.round(3))
+        ep.regression.Bumps().windows(s, x, rng=np.random.default_rng(0)) for s in (t, t.round(3))
     )
     np.testing.assert_allclose(exact.mean.toarray(), rounded.mean.toarray())
 
@@ -42,7 +42,7 @@ def test_straight_lines_pass_unequal_steps_unchanged() -> None:
     assert lines @ RANDOM == pytest.approx(grid, rel=1e-12)
     assert lines.data.min() > 0.0
     x = np.sin(0.05 * RANDOM)
-    windows = ep.Bumps(half_width_s=8.0).windows(RANDOM, x, rng=np.random.default_rng(0))
+    windows = ep.regression.Bumps(half_width_s=8.0).windows(RANDOM, x, rng=np.random.default_rng(0))
     n = len(windows)
     assert windows.slope @ (2.0 - 3.0 * RANDOM) == pytest.approx(np.full(n, -3.0), rel=1e-9)
     assert windows.mean @ np.ones(400) == pytest.approx(np.ones(n), rel=1e-12)
@@ -53,7 +53,7 @@ def test_no_two_windows_stand_about_one_sample() -> None:
     t = np.array([0.0, 1.0, 5.0, 6.0])
     middle = np.array([0.0, 1.0, 2.0, 3.5, 4.0, 5.0, 6.0])
     assert keep_one_per_sample(t, middle).tolist() == [0, 1, 3, 6]
-    windows = ep.Bumps(half_width_s=3.0).windows(
+    windows = ep.regression.Bumps(half_width_s=3.0).windows(
         RANDOM, np.sin(RANDOM), rng=np.random.default_rng(0)
     )
     assert len(windows) < len(RANDOM)

@@ -13,6 +13,7 @@ from ep2sindy.figures.series import (
     trajectory_figure,
 )
 from ep2sindy.figures.style import OFF_SCALE, find_exits, frame_limits
+from ep2sindy.model.rollout import Rollout
 from ep2sindy.report.report import Report
 from ep2sindy.studies.views import PlotRange, add_figures
 
@@ -25,12 +26,12 @@ def oscillation() -> ep.Trajectory:
     return ep.Trajectory(t, states, ("x", "v"), units={"x": "m", "v": "m/s"})
 
 
-def rolled(t: np.ndarray, states: np.ndarray, *, diverged: bool = False) -> ep.model.Rollout:
+def rolled(t: np.ndarray, states: np.ndarray, *, diverged: bool = False) -> Rollout:
     names = ("x", "v")[: states.shape[1]]
-    return ep.model.Rollout(t, states, diverged, "", names, np.empty((len(t), 0)), (), {})
+    return Rollout(t, states, diverged, "", names, np.empty((len(t), 0)), (), {})
 
 
-def rollouts(run: ep.Trajectory, n: int) -> dict[str, ep.model.Rollout]:
+def rollouts(run: ep.Trajectory, n: int) -> dict[str, Rollout]:
     """The data again, each a little larger; the last runs away."""
     grown = {f"model {k}": rolled(run.t, (1 + 0.1 * k) * run.states) for k in range(n)}
     away = run.states[:200] * np.exp(run.t[:200, None])

@@ -18,7 +18,7 @@ TEXTS = {
     "relations": lambda: relations_of("x: x == 1"),
     "the terms of 'x'": lambda: LIBRARY.only({"x": "x*y"}),
     "the terms of 'x' ": lambda: LIBRARY.exclude({"x": "x*y"}),
-    "the support of 'x'": lambda: ep.constraint(LIBRARY, {"x": "x*y"}),
+    "the support of 'x'": lambda: ep.library.constraint(LIBRARY, {"x": "x*y"}),
     "products": lambda: ep.polynomial(["x", "y"], degree=1, products="x*y"),
     "functions": lambda: ep.polynomial(["x", "y"], degree=1, functions="sin"),
     "variables": lambda: ep.polynomial("xy", degree=1),
@@ -49,11 +49,11 @@ NO_COUNTS: dict[str, Callable[[object], object]] = {
     "n": lambda n: ep.Bootstraps(n=n),
     "n_culled": lambda n: ep.Bootstraps(n_culled=n),
     "block": lambda n: ep.Bootstraps(block=n),
-    "n_blocks": lambda n: ep.BlockSplit(n_blocks=n),
+    "n_blocks": lambda n: ep.regression.BlockSplit(n_blocks=n),
     "n_steps": lambda n: ep.WeightedWeak(n_steps=n),
     "n_folds": lambda n: ep.FreeRunScore(n_folds=n),
     "n_starts": lambda n: ep.FreeRunScore(n_starts=n),
-    "n_windows": lambda n: ep.RefinedScore(n_windows=n),
+    "n_windows": lambda n: ep.FreeRunScore(n_windows=n),
     "degree": lambda n: ep.polynomial(["x"], degree=n),
     "function_degree": lambda n: ep.polynomial(
         ["x"], degree=1, functions=["sin"], function_degree=n
@@ -81,11 +81,20 @@ def test_whole_numbers_of_numpy_are_taken_and_kept_as_they_are_written() -> None
 
 WRONG_KINDS = [
     (lambda: ep.WeightedWeak(weak=ep.Differential()), "weak must be a Weak, such as ep.Weak"),
-    (lambda: ep.Weak(test_functions=ep.Bumps), "test_functions must be a WindowFunctions, such as"),
-    (lambda: ep.Weak(split=0.25), r"split must be a Split, such as ep.RandomSplit\(\): 0.25 came"),
+    (
+        lambda: ep.Weak(test_functions=ep.regression.Bumps),
+        "test_functions must be a WindowFunctions, such as",
+    ),
+    (
+        lambda: ep.Weak(split=0.25),
+        r"split must be a Split, such as ep.regression.RandomSplit\(\): 0.25 came",
+    ),
     (lambda: ep.Differential(smoother="kalman"), "smoother must be a Smoother, such as ep.sig"),
     (lambda: ep.discovery.PointSearch(["x"], None, ROWS), "library must be a Library, such as"),
-    (lambda: ep.Regression(selection=ep.Evidence()), "Evidence weighs what a search of trajector"),
+    (
+        lambda: ep.Regression(selection=ep.discovery.Evidence()),
+        "Evidence weighs what a search of trajector",
+    ),
     (lambda: ep.estimate(RUN, None), "library must be a Library, such as ep.polynomial"),
 ]
 

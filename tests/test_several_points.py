@@ -16,7 +16,12 @@ from ep2sindy.selection.criteria import Selection, log_supports
 from tests.models import plain_rows
 
 METHOD = ep.Regression(
-    ep.WeightedWeak(ep.Weak(test_functions=ep.Bumps(half_width_s=1.5), split=ep.RandomSplit(0.0))),
+    ep.WeightedWeak(
+        ep.Weak(
+            test_functions=ep.regression.Bumps(half_width_s=1.5),
+            split=ep.regression.RandomSplit(0.0),
+        )
+    ),
     ep.BestSubset(n_best=5),
     selection=ep.EBIC(),
     depth=5,
@@ -220,7 +225,9 @@ def test_units_and_amplitude_of_one_point_change_nothing(selection: Selection) -
 
 def test_order_of_points_changes_nothing() -> None:
     runs = family(0.05, 1)
-    split = replace(METHOD, formulation=ep.Weak(test_functions=ep.Bumps(half_width_s=0.8)))
+    split = replace(
+        METHOD, formulation=ep.Weak(test_functions=ep.regression.Bumps(half_width_s=0.8))
+    )
     forth, back = (ep.discover(each, LIBRARY, split, law=1) for each in (runs, runs[::-1]))
     assert list(forth.points) == [*reversed(back.points)]
     for point, own in forth.points.items():

@@ -170,7 +170,7 @@ def chain() -> ep.Trajectory:
 def refined(depth: int) -> ep.Regression:
     """A search whose systems are refined and judged whole."""
     search = ep.BestSubset(max_terms=6, n_best=100)
-    return ep.Regression(search=search, selection=ep.RefinedScore(), depth=depth)
+    return ep.Regression(search=search, selection=ep.FreeRunScore(bounds=None), depth=depth)
 
 
 def test_a_search_in_zones_finds_the_truth_and_conserves() -> None:
@@ -276,7 +276,7 @@ def toy(output: Path) -> list[str]:
     field = xr.Dataset(density, coords={"time": 1e-6 * record.t, "z": z})
     for name, unit in (("n_i", "m^-3"), ("n_n", "m^-3"), ("time", "s"), ("z", "m")):
         field[name].attrs["units"] = unit
-    ep.write_field(field, output / "chain.nc")
+    ep.data.write_field(field, output / "chain.nc")
     return [
         "+exp=zones", "data=file", f"data.path={output}/chain.nc", f"output={output}",
         "trajectory.zones={a: [0.0, 0.01], b: [0.01, 0.03]}", "data.z.name=z", "bootstraps.n=4",

@@ -7,7 +7,7 @@ import ep2sindy as ep
 
 
 def test_what_is_found_in_a_record_over_years_is_shown_per_year() -> None:
-    run = ep.datasets.hare_lynx()
+    run = ep.data.hare_lynx()
     assert "t = 0 to 20 year in steps of 1 year" in repr(run)
     terms = {"hare": ["hare", "hare*lynx"], "lynx": ["lynx", "hare*lynx"]}
     found = ep.discover(run, ep.polynomial(run.names).only(terms))
@@ -32,7 +32,7 @@ def test_what_is_found_in_a_record_over_years_is_shown_per_year() -> None:
 
 
 def test_notes_are_read_to_their_end() -> None:
-    text = repr(ep.discover(ep.datasets.hare_lynx()))
+    text = repr(ep.discover(ep.data.hare_lynx()))
     assert "or take a smaller library" in text
     assert max(map(len, text.splitlines())) <= 100
 

@@ -19,7 +19,7 @@ def chain() -> ep.SparseModel:
     """n' = 1e18, m' = n - m."""
     library = ep.polynomial(["n", "m"], degree=1)
     return ep.SparseModel(
-        library, ["n", "m"], ep.coef_matrix(library, [{"1": 1e18}, {"n": 1.0, "m": -1.0}])
+        library, ["n", "m"], ep.model.coef_matrix(library, [{"1": 1e18}, {"n": 1.0, "m": -1.0}])
     )
 
 
@@ -113,7 +113,7 @@ def test_what_an_input_sets_off_has_the_scale_of_that_input() -> None:
 def test_an_oscillation_from_rest_keeps_its_accuracy_over_a_long_time() -> None:
     """x'' = 1 - x: over a thousand radians, rate times duration would be a thousandfold scale."""
     library = ep.polynomial(["x", "v"], degree=1)
-    coef = ep.coef_matrix(library, [{"v": 1.0}, {"1": 1.0, "x": -1.0}])
+    coef = ep.model.coef_matrix(library, [{"v": 1.0}, {"1": 1.0, "x": -1.0}])
     found = ep.SparseModel(library, ["x", "v"], coef).simulate([0.0, 1000.0], [0.0, 0.0])
     assert found.states[-1, 0] == pytest.approx(1.0 - np.cos(1000.0), abs=1e-5)
 
@@ -121,7 +121,7 @@ def test_an_oscillation_from_rest_keeps_its_accuracy_over_a_long_time() -> None:
 def test_draws_reach_as_far_as_the_run_they_surround() -> None:
     """x' = x - x^2 grows a thousandfold from 1e-3, and rests at one."""
     library = ep.polynomial(["x"], degree=2)
-    coef = ep.coef_matrix(library, [{"x": 1.0, "x^2": -1.0}])
+    coef = ep.model.coef_matrix(library, [{"x": 1.0, "x^2": -1.0}])
     model = ep.SparseModel(library, ["x"], coef, covariance=np.diag([1e-4, 1e-4]))
     run = model.simulate(np.linspace(0.0, 15.0, 61), [1e-3], draws=50)
     low, high = run.band()
@@ -130,7 +130,7 @@ def test_draws_reach_as_far_as_the_run_they_surround() -> None:
 
 def test_a_run_that_ends_at_its_start_has_draws_of_the_start_alone() -> None:
     library = ep.polynomial(["x"], degree=1, functions=["log"])
-    coef = ep.coef_matrix(library, [{"log(x)": 1.0}])
+    coef = ep.model.coef_matrix(library, [{"log(x)": 1.0}])
     model = ep.SparseModel(library, ["x"], coef, covariance=np.eye(1))
     run = model.simulate(np.linspace(0.0, 1.0, 5), [-1.0], draws=3)
     assert run.diverged
@@ -207,7 +207,9 @@ def test_a_score_is_the_mean_over_the_states() -> None:
     run = linear().simulate(t, [1.0, -0.5]).trajectory()
     x_dot = run.states @ A.T
     half = ep.SparseModel(
-        linear().library, ["x", "y"], ep.coef_matrix(linear().library, [{"x": -0.5, "y": 2.0}, {}])
+        linear().library,
+        ["x", "y"],
+        ep.model.coef_matrix(linear().library, [{"x": -0.5, "y": 2.0}, {}]),
     )
     lost = 1.0 - np.square(x_dot[:, 1]).sum() / np.square(x_dot[:, 1] - x_dot[:, 1].mean()).sum()
     assert half.score(run, x_dot=x_dot) == pytest.approx((1.0 + lost) / 2, rel=1e-12)

@@ -14,7 +14,7 @@ from sklearn.utils.estimator_checks import check_estimator
 import ep2sindy as ep
 from tests.models import model_of
 
-SINDy = ep.sklearn.SINDy
+SINDy = ep.discovery.SINDy
 ROWS = ep.Regression()
 
 

@@ -101,7 +101,7 @@ def test_durations_are_times(tmp_path: Path) -> None:
     field = ep.open_field(tmp_path / "a.parquet")
     (run,) = trajectories_of(table)
     np.testing.assert_allclose(field["time"].values, run.t, rtol=1e-12)
-    assert clock_of(field) == run.clock == ep.Clock.of("h")
+    assert clock_of(field) == run.clock == ep.library.Clock.of("h")
 
 
 def test_dates_that_may_be_read_in_two_ways_are_left_out(tmp_path: Path) -> None:
@@ -119,8 +119,8 @@ def test_columns_of_several_sheets_bear_the_sheets_name(tmp_path: Path) -> None:
         ep.open_field(tmp_path / "a.xlsx")
     field = ep.open_field(
         tmp_path / "a.xlsx",
-        variables={"I_d": ep.Variable("two/I_d", "mA")},
-        time=ep.Variable("two/Time", "us"),
+        variables={"I_d": ep.data.Variable("two/I_d", "mA")},
+        time=ep.data.Variable("two/Time", "us"),
     )
     np.testing.assert_allclose(field["I_d"].values, 1e-3 * X, rtol=1e-12)
 
@@ -194,5 +194,5 @@ def test_a_measurement_file_of_labview_asks_for_its_time_alone(tmp_path: Path) -
         ValueError, match=r"if 'X_Value' is time, 'data.time=\{name:X_Value,unit:UN"
     ):
         ep.open_field(tmp_path / "a.lvm")
-    field = ep.open_field(tmp_path / "a.lvm", time=ep.Variable("X_Value", "s"))
+    field = ep.open_field(tmp_path / "a.lvm", time=ep.data.Variable("X_Value", "s"))
     np.testing.assert_allclose(field["Voltage"].values, X, atol=1e-6)

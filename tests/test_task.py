@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.data.coerce import Task
+from ep2sindy.discovery.result import DiscoveryMethod
 from ep2sindy.runtime.values import check_kind
 
 PREY = ep.lotka_volterra()
@@ -61,7 +63,7 @@ def test_an_estimate_takes_runs_and_relations_as_discover_does() -> None:
 
 def test_a_task_keeps_its_values_and_takes_a_tuple_of_runs() -> None:
     terms = {"x": ["x", "x*y"]}
-    task = ep.discovery.Task([RUN, OTHER], LIBRARY.relate("y: y == 1").only(terms))
+    task = Task([RUN, OTHER], LIBRARY.relate("y: y == 1").only(terms))
     terms["x"].append("y")
     assert task.states == ("x", "y")
     assert task.facts.only == {"x": ("x", "x*y")}
@@ -111,7 +113,7 @@ def test_inputs_are_taken_by_name_in_every_run(method) -> None:
 class Smallest:
     """A method of one's own, which asks another one."""
 
-    selection = ep.Evidence()
+    selection = ep.discovery.Evidence()
 
     def identify(self, task, *, rng, progress):
         return ep.TrajectorySearch(max_terms=2).identify(task, rng=rng, progress=progress)
@@ -134,4 +136,4 @@ def test_a_method_needs_no_more_than_a_rule_and_an_answer() -> None:
 def test_what_is_no_method_is_refused_with_what_it_lacks(value: object, lacking: str) -> None:
     message = f"(?s)^method must be a DiscoveryMethod, such as ep.Regression.*{lacking}"
     with pytest.raises(ValueError, match=message):
-        check_kind("method", value, ep.discovery.DiscoveryMethod, "ep.Regression()")
+        check_kind("method", value, DiscoveryMethod, "ep.Regression()")

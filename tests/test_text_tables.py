@@ -84,7 +84,7 @@ def test_text_goes_by_many_endings_and_columns_by_their_number(tmp_path: Path, e
     path = tmp_path / f"a.{ending}"
     path.write_text("when;current\n" + rows(T, X, sep=";", decimal=","))
     field = ep.open_field(
-        path, variables={"I_d": ep.Variable("1", "mA")}, time=ep.Variable("0", "s")
+        path, variables={"I_d": ep.data.Variable("1", "mA")}, time=ep.data.Variable("0", "s")
     )
     np.testing.assert_allclose(field["I_d"].values, 1e-3 * X, rtol=1e-8)
 
@@ -155,8 +155,8 @@ def test_a_unit_in_the_header_must_agree_with_the_mapping(tmp_path: Path) -> Non
     with pytest.raises(ValueError, match=r"(?s)2 things .*the file 'cm\^-3'.*the file 'us'"):
         ep.open_field(
             tmp_path / "a.csv",
-            variables={"n_i": ep.Variable("n", "m^-3")},
-            time=ep.Variable("t", "s"),
+            variables={"n_i": ep.data.Variable("n", "m^-3")},
+            time=ep.data.Variable("t", "s"),
         )
 
 
@@ -175,7 +175,7 @@ def test_units_of_a_preamble_are_those_of_the_columns(tmp_path: Path) -> None:
     field = ep.open_field(tektronix(tmp_path / "a.csv", T))
     np.testing.assert_allclose(field["CH1"].values, 1e-3 * X, rtol=1e-8)
     assert field["CH1"].attrs["units"] == "V"
-    assert ep.inspect_file(tmp_path / "a.csv").time == ep.Variable("TIME", "s")
+    assert ep.inspect_file(tmp_path / "a.csv").time == ep.data.Variable("TIME", "s")
 
 
 def test_a_gap_that_a_preamble_knows_nothing_of_stays_and_is_said(tmp_path: Path) -> None:
@@ -226,8 +226,8 @@ def test_a_count_is_a_unit_only_where_the_file_says_so(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="must be one that converts to SI: 'animals/ml' came"):
         ep.open_field(
             tmp_path / "a.csv",
-            variables={"x": ep.Variable("x", "animals/ml")},
-            time=ep.Variable("t", "s"),
+            variables={"x": ep.data.Variable("x", "animals/ml")},
+            time=ep.data.Variable("t", "s"),
         )
 
 
@@ -266,7 +266,7 @@ def test_a_preamble_beside_the_rows_says_units(tmp_path: Path) -> None:
     lines += [f",,,{t:.9e},{x:.9e}," for t, x in zip(T[4:], X[4:], strict=True)]
     (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
     found = ep.inspect_file(tmp_path / "a.csv")
-    assert found.time == ep.Variable("3", "s")
+    assert found.time == ep.data.Variable("3", "s")
     assert not found.notes()
     np.testing.assert_allclose(ep.open_field(tmp_path / "a.csv")["column_4"].values, 1e-3 * X)
 

@@ -14,9 +14,9 @@ from ep2sindy.discovery.one_signal import (
     try_in_turn,
 )
 from ep2sindy.library.units import Clock
-from ep2sindy.signals.embedding import DROWNED, Embedding, unexplained
+from ep2sindy.signals.embedding import DROWNED, Embedding, embed_alike, unexplained
 from ep2sindy.signals.smoothers import ratio_bounds
-from ep2sindy.signals.spectrum import signal_memory_s
+from ep2sindy.signals.spectrum import dominant_frequency, signal_memory_s
 
 A, B = 2.0, 1.0  # of the Toda oscillator: g' = A - B x
 
@@ -24,7 +24,7 @@ A, B = 2.0, 1.0  # of the Toda oscillator: g' = A - B x
 def toda(n_periods=20.0, *, per_period=80, start=(0.3, 0.0)):
     """x' = x g, g' = A - B x: closed orbits around x = A / B."""
     library = ep.polynomial(["x", "g"], degree=2)
-    coef = ep.coef_matrix(library, [{"x*g": 1.0}, {"1": A, "x": -B}])
+    coef = ep.model.coef_matrix(library, [{"x*g": 1.0}, {"1": A, "x": -B}])
     model = ep.SparseModel(library, ["x", "g"], coef)
     # The period of small departures; those of large ones are longer.
     t = 2 * np.pi / np.sqrt(A) * np.arange(round(n_periods * per_period)) / per_period
@@ -211,7 +211,7 @@ def test_a_gap_does_not_change_the_frequency(share):
     kept = np.delete(np.arange(3000), gap)
     found = ep.signals.find_cycle(t[kept], x[kept, None])
     assert found.frequency_Hz == pytest.approx(2e4, rel=1e-3)
-    assert ep.signals.dominant_frequency(t[kept], x[kept]) == pytest.approx(2e4, rel=5e-3)
+    assert dominant_frequency(t[kept], x[kept]) == pytest.approx(2e4, rel=5e-3)
 
 
 def test_three_states_of_a_signal_are_a_chain_of_derivatives():
@@ -241,7 +241,7 @@ def test_three_states_of_a_signal_are_a_chain_of_derivatives():
 def test_signals_of_several_runs_get_one_embedding():
     high, low = (ep.signals.prepare_signal(sine(mean=mean)) for mean in (3.0, 0.0))
     assert [each.embedding.how for each in map(ep.embed, (high, low))] == ["rate", "derivative"]
-    alike = ep.signals.embed_alike
+    alike = embed_alike
     assert {each.embedding for each in alike([high, high])} == {Embedding("rate")}
     both = alike([high, low], n_states=3)
     assert {each.embedding for each in both} == {Embedding("derivative", n_states=3)}

@@ -19,9 +19,9 @@ RUNS = "__import__('pathlib').Path('canary_that_sang').touch()"
 # What Hydra would call, what writes or runs what it is given, and what is not for configs.
 REFUSED = [
     "sympy.sympify", "os.system", "builtins.eval", "functools.partial", "hydra.utils.instantiate",
-    "ep2sindy.write_field", "ep2sindy.SparseModel.load", "ep2sindy.runtime.files.write_text",
+    "ep2sindy.data.write_field", "ep2sindy.SparseModel.load", "ep2sindy.runtime.files.write_text",
     "ep2sindy.EBIC.__init__", "ep2sindy.thruster.parameters.Thruster",
-    "ep2sindy.prepare.import_module", "ep2sindy.thruster.crop", "prepare.crop", "crop", "ep2sindy",
+    "ep2sindy.data.import_module", "ep2sindy.thruster.crop", "prepare.crop", "crop", "ep2sindy",
     "..EBIC", "", None, 1,
 ]  # fmt: skip
 

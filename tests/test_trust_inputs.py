@@ -172,7 +172,9 @@ def test_pickled_objects_of_a_zarr_store_do_not_run(
     content = Pickle().encode(np.array([Marks()] * 5, dtype=object))
     (path / array / "0").write_bytes(content)
     with pytest.raises(ValueError, match="a.zarr cannot be read"):
-        ep.open_field(path, variables={"I_d": ep.Variable("I", "A")}, time=ep.Variable("time", "s"))
+        ep.open_field(
+            path, variables={"I_d": ep.data.Variable("I", "A")}, time=ep.data.Variable("time", "s")
+        )
     assert not Path("it_ran").exists()
 
 

@@ -27,11 +27,11 @@ def prepared(field: xr.Dataset, *steps: Step) -> xr.Dataset:
 STEPS: list[Step] = [
     lambda field: field / 2,
     lambda field: field.drop_attrs(),
-    lambda field: ep.prepare.crop(field, stop_s=4e-5),
-    lambda field: ep.prepare.decimate(field, factor=2),
-    lambda field: ep.prepare.low_pass(field, cutoff_Hz=1e5),
-    lambda field: ep.prepare.derive(field, name="twice", expression="2*n_i", units="m^-3"),
-    lambda field: ep.prepare.keep_where(field, condition="z > 0.015"),
+    lambda field: ep.data.crop(field, stop_s=4e-5),
+    lambda field: ep.data.decimate(field, factor=2),
+    lambda field: ep.data.low_pass(field, cutoff_Hz=1e5),
+    lambda field: ep.data.derive(field, name="twice", expression="2*n_i", units="m^-3"),
+    lambda field: ep.data.keep_where(field, condition="z > 0.015"),
     lambda field: xr.Dataset({"n_i": field["n_i"]}),
 ]
 
@@ -51,7 +51,7 @@ def test_a_run_that_broke_at_once_is_no_data() -> None:
 
 @pytest.mark.parametrize("status", ["diverged", "steady", "decaying"])
 def test_a_file_of_a_simulation_says_what_it_is(status: str, tmp_path: Path) -> None:
-    ep.write_field(simulation(status).assign_attrs(channel_m=0.025), tmp_path / "run.nc")
+    ep.data.write_field(simulation(status).assign_attrs(channel_m=0.025), tmp_path / "run.nc")
     field = ep.open_field(tmp_path / "run.nc", plasma=True)
     assert is_simulation(field.attrs)
     assert amiss(field.attrs) == amiss(simulation(status).attrs)

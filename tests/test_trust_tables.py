@@ -118,7 +118,7 @@ def test_columns_of_one_name_are_numbered_and_none_is_taken_for_the_name(tmp_pat
     found = ep.inspect_file(tmp_path / "a.csv")
     assert [each.name for each in found.held] == ["t", "x.0", "x.1"]
     with pytest.raises(ValueError, match=r"no variable 'x' .*it holds t \(9\), x\.0 \(9\), x\.1"):
-        ep.open_field(tmp_path / "a.csv", variables={"x": ep.Variable("x", "1")}, dt_s=1.0)
+        ep.open_field(tmp_path / "a.csv", variables={"x": ep.data.Variable("x", "1")}, dt_s=1.0)
 
 
 def test_columns_that_are_left_out_are_said(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def written(path: Path, *, time: str = "s", **packing: object) -> Path:
 
 
 KINDS = [".nc", ".h5", ".zarr"]
-PLAIN = {"x": ep.Variable("x", "1")}
+PLAIN = {"x": ep.data.Variable("x", "1")}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -188,14 +188,14 @@ def test_packing_that_leaves_no_numbers_is_refused_with_its_attribute(
 ) -> None:
     path = written(tmp_path / f"a{kind}", **{key: value})
     with pytest.raises(ValueError, match=f"a{kind} cannot be read: {key} of 'x' must be a finite"):
-        ep.open_field(path, variables=PLAIN, time=ep.Variable("time", "s"))
+        ep.open_field(path, variables=PLAIN, time=ep.data.Variable("time", "s"))
     assert ep.inspect_file(path).time is not None  # the other array is read
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_sound_packing_is_undone(kind: str, tmp_path: Path) -> None:
     path = written(tmp_path / f"a{kind}", scale_factor=np.array([0.5]), add_offset=1.0)
-    field = ep.open_field(path, variables=PLAIN, time=ep.Variable("time", "s"))
+    field = ep.open_field(path, variables=PLAIN, time=ep.data.Variable("time", "s"))
     assert field["x"].values.tolist() == [1.0, 1.5, 2.0, 2.5, 3.0]
 
 
@@ -204,8 +204,8 @@ def test_sound_packing_is_undone(kind: str, tmp_path: Path) -> None:
 def test_days_are_no_seconds(kind: str, time: str, tmp_path: Path) -> None:
     path = written(tmp_path / f"a{kind}", time=time)
     with pytest.raises(ValueError, match=f"the mapping says 's', the file '{time}'"):
-        ep.open_field(path, variables=PLAIN, time=ep.Variable("time", "s"))
-    for given in (ep.Variable("time", "days"), ep.inspect_file(path).time):
+        ep.open_field(path, variables=PLAIN, time=ep.data.Variable("time", "s"))
+    for given in (ep.data.Variable("time", "days"), ep.inspect_file(path).time):
         field = ep.open_field(path, variables=PLAIN, time=given)
         assert field["time"].values[:2].tolist() == [0.0, 86400.0]
 

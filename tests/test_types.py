@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.model.scores import r2
 
 pytestmark = pytest.mark.skipif(
     "tests.checked" not in sys.modules, reason="types are checked by `make types`"
@@ -16,10 +17,8 @@ pytestmark = pytest.mark.skipif(
 @pytest.mark.parametrize(
     "call",
     [
-        pytest.param(lambda: ep.model.r2(truth=[1.0], prediction=[1.0]), id="lists"),
-        pytest.param(
-            lambda: ep.model.r2(truth=np.ones(5), prediction=np.ones(5)), id="an axis missing"
-        ),
+        pytest.param(lambda: r2(truth=[1.0], prediction=[1.0]), id="lists"),
+        pytest.param(lambda: r2(truth=np.ones(5), prediction=np.ones(5)), id="an axis missing"),
         pytest.param(lambda: ep.polynomial(3, degree=2), id="a type"),
     ],
 )

@@ -36,7 +36,7 @@ def test_rates_and_jacobian_are_those_of_the_formula() -> None:
 def test_terms_without_a_coefficient_are_not_evaluated() -> None:
     """log(x) has no value at -1, and no coefficient."""
     library = ep.polynomial(["x"], degree=1, functions=["log"])
-    model = ep.SparseModel(library, ["x"], ep.coef_matrix(library, [{"x": -2.0}]))
+    model = ep.SparseModel(library, ["x"], ep.model.coef_matrix(library, [{"x": -2.0}]))
     assert model.field.library.names == ("x",)
     assert model.field.rates(np.array([-1.0])) == 2.0
 

@@ -7,6 +7,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON, M_KRYPTON, M_XENON
+from ep2sindy.thruster.plane.simulate import THRUSTER_2D
 
 T = np.array([5.0, 10.0, 20.0])
 DISTANCE = np.array([-2e-3, -1e-3, 0.0, 1e-3, 2e-3])
@@ -91,6 +92,6 @@ def test_a_shielded_wall_meets_the_electrons_of_its_own_temperature():
         np.testing.assert_allclose(getattr(shielded, name)(T, gap, M_XENON), cold)
     with pytest.raises(ValueError, match=r"shielded_T_e_eV must be finite and positive, got 0\.0"):
         ep.thruster.SheathWall(shielded_T_e_eV=0.0)
-    thruster = replace(ep.thruster.THRUSTER_2D, wall=shielded)
+    thruster = replace(THRUSTER_2D, wall=shielded)
     with pytest.raises(ValueError, match=r"does not solve a shielded wall"):
         ep.thruster.simulate_2d(thruster, progress=False)

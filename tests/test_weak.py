@@ -9,10 +9,10 @@ from ep2sindy.signals.smoothers import NoSmoothing
 from ep2sindy.systems.systems import System, damped_oscillator, van_der_pol
 
 SYSTEMS = [damped_oscillator(), ep.lotka_volterra(), van_der_pol(), ep.lorenz()]
-EVERY_ROW = ep.Weak(split=ep.RandomSplit(test_fraction=0.0))
+EVERY_ROW = ep.Weak(split=ep.regression.RandomSplit(test_fraction=0.0))
 # The thesis's: no smoothing, no weights.
 RAW_BOXES = ep.Weak(
-    test_functions=ep.Boxes(n_windows=300, n_points=20),
+    test_functions=ep.regression.Boxes(n_windows=300, n_points=20),
     smoother=NoSmoothing(),
     smooth_library=False,
     errors_in_variables=False,
@@ -97,12 +97,14 @@ def test_windows_never_cross_trajectories(smooth_library: bool) -> None:
             assert np.array_equal(getattr(both.noisy, name), np.concatenate(parts))
 
 
-@pytest.mark.parametrize("split", [ep.RandomSplit(0.25), ep.BlockSplit(0.3, n_blocks=5)])
+@pytest.mark.parametrize(
+    "split", [ep.regression.RandomSplit(0.25), ep.regression.BlockSplit(0.3, n_blocks=5)]
+)
 @pytest.mark.parametrize(
     "form", [replace(ep.Weak(), smooth_library=False), RAW_BOXES], ids=["bumps", "boxes"]
 )
 def test_no_training_row_shares_a_sample_with_a_held_out_row(
-    form: ep.Weak, split: ep.RandomSplit | ep.BlockSplit
+    form: ep.Weak, split: ep.regression.RandomSplit | ep.regression.BlockSplit
 ) -> None:
     run = noisy(ep.lotka_volterra())
     rng = np.random.default_rng(0)
@@ -133,7 +135,9 @@ def test_noise_is_followed_into_the_training_rows_alone() -> None:
 
 def test_a_record_of_a_few_windows_holds_nothing_out() -> None:
     run = noisy(ep.lotka_volterra()).window(0, 60)
-    for problem in assembled(replace(ep.Weak(), test_functions=ep.Bumps(half_width_s=1.0)), [run]):
+    for problem in assembled(
+        replace(ep.Weak(), test_functions=ep.regression.Bumps(half_width_s=1.0)), [run]
+    ):
         assert not problem.test.any()
 
 
@@ -182,4 +186,4 @@ def test_an_input_that_never_changes_is_no_obstacle() -> None:
 
 def test_overlapping_boxes_have_no_errors_in_variables() -> None:
     with pytest.raises(ValueError, match="needs smooth test functions: Boxes came; use Bumps, or"):
-        ep.Weak(test_functions=ep.Boxes())
+        ep.Weak(test_functions=ep.regression.Boxes())

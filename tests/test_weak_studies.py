@@ -17,7 +17,7 @@ from ep2sindy.studies.weak_windows import coefficient_error, error_cells
 from ep2sindy.systems.systems import System
 from tests import programs, test_experiment_fits
 
-EVERY_ROW = ep.RandomSplit(test_fraction=0.0)
+EVERY_ROW = ep.regression.RandomSplit(test_fraction=0.0)
 UNWEIGHTED = ep.Weak(split=EVERY_ROW, errors_in_variables=False)
 
 
@@ -26,7 +26,7 @@ def sampled(*, rate_Hz: float = 30.0, duration_s: float = 40.0) -> System:
 
 
 def boxes(n_windows: int, n_points: int) -> ep.Weak:
-    windows = ep.Boxes(n_windows=n_windows, n_points=n_points)
+    windows = ep.regression.Boxes(n_windows=n_windows, n_points=n_points)
     return replace(UNWEIGHTED, test_functions=windows, smooth_library=False)
 
 

@@ -48,7 +48,7 @@ def test_the_wheel_brings_its_stubs(program: Path, tmp_path: Path) -> None:
         "from importlib.resources import files\n"
         "assert (files('ep2sindy') / 'py.typed').is_file()\n"
         "assert (files('ep2sindy') / 'thruster' / '__init__.pyi').is_file()\n"
-        "print(ep.thruster.Thruster().channel_length, ep.prepare.crop.__name__)\n"
+        "print(ep.thruster.Thruster().channel_length, ep.data.crop.__name__)\n"
     )
     result = run(program.parent / "python", "-c", code, cwd=tmp_path)
     assert result.stdout == "0.025 crop\n", result.stderr

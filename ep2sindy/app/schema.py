@@ -175,7 +175,7 @@ def _names_target(node: Any) -> bool:
 def _check_target(node: Any, place: str) -> None:
     if not _names_target(node):
         raise ValueError(
-            f"{place} must name a _target_, like {{_target_: ep2sindy.prepare.crop, start_s: 0}}: "
+            f"{place} must name a _target_, like {{_target_: ep2sindy.data.crop, start_s: 0}}: "
             f"got {node!r}"
         )
 

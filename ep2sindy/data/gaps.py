@@ -43,7 +43,7 @@ def present_rows(columns: Mapping[str, Float[np.ndarray, " _"]]) -> Bool[np.ndar
         raise ValueError(
             f"two samples or more must hold all of {list(columns)}: of {len(present)} samples "
             f"{counts}, and {int(present.sum())} are left; fill them first "
-            "(ep2sindy.prepare.interpolate)"
+            "(ep2sindy.data.interpolate)"
         )
     return present
 
@@ -99,7 +99,7 @@ def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
     return (
         f"{n_samples - len(t)} of {n_samples} samples are missing (NaN) and left out; the longest "
         f"gap is {longest:.4g} s, {longest / usual:.0f} steps: crop the record if that is long "
-        "beside its period, or fill it with ep2sindy.prepare.interpolate"
+        "beside its period, or fill it with ep2sindy.data.interpolate"
     )
 
 
@@ -129,5 +129,5 @@ def describe_missing(
             parts.append(f"{name} {int(lacks.sum())}, its longest gap is {longest:.4g} s")
     return (
         f"of {len(t)} samples are missing (NaN): {'; '.join(parts)}. A search of trajectories does "
-        "without them, others leave the samples out: fill them with ep2sindy.prepare.interpolate"
+        "without them, others leave the samples out: fill them with ep2sindy.data.interpolate"
     )

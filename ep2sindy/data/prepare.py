@@ -284,7 +284,7 @@ def _uniform_step(field: xr.Dataset) -> float:
         k = int(np.argmax(np.abs(steps - dt_s)))
         raise ValueError(
             f"a low-pass needs equal time steps: t[{k + 1}] - t[{k}] = {steps[k]:g} s, the mean "
-            f"is {dt_s:g} s; bring the field to equal steps first (ep2sindy.prepare.resample)"
+            f"is {dt_s:g} s; bring the field to equal steps first (ep2sindy.data.resample)"
         )
     return dt_s
 
@@ -351,7 +351,7 @@ def _check_gaps(name: str, t: np.ndarray, present: np.ndarray, max_gap_s: float 
         raise ValueError(
             f"only gaps inside the record can be filled: {name} holds numbers from "
             f"{t[present[0]]:.6g} to {t[present[-1]]:.6g} s, the record runs from {t[0]:.6g} to "
-            f"{t[-1]:.6g} s; crop it first (ep2sindy.prepare.crop)"
+            f"{t[-1]:.6g} s; crop it first (ep2sindy.data.crop)"
         )
     gaps = np.diff(t[present])
     if max_gap_s is not None and gaps.max() > max_gap_s:

@@ -35,7 +35,7 @@ def zone_averages(
     Raises ValueError also for names that are no words, and for zones that overlap or come in
     another order.
 
-    >>> field = ep.read_field("run.nc")
+    >>> field = ep.data.read_field("run.nc")
     >>> zones = {"anode": (0.0, 0.0125), "exit": (0.0125, 0.025)}
     >>> ep.zone_averages(field, zones, states=["n_i", "n_n"]).state_names
     ('n_i@anode', 'n_n@anode', 'n_i@exit', 'n_n@exit')

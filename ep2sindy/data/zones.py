@@ -53,7 +53,7 @@ def zone_average(
     Raises ValueError for an unknown variable, a zone off the grid or without plasma, or a
     value that is not finite in an unmasked cell.
 
-    >>> field = ep.read_field("run.nc")
+    >>> field = ep.data.read_field("run.nc")
     >>> run = ep.zone_average(field, ep.Zone(z=(0.01, 0.02)), states=["n_i", "n_n"])
     """
     check_field(field)

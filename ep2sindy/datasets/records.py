@@ -20,7 +20,7 @@ def pendulum_swing() -> Trajectory:
     Source: Kaheman, Fasel, Bramburger, Strom, Kutz & Brunton 2022, arXiv:2205.06231,
     github.com/dynamicslab/MultiArm-Pendulum, MIT licence, (c) 2022 dynamicslab.
 
-    >>> ep.datasets.pendulum_swing().n_samples
+    >>> ep.data.pendulum_swing().n_samples
     5500
     """
     return _read("pendulum", ["theta"], {"theta": "rad"})
@@ -32,7 +32,7 @@ def hare_lynx() -> Trajectory:
     Times are in s, and shown in years since 1900.
     Source: Odum 1953, Fundamentals of Ecology; public figures.
 
-    >>> ep.datasets.hare_lynx().states[0].tolist()
+    >>> ep.data.hare_lynx().states[0].tolist()
     [30.0, 4.0]
     """
     return _read("hare_lynx", ["hare", "lynx"], {}, unit="year", begins=1900.0)
@@ -44,7 +44,7 @@ def gause() -> Trajectory:
     Times are in s, and shown in days.
     Source: Gause, Smaragdova & Witt 1935; digitised in github.com/gugushvili/predator_prey, CC0.
 
-    >>> ep.datasets.gause().state_names
+    >>> ep.data.gause().state_names
     ('paramecium', 'yeast')
     """
     return _read("gause", ["paramecium", "yeast"], {}, unit="day")

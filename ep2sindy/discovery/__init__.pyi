@@ -1,7 +1,7 @@
 # Discover
-from ep2sindy.data.coerce import Task as Task
-from ep2sindy.discovery.result import DiscoveryMethod as DiscoveryMethod
-from ep2sindy.estimation.estimate import Estimate as Estimate
 from ep2sindy.discovery.pointwise import PointSearch as PointSearch
-from ep2sindy.discovery.regimes import find_regimes as find_regimes
-from ep2sindy.discovery.regimes import Regimes as Regimes
+from ep2sindy.discovery.estimator import SINDy as SINDy
+from ep2sindy.estimation.cost import SlowSearch as SlowSearch
+
+# Selection
+from ep2sindy.selection.criteria import Evidence as Evidence  # for configs

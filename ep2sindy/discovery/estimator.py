@@ -36,7 +36,7 @@ class SINDy(BaseEstimator):
     feature_names_in_ of a DataFrame.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
-    >>> found = ep.sklearn.SINDy(degree=2).fit(run.states, run.t)
+    >>> found = ep.discovery.SINDy(degree=2).fit(run.states, run.t)
     >>> list(found.model_.terms("x0"))
     ['x0', 'x0*x1']
     >>> found.predict(run.states).shape

@@ -76,7 +76,7 @@ class TrajectorySearch:
     def __post_init__(self) -> None:
         set_counts(self, {"depth": 1, "max_terms": 1})
         check_limit_s(self.limit_s)
-        check_kind("selection", self.selection, Selection, "ep.Evidence()")
+        check_kind("selection", self.selection, Selection, "ep.discovery.Evidence()")
         if self.selection.basis == "rows":
             raise ValueError(
                 "a search of trajectories weighs models by their likelihood: selection must "
@@ -274,12 +274,11 @@ class Regression:
         # These load torch, only for a search under roles.
         from ep2sindy.selection.conserving import search_conserving_systems
         from ep2sindy.selection.free_run import FreeRunScore
-        from ep2sindy.selection.refined import RefinedScore
 
-        if not isinstance(self.selection, FreeRunScore | RefinedScore):
+        if not isinstance(self.selection, FreeRunScore):
             raise ValueError(
                 "roles tie all equations together, so a rule must judge whole systems: selection "
-                f"must be FreeRunScore() or RefinedScore(), {self.selection!r} came"
+                f"must be FreeRunScore(), {self.selection!r} came"
             )
         library = task.library.with_known_terms(task.states)
         with progress.stage(None, "", "rows of the regression"):

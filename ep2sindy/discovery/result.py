@@ -62,7 +62,7 @@ class DiscoveryMethod(Protocol):
     identify: answers a `Task`. A method of one's own may ask another one:
 
     >>> class Smallest:
-    ...     selection = ep.Evidence()
+    ...     selection = ep.discovery.Evidence()
     ...
     ...     def identify(self, task, *, rng, progress):
     ...         own = ep.TrajectorySearch(max_terms=2)

@@ -141,7 +141,7 @@ def check_size(
         fixed + each * (n if limit_s is None else min(n, 2 * PARTS[0])),
         f"{what},",
         way_out="take fewer terms or a lower degree, every second sample "
-        "(ep2sindy.prepare.decimate), limit_s=60 for a search of parts, or a search equation by "
+        "(ep2sindy.data.decimate), limit_s=60 for a search of parts, or a search equation by "
         "equation: Regression(WeightedWeak()), or search=best_subset selection=ebic",
     )
     seconds = n * d * (SECONDS + MORE_SECONDS * p**2)

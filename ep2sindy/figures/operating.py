@@ -124,7 +124,7 @@ def _draw_estimates(
     mark: Mapping[str, Any],
 ) -> None:
     """Draw marks at their x, with bars where the ends of an interval are known."""
-    reach = np.abs(ends.sub(value, axis=0)).to_numpy(float).T
+    reach = ends.sub(value, axis=0).abs().to_numpy(float).T
     ax.errorbar(x, value, reach, ls="none", elinewidth=0.8, capsize=2, zorder=3, **mark)
 
 

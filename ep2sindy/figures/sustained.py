@@ -14,7 +14,7 @@ from ep2sindy.figures.style import GREY, SIGN, TITLE
 
 # Status -> marker, the best first; any other run has no cycle.
 MARKERS = {"sustained": "o", "wrong frequency": "D", "wrong cycle": "s"}
-OTHER = "decays, diverges or turns negative"
+OTHER = "no cycle: decays, diverges, turns negative"
 NORM = LogNorm(0.01, 1.0)  # of the amplitude's error
 
 

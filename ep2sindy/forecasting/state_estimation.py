@@ -219,7 +219,7 @@ def estimate_states(
 
     >>> full = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> predators = ep.Trajectory(full.t, full.columns(["y"]), ["y"])
-    >>> both = ep.estimate_states(ep.lotka_volterra().model, predators)
+    >>> both = ep.model.estimate_states(ep.lotka_volterra().model, predators)
     >>> off = both.columns(["x"]) - full.columns(["x"])
     >>> bool(off.std() < 0.1 * full.columns(["x"]).std())
     True

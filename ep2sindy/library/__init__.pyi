@@ -1,2 +1,3 @@
 # Libraries
-from ep2sindy.library.equations import equation_text as equation_text
+from ep2sindy.library.units import Clock as Clock
+from ep2sindy.library.relations import constraint as constraint

@@ -192,7 +192,7 @@ def constraint(
 
     >>> library = ep.polynomial(["x", "y"], degree=2)
     >>> support = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
-    >>> ep.constraint(library, support, ["x: x*y == -1 * y: x*y"]).C.shape
+    >>> ep.library.constraint(library, support, ["x: x*y == -1 * y: x*y"]).C.shape
     (4, 3)
     """
     for state, terms in support.items():

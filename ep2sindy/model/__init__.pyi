@@ -1,6 +1,11 @@
 # Models
-from ep2sindy.model.rollout import Rollout as Rollout
-from ep2sindy.model.scores import r2 as r2
-from ep2sindy.model.stability import LimitCycle as LimitCycle
+from ep2sindy.forecasting.evaluation import Evaluation as Evaluation
+from ep2sindy.model.comparison import Status as Status
+from ep2sindy.model.comparison import FreeRunBounds as FreeRunBounds  # for configs
 from ep2sindy.model.stability import limit_cycle as limit_cycle
 from ep2sindy.model.stability import share_reaching as share_reaching
+from ep2sindy.model.model import coef_matrix as coef_matrix
+
+# Forecasts
+from ep2sindy.forecasting.skill import forecast_skill as forecast_skill
+from ep2sindy.forecasting.state_estimation import estimate_states as estimate_states

@@ -49,7 +49,7 @@ class SparseModel:
     input without one is held if its samples rest over most steps, and else smooth.
 
     >>> library = ep.polynomial(["x", "v"], degree=1)
-    >>> spring = ep.coef_matrix(library, [{"v": 1.0}, {"x": -4.0}])
+    >>> spring = ep.model.coef_matrix(library, [{"v": 1.0}, {"x": -4.0}])
     >>> print(ep.SparseModel(library, ["x", "v"], spring).text())
     x' = 1 v
     v' = -4 x

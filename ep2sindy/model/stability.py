@@ -22,6 +22,11 @@ from ep2sindy.runtime.values import check_positive, locked, read_only
 # to 1e-6 or better.
 NEUTRAL_WITHIN = 1e-3
 
+# Largest modulus, after that of the flow, at which a cycle is trusted to attract: a departure
+# halves within 14 periods. Data of a few periods cannot tell weaker attraction from none. And the
+# smallest at which a cycle repels; a neutral cycle's is one but for errors of its coefficients.
+PULL, PUSH = 0.95, 1.003
+
 # If no orbit is found near the start, Newton's method begins again this many periods later.
 N_SETTLING = 10
 

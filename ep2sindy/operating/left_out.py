@@ -13,6 +13,7 @@ from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
 from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.stability import PULL
 from ep2sindy.operating.law import read_law
 from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.operating.records import OperatingRecord
@@ -20,7 +21,6 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import smooth_batch
 from ep2sindy.refinement.steps import FusedRungeKutta
 from ep2sindy.refinement.windows import cut_windows, dominant_window
-from ep2sindy.selection.free_run import PULL
 
 # Windows of every record that is left out, and steps of the integration in each of its samples.
 N_WINDOWS, N_SUBSTEPS = 20, 4

@@ -57,7 +57,7 @@ class RefinementSettings:
     Raises ValueError for less than one window or one with too few samples, for windows set by
     both samples and periods, or for a negative number of passes.
 
-    >>> ep.RefinementSettings(n_windows=20, periods=2.0).free_start
+    >>> ep.refinement.RefinementSettings(n_windows=20, periods=2.0).free_start
     True
     """
 

@@ -87,7 +87,7 @@ class Differential:
 
     def __post_init__(self) -> None:
         check_kind("smoother", self.smoother, Smoother, "ep.signals.SavitzkyGolay()")
-        check_kind("split", self.split, Split, "ep.RandomSplit()")
+        check_kind("split", self.split, Split, "ep.regression.RandomSplit()")
 
     def assemble(
         self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
@@ -171,9 +171,9 @@ class Weak:
     exact_inputs: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
-        check_kind("test_functions", self.test_functions, WindowFunctions, "ep.Bumps()")
+        check_kind("test_functions", self.test_functions, WindowFunctions, "ep.regression.Bumps()")
         check_kind("smoother", self.smoother, Smoother, "ep.signals.KalmanSmoother()")
-        check_kind("split", self.split, Split, "ep.RandomSplit()")
+        check_kind("split", self.split, Split, "ep.regression.RandomSplit()")
         check_list("exact_inputs", self.exact_inputs)
         if self.errors_in_variables and isinstance(self.test_functions, Boxes):
             raise ValueError(
@@ -323,10 +323,11 @@ class WeightedWeak:
     Raises ValueError for held-out rows, which the weights do not include.
     Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance.
 
+    >>> from ep2sindy.regression.front import fit_support
     >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
     >>> library, rng = ep.polynomial(["x", "y"], degree=2), np.random.default_rng(0)
     >>> rows, _ = ep.WeightedWeak().assemble([run], library, rng=rng)
-    >>> ep.regression.fit_support(rows, "x", ["x", "x*y"]).coef.round(2).tolist()
+    >>> fit_support(rows, "x", ["x", "x*y"]).coef.round(2).tolist()
     [0.67, -1.0]
     """
 
@@ -334,7 +335,7 @@ class WeightedWeak:
     n_steps: int = 2
 
     def __post_init__(self) -> None:
-        check_kind("weak", self.weak, Weak, "ep.Weak(split=ep.RandomSplit(0.0))")
+        check_kind("weak", self.weak, Weak, "ep.Weak(split=ep.regression.RandomSplit(0.0))")
         if not self.weak.errors_in_variables:
             raise ValueError("weights need the noise: set weak.errors_in_variables to true")
         set_counts(self, {"n_steps": 0})

@@ -43,8 +43,9 @@ class LeastSquares:
     triangle R of the QR factors of the columns of unit norm.
     Source: Bjorck 1996, Numerical Methods for Least Squares Problems, 1.3 and 2.7.
 
+    >>> from ep2sindy.regression.least_squares import LeastSquares
     >>> t = np.linspace(0.0, 1.0, 9)
-    >>> fit = ep.regression.LeastSquares.of_rows(np.column_stack([t, t**2]), 3.0 * t - t**2)
+    >>> fit = LeastSquares.of_rows(np.column_stack([t, t**2]), 3.0 * t - t**2)
     >>> fit.coef.round(9).tolist(), fit.rank
     ([3.0, -1.0], 2)
     """

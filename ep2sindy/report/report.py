@@ -123,7 +123,8 @@ class Report:
             self.headline |= rows.headline()
             seen = rows.screen(heading, by_state=by_state)
         else:
-            frame, self.summary[name], seen = rows, json_rows(rows), rows
+            frame, self.summary[name] = rows, json_rows(rows)
+            seen = rows.dropna(axis=1, how="all")  # as of published values, where there are none
         self.samples(name, frame)
         if shown:
             drawn = Table(seen, title=title, note=note, bold=bold, page_only=page_only)

@@ -1,24 +1,29 @@
-"""Systems of equations made of candidates, the records to judge them on, and folds of these."""
+"""Systems of equations made of candidates, their trials in folds of the records, and their rank."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Unpack
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Process, binding, constraint
 from ep2sindy.library.roles import process_amounts
+from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.refine import refine, with_coef
+from ep2sindy.refinement.problem import RefinementChanges
+from ep2sindy.refinement.refine import BatchRefinement, refine, refine_batch, with_coef
 from ep2sindy.refinement.steps import fastest_step
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.regression.front import Fronts
+from ep2sindy.runtime.progress import Progress
 from ep2sindy.selection.criteria import (
     FLOOR,
     MAX_ERROR,
@@ -27,14 +32,22 @@ from ep2sindy.selection.criteria import (
     describe_left_out,
     support_of,
 )
-from ep2sindy.signals.attractor import Cycle
-from ep2sindy.signals.smoothers import KalmanSmoother
 
 # Most time steps, over windows and systems, of one refinement batch: more would not fit the cache.
 BATCH_STEPS = 6000
 
 # Largest ratio of the waveform errors of two systems of which the one of lower order comes first.
 SAME = 1.1
+
+# A system on an attracting cycle replaces a smaller one on a neutral cycle only if its window loss
+# is below this share of the other's: if only noise is left, extra terms attract by chance.
+GAIN = 0.95
+
+# Largest ratio of the waveform errors of two systems that count as equals.
+ALIKE = 1.5
+
+# Share of starts from which a cycle counts as attracting everything around it.
+GLOBAL = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,50 +107,18 @@ class TrialSystem:
         return find_broken_demands(processes, values, self.means)
 
     def refine_on_all(
-        self,
-        runs: Sequence[Trajectory],
-        *,
-        window: int | None = None,
-        n_windows: int = 30,
-        n_reweights: int = 1,
-        seed: int = 0,
+        self, runs: Sequence[Trajectory], seed: int, **settings: Unpack[RefinementChanges]
     ) -> SparseModel:
         """Refine on windows spread over all the data, with the covariance of the coefficients.
 
-        window: in samples; None takes one and a half periods. n_windows, n_reweights and seed: as
-        for `refine`. A system without terms, or one whose refinement does not stay finite, is
-        returned unchanged, without covariance.
+        seed and settings: as for `refine`. A system without free coefficients, or one whose
+        refinement does not stay finite, is returned unchanged, without covariance.
         """
         if not len(self.constraint.free):
             return self.model
-        found = refine(
-            self.model,
-            runs,
-            n_windows=n_windows,
-            window=window,
-            method=MultipleShooting(step=fastest_step(self.model.library)),
-            constraint=self.constraint,
-            n_reweights=n_reweights,
-            seed=seed,
-        )
-        return found.model
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """Results of a system on the folds that it was not fitted to, the worst over all folds.
-
-    error: largest deviation from the data's cycle, in units of its bound; a system with one or less
-    lives. f_error, amplitude: largest relative errors of the frequency and of an amplitude.
-    waveform: largest error of the waveform. loss: on the windows that the system was refined on.
-    """
-
-    system: TrialSystem
-    error: float
-    f_error: float
-    amplitude: float
-    waveform: float
-    loss: float
+        settings["method"] = MultipleShooting(step=fastest_step(self.model.library))
+        settings["constraint"] = self.constraint
+        return refine(self.model, runs, seed=seed, **settings).model
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,26 +135,21 @@ class Systems:
     left_out: str = ""
 
     def score(
-        self, errors: Float[np.ndarray, " systems"], *, limit: float, winner: int
+        self, errors: Float[np.ndarray, " systems"], winner: int
     ) -> list[Float[np.ndarray, " _candidates"]]:
-        """Scores of candidates from the errors of their systems.
+        """Scores of candidates from the errors of their systems, in units of the bound.
 
-        limit: errors up to this value cannot be told from the least. winner: index of the system
-        that is selected among them. A candidate's score is the least error of all systems with it,
-        no less than the limit, or MAX_ERROR if there are none. The winner's candidates score
-        marginally below the limit.
+        winner: index of the system that is selected. A candidate's score is the least error of all
+        systems with it, no less than one and the winner's, or MAX_ERROR if there are none. The
+        winner's candidates score marginally below that.
         """
+        limit = max(1.0, float(errors[winner]))
         scores = np.maximum(errors, limit)
         scores[winner] = np.nextafter(limit, 0.0)
         return [
             np.array([scores[at == k].min(initial=MAX_ERROR) for k in range(len(front.candidates))])
             for front, at in zip(self.fronts, self.places.T, strict=True)
         ]
-
-    def find_smallest(self, errors: Float[np.ndarray, " systems"], *, limit: float) -> int:
-        """Index of the system of fewest terms, then least error, among errors up to the limit."""
-        n_terms = sum(f.sizes[k] for f, k in zip(self.fronts, self.places.T, strict=True))
-        return int(np.lexsort((errors, n_terms, errors > limit))[0])
 
 
 def combine(fronts: Fronts, task: Task, *, most: int) -> Systems:
@@ -211,46 +187,6 @@ def find_broken_demands(
         rates[process.role] = rates.get(process.role, 0.0) + value * mean
     back = [role for role, rate in rates.items() if rate <= 0.0 and not role.endswith(" free")]
     return found + [f"{role} > 0 in the mean" for role in back]
-
-
-def describe_demands(note: str, broken: Sequence[str]) -> str:
-    """A rule's note, with the demands that its winner does not meet."""
-    return f"{note}; no system meets all demands: {', '.join(broken)}" if broken else note
-
-
-def plan_refinement(batch: WindowBatch, library: Library) -> tuple[MultipleShooting, int]:
-    """Refinement method for systems to be judged, and how many to refine together.
-
-    The regression's coefficients are close, so whole windows are fitted at once in few iterations.
-    Systems that need more are the wrong ones.
-    """
-    method = MultipleShooting(
-        step=fastest_step(library), first_memory=batch.data.shape[1], tolerance=1e-3, max_iter=10
-    )
-    return method, max(1, BATCH_STEPS // batch.steps.size)
-
-
-@dataclass(frozen=True, eq=False)
-class Records:
-    """The trajectories to judge equations on, with smoothed states, and the cycles of each."""
-
-    runs: Sequence[Trajectory]
-    smoothed: Sequence[Float[np.ndarray, "_ n_states"]]
-    cycles: Sequence[Cycle] = ()
-
-
-def smooth_records(fronts: Fronts, runs: Sequence[Trajectory]) -> Records:
-    """The runs with smoothed states, the states in the order of the fronts.
-
-    Raises ValueError for a state without a front.
-    """
-    equations = [front.equation for front in fronts]
-    if sorted(equations) != sorted(runs[0].state_names):
-        raise ValueError(
-            f"to integrate, every state needs one front: {equations} came for the states "
-            f"{list(runs[0].state_names)}"
-        )
-    return Records(runs, [KalmanSmoother().smooth(run.t, run.columns(equations)) for run in runs])
 
 
 @dataclass(frozen=True)
@@ -325,35 +261,143 @@ def cut_stretches(
     )
 
 
-def find_living(trials: Sequence[Trial]) -> list[int]:
+def plan_refinement(batch: WindowBatch, library: Library) -> tuple[MultipleShooting, int]:
+    """Refinement method for systems to be judged, and how many to refine together.
+
+    The regression's coefficients are close, so whole windows are fitted at once in few iterations.
+    Systems that need more are the wrong ones.
+    """
+    method = MultipleShooting(
+        step=fastest_step(library), first_memory=batch.data.shape[1], tolerance=1e-3, max_iter=10
+    )
+    return method, max(1, BATCH_STEPS // batch.steps.size)
+
+
+def refine_systems(
+    systems: Sequence[TrialSystem], batch: WindowBatch, progress: Progress, *, n_reweights: int
+) -> BatchRefinement:
+    """Every system refined on the same windows. Raises ValueError for one without terms."""
+    method, together = plan_refinement(batch, systems[0].model.library)
+    with progress.stage(len(systems), "system", "refined without a fold") as advance:
+        return refine_batch(
+            [system.model for system in systems],
+            batch,
+            method=method,
+            constraints=[system.constraint for system in systems],
+            n_reweights=n_reweights,
+            points_per_batch=together,
+            advance=advance,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """How a system does where it was not fitted: the worst over all folds.
+
+    error: in units of its bound; a system with one or less lives. f_error, amplitude: largest
+    relative errors of the frequency and of an amplitude; NaN if windows are judged. waveform:
+    largest error of the waveform, or the mean square error over windows left out. loss: on the
+    windows that the system was refined on, or, if windows are judged, on those left out.
+    """
+
+    system: TrialSystem
+    error: float
+    f_error: float
+    amplitude: float
+    waveform: float
+    loss: float
+
+    def rank(self, margin: float) -> tuple[bool, int, float]:
+        """Sorts the best of living systems first: those with room, the smallest, the closest."""
+        return self.error > margin, self.system.n_free, self.waveform
+
+
+def find_living(trials: Sequence[Trial]) -> list[Trial]:
     """The systems that live in every fold.
 
     If some follow the windows to rounding, because the truth is in the library, these alone.
     """
     exact = min(trial.loss for trial in trials) < FLOOR
-    return [k for k, t in enumerate(trials) if t.error <= 1.0 and (t.loss < FLOOR or not exact)]
+    return [t for t in trials if t.error <= 1.0 and (t.loss < FLOOR or not exact)]
 
 
-def list_others(trials: Sequence[Trial], living: Sequence[int], winner: int) -> list[OtherSystem]:
+def list_others(living: Sequence[Trial], winner: Trial) -> list[OtherSystem]:
     """The other living systems of the winner's size, the best waveform first."""
-    size = trials[winner].system.n_free
-    alike = [trials[k] for k in living if k != winner and trials[k].system.n_free == size]
+    size = winner.system.n_free
+    alike = [t for t in living if t is not winner and t.system.n_free == size]
     return [
         OtherSystem(t.system.parts, t.error, t.f_error, t.amplitude, t.waveform)
         for t in sorted(alike, key=lambda t: t.waveform)
     ]
 
 
-def order_equals(ranked: Sequence[int], trials: Sequence[Trial]) -> list[int]:
+def order_equals(ranked: Sequence[Trial]) -> list[Trial]:
     """The ranked systems; of those as good as the best one left, the lowest order comes first."""
     left, found = list(ranked), []
     while left:
-        best = trials[left[0]]
-        size, reach = best.system.n_free, SAME * best.waveform
-        equals = [
-            k for k in left if trials[k].system.n_free == size and trials[k].waveform <= reach
-        ]
-        simplest = min(equals, key=lambda k: trials[k].system.order)
-        found.append(simplest)
-        left.remove(simplest)
+        size, reach = left[0].system.n_free, SAME * left[0].waveform
+        equals = [t for t in left if t.system.n_free == size and t.waveform <= reach]
+        found.append(min(equals, key=lambda t: t.system.order))
+        left.remove(found[-1])
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class Confirmed:
+    """A system refined on all data, and its free run over the longest record.
+
+    broken: demands that the coefficients do not meet. share: of starts around the cycle that reach
+    it; zero if the model does not live, or if departures from its cycle do not die out. run: None
+    if windows are judged; share is then one, or zero if demands are broken. repels: True if
+    departures grow.
+    """
+
+    trial: Trial
+    model: SparseModel
+    broken: Sequence[str]
+    share: float
+    run: Evaluation | None = None
+    repels: bool = False
+
+    @property
+    def is_global(self) -> bool:
+        return self.share >= GLOBAL
+
+    @property
+    def rests(self) -> bool:
+        """Whether it lives on a neutral cycle."""
+        lives = self.run is not None and self.run.status is Status.SUSTAINED
+        return lives and not self.share and not self.repels
+
+    def outdoes(self, resting: Confirmed) -> bool:
+        """Whether an attracting system is preferred to one that is no larger, on a neutral cycle.
+
+        It is if it follows the windows better, or as an equal: of one size, and as close to the
+        waveform of the folds that neither was fitted to.
+        """
+        ours, theirs = self.trial, resting.trial
+        is_equal = ours.system.n_free <= theirs.system.n_free
+        is_close = ours.waveform <= ALIKE * theirs.waveform
+        return ours.loss < GAIN * theirs.loss or (is_equal and is_close)
+
+    @property
+    def rank(self) -> tuple[float, ...]:
+        """Sorts the best first; the first of equals wins."""
+        goes = (False, 0) if self.run is None else self.run.rank
+        size, share = self.trial.system.n_free, min(self.share, GLOBAL)
+        attracts = (self.repels, not self.share, not self.is_global)
+        return (bool(self.broken), *goes, *attracts, size, -share)
+
+    def text(self, n_living: int, n_systems: int) -> str:
+        """How the system was confirmed, in words."""
+        if self.run is None:
+            found = "chosen by windows held out"
+        else:
+            how = self.run.text if n_living else f"{self.run.text} where fitted"
+            if self.run.status is Status.SUSTAINED and not self.share:
+                how = f"{how}, on a cycle that {'repels' if self.repels else 'does not attract'}"
+            elif self.share and not self.model.inputs:
+                how = f"{how}, {100.0 * self.share:.0f} % of starts reach it"
+            found = f"{how}; {n_living or 'none'} of {n_systems} systems live where not fitted"
+        demands = f"; no system meets all demands: {', '.join(self.broken)}" if self.broken else ""
+        return found + demands

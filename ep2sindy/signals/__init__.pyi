@@ -3,11 +3,7 @@ from ep2sindy.signals.smoothers import KalmanSmoother as KalmanSmoother  # for c
 from ep2sindy.signals.log_smoother import LogSmoother as LogSmoother  # for configs
 from ep2sindy.signals.smoothers import SavitzkyGolay as SavitzkyGolay  # for configs
 from ep2sindy.signals.smoothers import NoSmoothing as NoSmoothing  # for configs
-from ep2sindy.signals.spectrum import dominant_frequency as dominant_frequency
-from ep2sindy.signals.attractor import Cycle as Cycle
 from ep2sindy.signals.attractor import find_cycle as find_cycle
 from ep2sindy.signals.attractor import mean_cycle as mean_cycle
 from ep2sindy.signals.trace import prepare_signal as prepare_signal
-from ep2sindy.signals.trace import Trace as Trace
-from ep2sindy.signals.embedding import Embedded as Embedded
-from ep2sindy.signals.embedding import embed_alike as embed_alike
+from ep2sindy.signals.delay import Delay as Delay

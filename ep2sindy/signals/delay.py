@@ -30,7 +30,7 @@ class Delay:
     Source of the "linear chain trick": MacDonald 1978, Time Lags in Biological Models,
     doi:10.1007/978-3-642-93107-9.
 
-    >>> delay = ep.Delay("x", delay_s=2.0, n_stages=3)
+    >>> delay = ep.signals.Delay("x", delay_s=2.0, n_stages=3)
     >>> delay.names
     ('x_lag1', 'x_lag2', 'x_lag3')
     >>> delay.equations["x_lag2"]

@@ -241,7 +241,7 @@ def _check_oscillation(signal: Trace) -> None:
             f"a trace must oscillate: no period explains a quarter of the variance of {name} over "
             f"its {duration} (strongest line: {clock.frequency_text(signal.frequency_Hz)}), and "
             "most of it is white noise; crop transients, prepare it with "
-            "ep2sindy.prepare.low_pass, or take another signal"
+            "ep2sindy.data.low_pass, or take another signal"
         )
     if signal.per_period < MIN_SAMPLES:
         raise ValueError(

@@ -97,7 +97,7 @@ class Study:
     models: structures by name. fits: the ways of fitting, by name. forms: forms of the regression
     besides the formulation, by name. held_out: share at the end of the record over which models
     run; None fits and runs over all of it. rollout_s: longest run; None means to the end.
-    n_windows, periods, window, n_reweights: of refinements, see `ep.RefinementSettings`. windows:
+    n_windows, periods, window, n_reweights: of refinements, see `RefinementSettings`. windows:
     lengths for loss against window length. n_draws: number of draws of windows, for the spread of
     the refinements. points: operating points, at each of which all is fitted; None for one record.
     parameters: their places in the data group; labels: their names in figures.

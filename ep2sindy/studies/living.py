@@ -140,11 +140,8 @@ class LivingSearch:
 
     @property
     def bounds(self) -> FreeRunBounds:
-        """The bounds by which the selection rule calls a model living."""
-        from ep2sindy.selection.free_run import FreeRunScore  # loads torch, only for a search
-
-        rule = self.selection
-        return rule.bounds if isinstance(rule, FreeRunScore) else FreeRunBounds()
+        """The bounds by which the selection rule calls a model living, or the usual ones."""
+        return getattr(self.selection, "bounds", None) or FreeRunBounds()
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,7 +97,8 @@ def add_points(
         raise ValueError("structures need a record to be fitted to: no operating point has one")
     names = list(next(iter(found.values())))
     over = {name: AtPoints([fits[name] for fits in found.values()]) for name in names}
-    sources = {fits[0].name: fits[0].structure.source for fits in (e.fits for e in over.values())}
+    first = next(iter(found.values())).values()
+    sources = {fit.name: fit.structure.source for fit in first}
     report.section(f"{len(names)} fits at {len(found)} operating points")
     draw = partial(sustained_figure, _rows(found), labels=labels)
     report.figure("sustained", draw, CAPTION)

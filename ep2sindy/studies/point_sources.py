@@ -199,7 +199,7 @@ def nothing_moves(statuses: Sequence[str]) -> str:
         f"none of the {len(statuses)} operating points oscillates "
         f"({', '.join(sorted(set(statuses)))}), so there is no fit: "
         "try the part of the records behind the start-up "
-        "('prepare=[{_target_:ep2sindy.prepare.crop,start_s:...}]'), another zone "
+        "('prepare=[{_target_:ep2sindy.data.crop,start_s:...}]'), another zone "
         "(trajectory.zone.z=...), or other points"
     )
 

@@ -419,7 +419,7 @@ def fits_table(results: Sequence[PointResult]) -> pd.DataFrame:
         for result in results
         for fit, fitted in result.fits.items()
     ]  # fmt: skip
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows, columns=None if rows else ["fit", "status", "loss"])
 
 
 def _live(result: PointResult) -> dict[str, float]:

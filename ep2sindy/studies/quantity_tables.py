@@ -202,7 +202,7 @@ def _add_figures(
     labels: Mapping[str, str],
 ) -> None:
     """Add a figure of each model: its quantities by least squares, refined, and published."""
-    usable = estimates[estimates["usable"]]
+    usable = estimates[estimates["usable"].astype(bool)]
     for model in dict.fromkeys(fit.removesuffix(REFINED) for fit in usable["fit"] if lines):
         kinds = {model: "least squares", model + REFINED: "refined"}
         best = min(kinds, key=lambda fit: errors.get(fit, np.inf))

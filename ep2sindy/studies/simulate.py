@@ -125,7 +125,7 @@ class Study:
             Result(
                 f"Simulated: {status_text(run)}{at}",
                 [Text("; ".join(brief))],
-                load='ep.read_field("{}/field.nc")',
+                load='ep.data.read_field("{}/field.nc")',
                 picture="current",
             )
         )

@@ -15,12 +15,8 @@ from ep2sindy.thruster.axial.starts import Restart as Restart  # for configs
 from ep2sindy.thruster.axial.starts import SoftStart as SoftStart  # for configs
 from ep2sindy.thruster.balance import zone_balance as zone_balance
 from ep2sindy.thruster.plane.simulate import simulate_2d as simulate_2d  # for configs
-from ep2sindy.thruster.plane.simulate import THRUSTER_2D as THRUSTER_2D
-from ep2sindy.thruster.plane.simulate import OPERATING_POINT_2D as OPERATING_POINT_2D
 from ep2sindy.thruster.propellant_files import propellant as propellant  # for configs
 from ep2sindy.thruster.propellant_files import read_propellant as read_propellant  # for configs
-from ep2sindy.thruster.propellants import PropellantTable as PropellantTable  # for configs
-from ep2sindy.thruster.propellants import TabulatedRates as TabulatedRates  # for configs
 from ep2sindy.thruster.propellants import XenonFits as XenonFits  # for configs
 from ep2sindy.thruster.ionization import ionization_rate as ionization_rate  # for configs
 from ep2sindy.thruster.magnetic_field import MagneticField as MagneticField  # for configs
@@ -33,7 +29,6 @@ from ep2sindy.thruster.plume import ThermalPlume as ThermalPlume  # for configs
 from ep2sindy.thruster.transport import AnomalousTransport as AnomalousTransport  # for configs
 from ep2sindy.thruster.transport import GaussianTransport as GaussianTransport  # for configs
 from ep2sindy.thruster.transport import FunctionTransport as FunctionTransport  # for configs
-from ep2sindy.thruster.transport import Plasma as Plasma
 from ep2sindy.thruster.transport import MultiLogTransport as MultiLogTransport  # for configs
 from ep2sindy.thruster.transport import PressureShift as PressureShift  # for configs
 from ep2sindy.thruster.walls import ExponentialWall as ExponentialWall  # for configs

@@ -10,17 +10,17 @@ from ep2sindy.refinement.ode import unconstrained
 from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_batch
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.front import Candidate, ParetoFront
+from ep2sindy.runtime.progress import SILENT
 from ep2sindy.selection import systems
-from ep2sindy.selection.criteria import FLOOR, MAX_ERROR
-from ep2sindy.selection.refined import _refine
+from ep2sindy.selection.by_windows import WindowsLeftOut
+from ep2sindy.selection.criteria import MAX_ERROR
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, damped_oscillator
 from tests.models import plain_rows
 
 PREY = ep.lotka_volterra()
+RULE = ep.FreeRunScore(bounds=None)
 Terms = dict[str, float]
-# The limit of what follows exactly: two standard errors of one residual above the floor.
-EXACT = 17.0 * FLOOR
 
 
 def fronts_of(
@@ -49,12 +49,12 @@ def fronts_of(
     return fronts
 
 
-def scores_by(rule: ep.RefinedScore, fronts: list[ParetoFront]) -> list[np.ndarray]:
+def scores_by(rule: ep.FreeRunScore, fronts: list[ParetoFront]) -> list[np.ndarray]:
     rows = fronts[0].rows
     return list(rule.decide(fronts, Task(rows.trajectories, rows.library)).scores)
 
 
-def picked(rule: ep.RefinedScore, fronts: list[ParetoFront]) -> list[set[str]]:
+def picked(rule: ep.FreeRunScore, fronts: list[ParetoFront]) -> list[set[str]]:
     scores = scores_by(rule, fronts)
     return [set(f.with_scores(s).best.terms) for f, s in zip(fronts, scores, strict=True)]
 
@@ -87,10 +87,10 @@ WRONG = {
 def test_the_truth_is_selected_from_exact_samples(system: System) -> None:
     run = system.trajectory().window(0, 600)
     fronts = fronts_of([run], system.model.library, next_to_truth(system, WRONG[system.name]))
-    found = scores_by(ep.RefinedScore(), fronts)
+    found = scores_by(RULE, fronts)
     chosen = [f.with_scores(scores).best for f, scores in zip(fronts, found, strict=True)]
     assert [set(c.terms) for c in chosen] == supports(system)
-    assert max(scores.min() for scores in found) <= EXACT
+    assert max(scores.min() for scores in found) < 1.0
 
 
 @pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.05])
@@ -103,7 +103,7 @@ def test_biased_coefficients_of_the_truth_are_mended(noise: float) -> None:
     }
     good = {s: PREY.model.terms(s) | {"1": 1e-4} for s in PREY.model.states}
     fronts = fronts_of([run], PREY.model.library, {s: [poor[s], good[s]] for s in poor})
-    assert picked(ep.RefinedScore(), fronts) == supports(PREY)
+    assert picked(RULE, fronts) == supports(PREY)
 
 
 def test_equations_without_terms_take_part_and_can_win() -> None:
@@ -113,11 +113,7 @@ def test_equations_without_terms_take_part_and_can_win() -> None:
     run = ep.Trajectory(t, states, ["x", "y"])
     choices = {"x": [{"x": 0.01}], "y": [{"y": -0.8}]}
     fronts = fronts_of([run], ep.polynomial(["x", "y"], degree=1), choices)
-    assert picked(ep.RefinedScore(), fronts) == [set(), {"y"}]
-    nothing = fronts_of([run], ep.polynomial(["x", "y"], degree=1), {"x": [], "y": []})
-    x, y = scores_by(ep.RefinedScore(window_s=1.0), nothing)
-    assert x == y
-    assert 0.0 < float(x[0]) < MAX_ERROR
+    assert picked(RULE, fronts) == [set(), {"y"}]
 
 
 def test_inputs_drive_the_refinement() -> None:
@@ -126,10 +122,10 @@ def test_inputs_drive_the_refinement() -> None:
     run = ep.Trajectory(t, (np.cos(t) + np.sin(t))[:, None], ["x"], 2.0 * np.cos(t)[:, None], ["u"])
     choices = {"x": [{"u": 1.0}, {"u": 0.7, "x": -1.2}]}
     library = ep.polynomial(["u", "x"], degree=1)  # the library's order is its own
-    assert picked(ep.RefinedScore(), fronts_of([run], library, choices)) == [{"u", "x"}]
+    assert picked(RULE, fronts_of([run], library, choices)) == [{"u", "x"}]
 
 
-def test_units_do_not_matter_to_the_refined_score() -> None:
+def test_units_do_not_matter_to_windows() -> None:
     run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(1)).window(0, 500)
     library, choices = PREY.model.library, next_to_truth(PREY, WRONG["Lotka-Volterra"])
     degree = dict(zip(library.names, library.exponents.sum(axis=1), strict=True))
@@ -138,8 +134,8 @@ def test_units_do_not_matter_to_the_refined_score() -> None:
         s: [{n: c * 1e6 * 1e18 ** (1.0 - degree[n]) for n, c in terms.items()} for terms in given]
         for s, given in choices.items()
     }
-    plain = scores_by(ep.RefinedScore(), fronts_of([run], library, choices))
-    scaled = scores_by(ep.RefinedScore(), fronts_of([dense], library, converted))
+    plain = scores_by(RULE, fronts_of([run], library, choices))
+    scaled = scores_by(RULE, fronts_of([dense], library, converted))
     for a, b in zip(plain, scaled, strict=True):
         assert b == pytest.approx(a, rel=1e-4)
 
@@ -149,36 +145,44 @@ def test_a_combination_that_diverges_gets_the_largest_error() -> None:
     library = ep.polynomial(["x", "v"], degree=3)
     choices = {"x": [{"v": 1.0}, {"1": 1e200, "x^3": 1e200}], "v": [{"x": -9.0, "v": -0.6}]}
     run = system.trajectory().window(0, 600)
-    scores = scores_by(ep.RefinedScore(window_s=0.5), fronts_of([run], library, choices))
+    scores = scores_by(RULE, fronts_of([run], library, choices))
     assert scores[0][2] == MAX_ERROR
-    assert scores[0][1] <= EXACT
+    assert scores[0][1] < 1.0
 
 
 def test_what_refines_does_not_judge(monkeypatch: pytest.MonkeyPatch) -> None:
-    batches: list[list[ep.Trajectory]] = []
+    batches: list[WindowBatch] = []
+    pieces: list[list[ep.Trajectory]] = []
 
     def seen(runs: list[ep.Trajectory], **settings: object) -> WindowBatch:
-        batches.append(runs)
-        return cut_windows(runs, **settings)
+        pieces.append(runs)
+        batches.append(cut_windows(runs, **settings))
+        return batches[-1]
 
     monkeypatch.setattr(systems, "cut_windows", seen)
     run = PREY.trajectory()
-    # The last is too short for a pair.
-    parts = [run.window(0, 450), run.window(600, 990), run.window(990, 1000)]
+    parts = [run.window(0, 450), run.window(600, 990)]
     choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
     fronts = fronts_of(parts, PREY.model.library, choices)
-    assert picked(ep.RefinedScore(window_s=5.0, n_windows=10), fronts) == supports(PREY)
-    times = [np.concatenate([piece.t for piece in batch]) for batch in batches]
+    assert picked(replace(RULE, n_windows=10), fronts) == supports(PREY)
+    times = [
+        np.concatenate(
+            [run[j].t[k : k + batch.data.shape[1]] for j, k in zip(
+                batch.trajectory, batch.start, strict=True
+            )]
+        )
+        for run, batch in zip(pieces, batches, strict=True)
+    ]  # fmt: skip
+    assert len(times) == 6
     for fitted, held in zip(times[::2], times[1::2], strict=True):
-        assert len(np.unique(np.append(fitted, held))) == len(fitted) + len(held) == 10 * 51
-    judged = np.concatenate(times[1::2])
-    assert len(np.unique(judged)) == len(judged) == 10 * 51
+        assert not set(fitted) & set(held)
+        assert len(set(held)) == len(held)
 
 
 def test_two_windows_refine_and_judge_by_turns() -> None:
     run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(1)).window(0, 400)
     fronts = fronts_of([run], PREY.model.library, next_to_truth(PREY, WRONG["Lotka-Volterra"]))
-    assert picked(ep.RefinedScore(n_windows=2), fronts) == supports(PREY)
+    assert picked(replace(RULE, n_windows=2), fronts) == supports(PREY)
 
 
 @pytest.mark.parametrize("number", [2, pytest.param(5, marks=pytest.mark.slow)])
@@ -188,9 +192,7 @@ def test_windows_without_a_jump_do_not_decide_alone(number: int) -> None:
     system, (run,) = realization("van_der_pol", 0.05, number, seed=7)
     terms = {s: system.model.terms(s) for s in system.model.states}
     choices = {"x": [terms["x"]], "y": [terms["y"], {"x^3": 0.5 * terms["y"]["x"]}]}
-    assert picked(ep.RefinedScore(), fronts_of([run], system.model.library, choices)) == supports(
-        system
-    )
+    assert picked(RULE, fronts_of([run], system.model.library, choices)) == supports(system)
 
 
 def batch_of(run: ep.Trajectory, *, n_windows: int = 3, window: int = 50) -> WindowBatch:
@@ -210,7 +212,7 @@ def test_models_of_different_terms_refined_together_are_those_refined_alone() ->
         [{"x": 0.6, "x*y": -0.9}, {"1": 0.01, "y": -0.3, "x*y": 0.9}],
     ]
     models = [
-        ep.SparseModel(library, ["x", "y"], ep.coef_matrix(library, terms)) for terms in given
+        ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, terms)) for terms in given
     ]
     method = MultipleShooting()
     found = refine_batch(models, batch, method=method)
@@ -234,9 +236,9 @@ def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() 
     library = ep.polynomial(["x", "y"], degree=4)
     truth = {s: PREY.model.terms(s) for s in ("x", "y")}
     wild = ep.SparseModel(
-        library, ["x", "y"], ep.coef_matrix(library, [{"x^2*y^2": 1e200}, {"y": 1e3}])
+        library, ["x", "y"], ep.model.coef_matrix(library, [{"x^2*y^2": 1e200}, {"y": 1e3}])
     )
-    sound = ep.SparseModel(library, ["x", "y"], ep.coef_matrix(library, list(truth.values())))
+    sound = ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, list(truth.values())))
     batch = batch_of(PREY.trajectory())
     found = refine_batch([wild, sound], batch, method=MultipleShooting())
     kept, good = found.models
@@ -250,21 +252,21 @@ def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() 
     assert np.square(paths[1] - batch.data).mean() < 1e-8
 
 
-def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_refinement_that_ends_worse_than_it_began_is_not_kept() -> None:
     off = replace(PREY.model, coef=1.2 * PREY.model.coef)
 
-    def unfinished(models: list[ep.SparseModel], *_: object, **__: object) -> BatchRefinement:
-        better, worse = PREY.model, replace(PREY.model, coef=2.0 * PREY.model.coef)
-        return BatchRefinement([better, worse], np.zeros(2, dtype=np.bool_), np.ones(2))
-
-    monkeypatch.setattr("ep2sindy.selection.refined.refine_batch", unfinished)
-    batch = batch_of(PREY.trajectory())
+    better, worse = PREY.model, replace(PREY.model, coef=2.0 * PREY.model.coef)
+    refined = BatchRefinement([better, worse], np.zeros(2, dtype=np.bool_), np.ones(2))
+    run = PREY.trajectory()
+    batch, fold = batch_of(run), systems.Fold([systems.Stretch(0, 0, 300)], [])
     trial = systems.TrialSystem(off, unconstrained(off))
-    first, second = _refine([trial, trial], batch, lambda n_more: None)
-    np.testing.assert_array_equal(first.coef, PREY.model.coef)
-    np.testing.assert_array_equal(second.coef, off.coef)
+    measure = WindowsLeftOut([run], [fold], run.states.std(axis=0), ["x", "y"], n_windows=2)
+    mended, spoilt = measure.judge([trial, trial], refined, batch, fold, SILENT)
+    assert np.abs(mended).max() < 1e-3
+    same = BatchRefinement([off, off], np.ones(2, dtype=np.bool_), np.ones(2))
+    np.testing.assert_array_equal(
+        spoilt, measure.judge([trial, trial], same, batch, fold, SILENT)[1]
+    )
 
 
 def test_what_cannot_be_judged_is_refused() -> None:
@@ -272,9 +274,9 @@ def test_what_cannot_be_judged_is_refused() -> None:
     choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
     fronts = fronts_of([run], PREY.model.library, choices)
     with pytest.raises(ValueError, match=r"every state needs one front: \['x'\] came"):
-        scores_by(ep.RefinedScore(), fronts[:1])
+        scores_by(RULE, fronts[:1])
     short = fronts_of([run.window(0, 9)], PREY.model.library, choices)
-    with pytest.raises(ValueError, match="2 x 4 were asked of at most 9; .* longer records"):
-        scores_by(ep.RefinedScore(), short)
-    with pytest.raises(ValueError, match="window_s must be positive: 0"):
-        ep.RefinedScore(window_s=0.0)
+    with pytest.raises(
+        ValueError, match="runs must hold 30 samples to be parted in 3: at most 9 came"
+    ):
+        scores_by(RULE, short)

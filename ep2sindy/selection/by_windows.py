@@ -1,0 +1,149 @@
+"""Systems judged on windows that they were not refined on, for records without a cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.refine import BatchRefinement, smooth_batch
+from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, dominant_window
+from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.selection.criteria import FLOOR, MAX_ERROR
+from ep2sindy.selection.systems import (
+    Confirmed,
+    Fold,
+    Trial,
+    TrialSystem,
+    cut_stretches,
+    plan_refinement,
+)
+
+# Standard errors by which the winner's error may exceed the least.
+N_ERRORS = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class WindowsLeftOut:
+    """Errors of systems on windows that share no samples with those that they were refined on.
+
+    For judging, coefficients are held and each window's start is fitted: from a smoothed start even
+    the true system, if it is chaotic, runs away from its own samples.
+    The error is the mean square distance to the samples in variances of each state, averaged over
+    the states with weights 1 / residual of the leader, the system of greatest likelihood. It is at
+    most 10, which also stands for a window that a system cannot run through. A refinement that
+    blows up, or that does not converge and follows its own windows no better, keeps the
+    coefficients of the regression, which are judged like any other.
+    Its bound is two standard errors above the leader's. The standard error is that of the
+    difference between the two errors, in which noise that both meet cancels: with n independent
+    residuals an excess share of q in the error has the standard error sqrt(4 q / n), so q = 16 / n
+    is two of them. n is the number of residuals times (1 - rho) / (1 + rho), rho being the
+    autocorrelation of the leader's residuals from sample to sample. So differences between models
+    that miss more than white noise are uncertain.
+
+    runs: the records between their gaps. spread: standard deviation of each state over all runs.
+    n_windows: to judge on, in each fold, if there is room for as many.
+    """
+
+    runs: Sequence[Trajectory]
+    folds: Sequence[Fold]
+    spread: Float[np.ndarray, " n_states"]
+    states: Sequence[str]
+    n_windows: int
+    margin = 1.0  # all within the bound are alike
+    window_on_all = None  # one and a half periods
+    n_reweights = 1
+
+    @cached_property
+    def window(self) -> int:
+        """Number of samples in each: one and a half periods, or half of what a fold holds out."""
+        room = min(max(part.stop - part.start for part in fold.held) for fold in self.folds)
+        return max(MIN_SAMPLES, min(dominant_window(self.runs, self.states), room // 2))
+
+    def admits(self, system: TrialSystem) -> bool:
+        return bool(system.model.coef.any())
+
+    def judge(
+        self,
+        systems: Sequence[TrialSystem],
+        refined: BatchRefinement,
+        fitted: WindowBatch,
+        fold: Fold,
+        progress: Progress,
+    ) -> Float[np.ndarray, "systems windows samples n_states"]:
+        """Distances to windows held out, in standard deviations of the states."""
+        models, before = list(refined.models), [system.model for system in systems]
+        doubtful = np.flatnonzero(~refined.finished)
+        worse, better = (
+            _bounded_squares(_residuals([each[k] for k in doubtful], fitted)).mean(axis=(1, 2))
+            for each in (models, before)
+        )
+        for k in doubtful[worse >= better]:
+            models[k] = before[k]
+        window = fitted.data.shape[1]
+        room = sum((part.stop - part.start) // window for part in fold.held)
+        n_windows = min(self.n_windows, room)
+        held = cut_stretches(self.runs, fold.held, before[0], window=window, n_windows=n_windows)
+        return _residuals(models, held, progress) * (held.scale[: len(self.spread)] / self.spread)
+
+    def figures(self, tried: Sequence[np.ndarray]) -> Float[np.ndarray, "systems 5"]:
+        """Errors in units of their bound."""
+        errors, bound = _errors_and_bound(np.concatenate(tried, axis=1))
+        unknown = np.full_like(errors, np.nan)
+        shares = np.minimum(errors / bound, MAX_ERROR)
+        return np.column_stack([shares, unknown, unknown, errors, errors])
+
+    def confirm(self, trial: Trial, model: SparseModel) -> Confirmed:
+        """A system is confirmed if its coefficients, refined on all data, meet the demands."""
+        broken = trial.system.broken(model)
+        return Confirmed(trial, model, broken, share=float(not broken))
+
+
+def _residuals(
+    models: Sequence[SparseModel], batch: WindowBatch, progress: Progress = SILENT
+) -> Float[np.ndarray, "models windows samples n_states"]:
+    """Distances of the best trajectories to the samples, in the batch's scale; NaN if none."""
+    if not models:
+        return np.empty((0, *batch.data.shape))
+    method, together = plan_refinement(batch, models[0].library)
+    with progress.stage(len(models), "system", "starts of windows held out") as advance:
+        return (
+            smooth_batch(models, batch, method=method, points_per_batch=together, advance=advance)
+            - batch.data
+        )
+
+
+def _errors_and_bound(
+    residuals: Float[np.ndarray, "models windows samples n_states"],
+) -> tuple[Float[np.ndarray, " models"], float]:
+    """Error of every model, and the largest error not distinguishable from the leader's."""
+    squares = _bounded_squares(residuals)
+    by_state = np.maximum(squares.mean(axis=1), FLOOR)
+    leader = int(np.argmin(np.log(by_state).sum(axis=1)))
+    least = by_state[leader]
+    errors = np.minimum((by_state / least).mean(axis=1) * least.mean(), MAX_ERROR)
+    n = _independent(np.nan_to_num(residuals[leader]))
+    return errors, float(least.mean() * (1.0 + (2.0 * N_ERRORS) ** 2 / n))
+
+
+def _bounded_squares(
+    residuals: Float[np.ndarray, "models windows samples n_states"],
+) -> Float[np.ndarray, "models windows n_states"]:
+    """Mean squares over a window, at most MAX_ERROR, which also stands for a missing trajectory."""
+    with np.errstate(over="ignore"):
+        squares = np.square(residuals).mean(axis=2)
+    return np.where(squares < MAX_ERROR, squares, MAX_ERROR)
+
+
+def _independent(residuals: Float[np.ndarray, "windows samples n_states"]) -> float:
+    """Number of independent residuals with the same information on a mean, by autocorrelation."""
+    power = np.maximum(np.square(residuals).sum(axis=(0, 1)), 1e-300)
+    rho = (residuals[:, 1:] * residuals[:, :-1]).sum(axis=(0, 1)) / power
+    rho = np.clip(rho, 0.0, 1.0)
+    n_samples = residuals.shape[0] * residuals.shape[1]
+    return max(float((n_samples * (1.0 - rho) / (1.0 + rho)).sum()), 1.0)

@@ -1,2 +1,0 @@
-# For scikit-learn
-from ep2sindy.discovery.estimator import SINDy as SINDy
