@@ -148,9 +148,7 @@ def _signed_colours() -> Colormap:
     half = round((1.0 - GAP) * n) + 1  # the faintest shade begins before GAP, because of rounding
     shades = np.linspace(0.3, 1.0, half)
     blues, reds = colormaps["Blues"](shades[::-1]), colormaps["Reds"](shades)
-    found = ListedColormap([*blues, *[ABSENT] * (2 * (n - half)), *reds])
-    found.set_bad("white")
-    return found
+    return ListedColormap([*blues, *[ABSENT] * (2 * (n - half)), *reds]).with_extremes(bad="white")
 
 
 def _draw_signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.DataArray) -> None:
