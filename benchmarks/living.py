@@ -30,8 +30,15 @@ from ep2sindy.library.relations import Constraint
 from ep2sindy.library.roles import shares_of, sum_known
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.studies.living import start_of
-from ep2sindy.studies.processes import ComparedProcess, compared_processes, ends_of
-from ep2sindy.studies.source import Zones, fitted_rate, recorded_rates, told_roles
+from ep2sindy.studies.processes import (
+    ComparedProcess,
+    Zones,
+    compared_processes,
+    ends_of,
+    fitted_rate,
+    recorded_rates,
+    told_roles,
+)
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 CHANNEL, DOWNSTREAM = "channel", "downstream"

@@ -9,8 +9,8 @@ import xarray as xr
 import ep2sindy as ep
 from ep2sindy.library.roles import constraint_of, sum_known
 from ep2sindy.studies.balance import model_balance
-from ep2sindy.studies.processes import compared_processes
-from ep2sindy.studies.source import Zones, split_in_time, told_roles
+from ep2sindy.studies.processes import Zones, compared_processes, told_roles
+from ep2sindy.studies.source import split_in_time
 from tests.thrusters import brief
 
 STATES = ["n_i", "n_n"]

@@ -16,8 +16,7 @@ from ep2sindy.model.model import SparseModel, model_of
 from ep2sindy.refinement.problem import Iteration
 from ep2sindy.studies.fits import Study, watcher
 from ep2sindy.studies.fitted import Fit, expand
-from ep2sindy.studies.processes import compared_processes
-from ep2sindy.studies.source import Zones
+from ep2sindy.studies.processes import Zones, compared_processes
 from ep2sindy.studies.structures import Structure, balance_model
 from tests import programs
 from tests.fields import along_channel

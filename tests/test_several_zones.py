@@ -12,8 +12,7 @@ from ep2sindy.library.equations import equation_html, latex_derivative, latex_te
 from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.library.roles import constraint_of, shares_of
-from ep2sindy.studies.processes import compared_processes
-from ep2sindy.studies.source import Zones, told_roles
+from ep2sindy.studies.processes import Zones, compared_processes, told_roles
 from tests.models import model_of
 from tests.programs import composed, computed
 

@@ -11,28 +11,15 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from jaxtyping import Float
-from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from ep2sindy.data.fields import cell_edges
+from ep2sindy.figures import style
 from ep2sindy.figures.maps import CM
-from ep2sindy.figures.style import (
-    COLOURS,
-    DATA,
-    GREY,
-    TITLE,
-    WIDTH,
-    legend_above,
-    make_grid,
-    make_panels,
-    unit_text,
-    write_in_cell,
-)
+from ep2sindy.figures.style import COLOURS, DATA, GREY, TITLE, WIDTH
 from ep2sindy.signals.spectrum import power_spectrum
 
 PROFILES = ("n_i", "n_n", "u_iz", "T_e_eV", "E_z", "ionization")
@@ -45,25 +32,22 @@ MS, KHZ = 1e3, 1e-3
 
 def current_figure(field: xr.Dataset, window: slice) -> Figure:
     """The discharge current over the whole record, and with the beam current over a few periods."""
-    figure, axes = make_panels(2, 1, (WIDTH, 4.8))
-    whole, part = axes.flat
-    time = MS * field["time"].values
+    figure, ((whole,), (part,)) = style.make_panels(2, 1, (WIDTH, 4.8))
+    time, shown = MS * field["time"].values, field.isel(time=window)
     whole.plot(time, field["I_d"].values, color=DATA, lw=0.5)
     if window.stop - window.start < time.size:
         whole.axvspan(time[window.start], time[window.stop - 1], color=COLOURS[4], alpha=0.35, lw=0)
-    shown = field.isel(time=window)
     part.plot(time[window], shown["I_d"].values, color=DATA, lw=1.3, label="discharge current")
-    highest = shown["I_d"].values
     if "I_beam" in field:
-        beam = shown["I_beam"].values
-        highest = np.maximum(highest, beam)
-        part.plot(time[window], beam, color=COLOURS[0], lw=1.3, ls="--", label="ion beam current")
-    for ax, values in ((whole, field["I_d"].values), (part, highest)):
+        beam: dict[str, Any] = {"color": COLOURS[0], "ls": "--", "label": "ion beam current"}
+        part.plot(time[window], shown["I_beam"].values, lw=1.3, **beam)
+    handles = list(part.lines)
+    for ax in (whole, part):
         ax.set_ylabel("current (A)")
-        _hold_zero(ax, values)
         ax.margins(x=0.0)
+        _show_zero(ax)
     part.set_xlabel("time after the warm-up (ms)")
-    legend_above(figure, part.lines)
+    style.legend_above(figure, handles)
     return figure
 
 
@@ -77,7 +61,7 @@ def current_spectrum_figure(
     """
     frequency, power = power_spectrum(field["time"].values, field["I_d"].values)
     shown = (frequency > 0.0) & (frequency <= f_max_Hz)
-    figure, ((ax,),) = make_panels(1, 1, (WIDTH, 3.8))
+    figure, ((ax,),) = style.make_panels(1, 1, (WIDTH, 3.8))
     floor = max(1e-12 * power.max(), np.finfo(float).tiny)
     ax.loglog(KHZ * frequency[shown], np.maximum(power[shown], floor), color=DATA, lw=0.8)
     if np.isfinite(f_kHz):
@@ -86,10 +70,10 @@ def current_spectrum_figure(
     if f_max_Hz > transit_Hz:
         limits = KHZ * transit_Hz, KHZ * f_max_Hz
         ax.axvspan(*limits, color=GREY, alpha=0.25, lw=0, label="transit range")
-    ax.set(xlabel="frequency (kHz)", ylabel=f"power of the current ({unit_text('A^2/Hz')})")
+    ax.set(xlabel="frequency (kHz)", ylabel=f"power of the current ({style.unit_text('A^2/Hz')})")
     ax.set_xlim(KHZ * frequency[shown][0], KHZ * frequency[shown][-1])
     ax.grid(alpha=0.3)
-    legend_above(figure, ax.get_legend_handles_labels()[0])
+    style.legend_above(figure, ax.get_legend_handles_labels()[0])
     return figure
 
 
@@ -107,23 +91,23 @@ def profile_table(field: xr.Dataset) -> pd.DataFrame:
 def profile_figure(field: xr.Dataset) -> Figure:
     """Mean profiles with bands of 5 to 95 % and of the full range; the channel's exit is dashed."""
     table, names = profile_table(field), [name for name in PROFILES if name in field]
-    figure, axes = make_grid(
+    figure, axes = style.make_grid(
         len(names), width=3.0, height=2.5, extra=0.4, sharex=True,
         x_label="distance from the anode (cm)",
     )  # fmt: skip
-    z = CM * field["z"].values
+    z, band = CM * field["z"].values, "{} to {} % of the time".format(*BAND_PERCENT)
     for ax, name in zip(axes, names, strict=True):
         values = table[[f"{name}_{end}" for end in ENDS]].to_numpy().T
         (mean, low, high, least, most), unit = scale_to_prefix(values, field[name].attrs["units"])
         ax.fill_between(z, least, most, color=COLOURS[5], alpha=0.3, lw=0, label="whole range")
-        label = f"{BAND_PERCENT[0]} to {BAND_PERCENT[1]} % of the time"
-        ax.fill_between(z, low, high, color=COLOURS[0], alpha=0.35, lw=0, label=label)
+        ax.fill_between(z, low, high, color=COLOURS[0], alpha=0.35, lw=0, label=band)
         ax.plot(z, mean, color=DATA, lw=1.5, label="mean")
         ax.set_title(fill(_words(field[name]), 28), fontsize=TITLE)
         ax.set_ylabel(unit)
-        _mark_exit(ax, field, along="x")
+        for end in _exit_cm(field):
+            ax.axvline(end, color=DATA, lw=1.0, ls="--")
         ax.margins(x=0.0)
-    legend_above(figure, axes[0].get_legend_handles_labels()[0])
+    style.legend_above(figure, axes[0].get_legend_handles_labels()[0])
     return figure
 
 
@@ -133,21 +117,21 @@ def space_time_figure(field: xr.Dataset, window: slice) -> Figure:
     shown = field.isel(time=window)
     time = MS * shown["time"].values
     size, heights = (WIDTH, 1.7 + 2.4 * len(names)), [1.0, *[1.7] * len(names)]
-    figure, grid = make_panels(1 + len(names), 1, size, sharex=True, heights=heights)
+    figure, grid = style.make_panels(1 + len(names), 1, size, sharex=True, heights=heights)
     axes = grid[:, 0]
     axes[0].plot(time, shown["I_d"].values, color=DATA, lw=1.3)
     axes[0].set_ylabel("discharge\ncurrent (A)")
-    _hold_zero(axes[0], shown["I_d"].values)
+    _show_zero(axes[0])
     edges = CM * cell_edges(field["z"].values.astype(float))
     for ax, name in zip(axes[1:], names, strict=True):
         values, unit = scale_to_prefix(along_z(shown[name]), field[name].attrs["units"])
-        drawn = ax.pcolormesh(
-            cell_edges(time), edges, values.T, cmap=MAPS[name], vmin=0.0, rasterized=True
-        )
-        bar = figure.colorbar(drawn, ax=ax, pad=0.02, aspect=14)
-        bar.set_label(f"{_words(field[name])}\n({unit})")
+        look: dict[str, Any] = {"cmap": MAPS[name], "vmin": 0.0, "rasterized": True}
+        drawn = ax.pcolormesh(cell_edges(time), edges, values.T, **look)
+        label = f"{_words(field[name])}\n({unit})"
+        figure.colorbar(drawn, ax=ax, pad=0.02, aspect=14, label=label)
         ax.set_ylabel("distance from\nthe anode (cm)")
-        _mark_exit(ax, field, along="y")
+        for end in _exit_cm(field):
+            ax.axhline(end, color="white", lw=1.0, ls="--")
     axes[0].set_xlim(time[0], time[-1])
     axes[-1].set_xlabel("time after the warm-up (ms)")
     return figure
@@ -167,27 +151,24 @@ def scale_to_prefix(
     factor, name = READABLE.get(unit, (1.0, unit))
     largest = float(np.nanmax(np.abs(factor * values), initial=0.0))
     if 1e-2 <= largest < 1e4 or largest == 0.0:
-        return factor * values, unit_text(name)
+        return factor * values, style.unit_text(name)
     power = int(np.floor(np.log10(largest)))
-    return factor * values / 10.0**power, f"$10^{{{power}}}$ {unit_text(name)}"
+    return factor * values / 10.0**power, f"$10^{{{power}}}$ {style.unit_text(name)}"
 
 
-def _hold_zero(ax: Axes, values: Float[np.ndarray, " time"]) -> None:
-    """Set limits that include zero, so that a steady current does not look like a moving one."""
-    low, high = min(0.0, float(values.min())), max(0.0, float(values.max()))
-    ax.set_ylim(1.05 * low, (1.08 * high) or 1.0)
+def _show_zero(ax: Axes) -> None:
+    """Draw the line of zero, so that a steady current does not look like a moving one."""
+    ax.axhline(0.0, color=GREY, lw=0.8)
 
 
 def _words(array: xr.DataArray) -> str:
     return str(array.attrs.get("long_name", array.name))
 
 
-def _mark_exit(ax: Axes, field: xr.Dataset, *, along: str) -> None:
-    """Draw the end of the channel as a dashed line, if the run gives its position."""
+def _exit_cm(field: xr.Dataset) -> list[float]:
+    """The end of the channel, if the run gives its position."""
     thruster = json.loads(field.attrs.get("parameters", "{}")).get("thruster", {})
-    if length := thruster.get("channel_length"):
-        style: dict[str, Any] = {"color": DATA if along == "x" else "white", "lw": 1.0, "ls": "--"}
-        (ax.axvline if along == "x" else ax.axhline)(CM * length, **style)
+    return [CM * thruster["channel_length"]] if "channel_length" in thruster else []
 
 
 def last_periods(t: Float[np.ndarray, " time"], f_kHz: float, periods: float) -> slice:
@@ -203,7 +184,17 @@ HATCHES = {
     "steady": "//", "decaying": "\\\\", "transit": "..", "out": "--", "diverged": "xx",
     "failed": "++",
 }  # fmt: skip
-STATUS_MARKERS = {BREATHES: "o", "steady": "s", "decaying": "v", "transit": "D", "out": "_"}
+# A marker for a status, or an upright line if the current is meaningless.
+QUIET: dict[str, Any] = {"ls": "none", "color": COLOURS[1]}
+STATUS_STYLES: dict[str, dict[str, Any]] = {
+    BREATHES: {"ls": "none", "color": COLOURS[0], "marker": "o"},
+    "steady": {**QUIET, "marker": "s"},
+    "decaying": {**QUIET, "marker": "v"},
+    "transit": {**QUIET, "marker": "D"},
+    "out": {**QUIET, "marker": "_"},
+    "diverged": {"ls": ":", "color": COLOURS[3]},
+    "failed": {"ls": "--", "color": COLOURS[3]},
+}
 WORTHLESS = ("diverged", "failed")  # statuses whose current is meaningless
 CURVES = {  # column -> title, factor
     "I_d_mean": ("discharge current (A)", 1.0),
@@ -211,7 +202,6 @@ CURVES = {  # column -> title, factor
     "thrust_N": ("thrust (mN)", 1e3),
     "anode_efficiency": ("anode efficiency (%)", 100.0),
 }
-DARK = 0.6  # on the colour scale: text is black below, white above
 
 
 def stability_figure(
@@ -225,49 +215,47 @@ def stability_figure(
     along, up, *others = axes
     groups = list(points.groupby(others, sort=False)) if others else [((), points)]
     x, y = (list(dict.fromkeys(points[name])) for name in (along, up))
-    figure, panels = make_grid(
+    figure, panels = style.make_grid(
         len(groups), width=0.95 * len(x) + 0.7, height=0.62 * len(y) + 0.9, extra=0.7,
         sharex=True, sharey=True,
     )  # fmt: skip
     figure.set_figwidth(max(figure.get_figwidth() + 1.8, 5.5))
     known = points.loc[~points["status"].isin(WORTHLESS), "I_d_std"]
-    scale = Normalize(0.0, float(known.max()) if len(known) and known.max() > 0 else 1.0)
+    most = float(known.max()) if known.any() else 1.0
     for ax, (held, group) in zip(panels, groups, strict=True):
-        for row in group.to_dict("records"):
-            _draw_cell(ax, x.index(row[along]), y.index(row[up]), row, scale)
+        _draw_cells(ax, group.set_index([up, along]), y, x, most)
         title = [f"{labels[name]}: {value}" for name, value in zip(others, held, strict=True)]
         ax.set_title(", ".join(title), fontsize=TITLE)
         ax.set(xlim=(0, len(x)), ylim=(0, len(y)))
         ax.set_xticks(np.arange(len(x)) + 0.5, x)
         ax.set_yticks(np.arange(len(y)) + 0.5, y)
-        ax.tick_params(length=0)
     figure.supxlabel(labels[along], fontsize=TITLE)
     figure.supylabel(fill(labels[up], 26), fontsize=TITLE, multialignment="center")
-    bar = figure.colorbar(ScalarMappable(scale, colormaps["Blues"]), ax=panels, pad=0.02)
-    bar.set_label("standard deviation of the\ndischarge current (A)")
+    words = "standard deviation of the\ndischarge current (A)"
+    figure.colorbar(panels[0].collections[0], ax=panels, pad=0.02, label=words)
     seen = [name for name in HATCHES if (points["status"] == name).any()]
     if seen:
-        style: dict[str, Any] = {"facecolor": "white", "edgecolor": DATA}
-        legend_above(figure, [Patch(hatch=2 * HATCHES[n], label=n, **style) for n in seen])
+        look: dict[str, Any] = {"facecolor": "white", "edgecolor": DATA}
+        style.legend_above(figure, [Patch(hatch=2 * HATCHES[n], label=n, **look) for n in seen])
     return figure
 
 
-def _draw_cell(ax: Axes, column: int, row: int, point: Mapping[Any, Any], scale: Normalize) -> None:
-    """Draw one point: amplitude as colour, hatched and labelled if it does not breathe."""
-    status, std = point["status"], float(point["I_d_std"])
-    known = status not in WORTHLESS and np.isfinite(std)
-    colour = colormaps["Blues"](scale(std)) if known else "white"
-    hatch = HATCHES.get(status)
-    style: dict[str, Any] = {"facecolor": colour, "edgecolor": GREY, "lw": 0.8, "hatch": hatch}
-    ax.add_patch(Rectangle((column, row), 1, 1, **style))
-    lines = [f"{std:.2f} A"] if known else []
-    if np.isfinite(point["f_kHz"]) and known:
-        lines += [f"{point['f_kHz']:.1f} kHz"]
-    lines += [str(point["cycle"]) if status == BREATHES else status]
-    dark = known and hatch is None and scale(std) > DARK
-    text = write_in_cell(ax, column, row, "\n".join(lines), colour="white" if dark else "black")
-    if hatch:
-        text.set_bbox({"facecolor": "white", "alpha": 0.85, "lw": 0, "pad": 1.5})
+def _draw_cells(
+    ax: Axes, points: pd.DataFrame, rows: Sequence[str], columns: Sequence[str], most: float
+) -> None:
+    """Draw points by their place: amplitude as colour, hatched and labelled if one is quiet."""
+    cells = points.reindex(pd.MultiIndex.from_product([rows, columns]))
+    known = ~cells["status"].isin(WORTHLESS)
+    std, shape = cells["I_d_std"].where(known), (len(rows), len(columns))
+    lines = [std.map("{:.2f} A".format), cells["f_kHz"].where(known).map("{:.1f} kHz".format)]
+    lines += [cells["cycle"].where(cells["status"] == BREATHES, cells["status"]).fillna("nan")]
+    texts = ["\n".join(text for text in of if "nan" not in text) for of in zip(*lines, strict=True)]
+    written = style.draw_cells(ax, std.to_numpy(float).reshape(shape), texts, most)
+    for k, (status, text) in enumerate(zip(cells["status"], written, strict=True)):
+        if hatch := HATCHES.get(status):
+            corner = (k % len(columns), k // len(columns))
+            ax.add_patch(Rectangle(corner, 1, 1, fill=False, ec=GREY, lw=0.8, hatch=hatch))
+            text.set(color="black", bbox={"facecolor": "white", "alpha": 0.85, "lw": 0, "pad": 1.5})
 
 
 def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
@@ -275,7 +263,7 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
 
     points: values or texts in the column `along`, and the columns of CURVES; markers show statuses.
     """
-    figure, panels = make_panels(2, 2, (WIDTH, 5.2), sharex=True)
+    figure, panels = style.make_panels(2, 2, (WIDTH, 5.2), sharex=True)
     numbers = pd.api.types.is_numeric_dtype(points[along])
     x = points[along].to_numpy(float) if numbers else np.arange(len(points), dtype=float)
     for ax, (name, (title, factor)) in zip(panels.flat, CURVES.items(), strict=True):
@@ -284,12 +272,14 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
         values = factor * points[name].to_numpy(float)
         if numbers:
             ax.plot(x[kept][order], values[kept][order], color=GREY, lw=1.0, zorder=1)
-        for status in STATUS_MARKERS:
+        for status, look in STATUS_STYLES.items():
             here = (points["status"] == status).to_numpy()
-            reach = points["I_d_std"][here] if name == "I_d_mean" else None
-            ax.errorbar(x[here], values[here], reach, capsize=3, ms=5, **_status_style(status))
-        for place, status in zip(x[~kept], points["status"][~kept], strict=True):
-            ax.axvline(place, lw=1.0, **_status_style(status))
+            if status in WORTHLESS:
+                for place in x[here]:
+                    ax.axvline(place, lw=1.0, **look)
+            else:
+                reach = points["I_d_std"][here] if name == "I_d_mean" else None
+                ax.errorbar(x[here], values[here], reach, capsize=3, ms=5, **look)
         ax.set_title(title, fontsize=TITLE)
         ax.grid(alpha=0.3)
         ax.margins(x=0.08)
@@ -297,14 +287,6 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
             ax.set_xticks(x, points[along])
     for ax in panels[-1]:
         ax.set_xlabel(label)
-    seen = [name for name in (BREATHES, *HATCHES) if (points["status"] == name).any()]
-    legend_above(figure, [Line2D([], [], label=name, **_status_style(name)) for name in seen])
+    seen = {name: look for name, look in STATUS_STYLES.items() if name in set(points["status"])}
+    style.legend_above(figure, [Line2D([], [], label=name, **look) for name, look in seen.items()])
     return figure
-
-
-def _status_style(status: str) -> dict[str, Any]:
-    """A marker for a status, or an upright line if the current is meaningless."""
-    if status in STATUS_MARKERS:
-        colour = COLOURS[0] if status == BREATHES else COLOURS[1]
-        return {"ls": "none", "marker": STATUS_MARKERS[status], "color": colour}
-    return {"ls": ":" if status == "diverged" else "--", "color": COLOURS[3]}

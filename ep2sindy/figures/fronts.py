@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ep2sindy.figures.style import COLOURS, GREY, SMALL, TITLE, hover_spot, legend_above, make_grid
+from ep2sindy.figures import style
+from ep2sindy.figures.style import COLOURS, GREY, SMALL, TITLE
 from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
 
@@ -36,7 +37,7 @@ def front_figure(
     drawn on a line at FLOOR, and errors above TOP as marks at the upper edge.
     label: name of the scores, of which the lowest is selected; without scores none is marked.
     """
-    figure, axes = make_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
+    figure, axes = style.make_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
     for ax, front in zip(axes, fronts.values(), strict=True):
         chosen = None if np.isnan(front.scores).all() else front.candidates.index(front.best)
         if front.has_errors:
@@ -47,7 +48,7 @@ def front_figure(
         ax.set_title(_title(front, label, chosen=chosen is not None), fontsize=TITLE)
     entries = {line.get_label(): line for ax in axes for line in ax.lines}
     shown = [entries[name] for name in _LAYERS if name in entries]
-    legend_above(figure, shown)
+    style.legend_above(figure, shown)
     return figure
 
 
@@ -128,21 +129,23 @@ def _add_hovers(ax: Axes, front: ParetoFront, label: str) -> None:
         terms = ", ".join(name.replace("*", " ") for name in each.terms) or "none"
         text = f"{front.equation}' of {each.n_terms} terms: {terms}"
         error = f" | 1 - R2 = {height:.3g}" if front.has_errors else ""
-        hover_spot(ax, float(each.n_terms), height, f"{text}{error} | {label} = {each.score:.4g}")
+        style.hover_spot(
+            ax, float(each.n_terms), height, f"{text}{error} | {label} = {each.score:.4g}"
+        )
 
 
 def _draw_cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
     """Draw light dots; models far worse than none are carets at the upper edge."""
     above = cloud.errors > TOP
-    style: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 2, "alpha": 0.85, "mew": 0.0}
+    look: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 2, "alpha": 0.85, "mew": 0.0}
     ax.plot(
         cloud.sizes[~above], np.maximum(cloud.errors[~above], FLOOR), marker="o", ms=3.5,
-        label=label, **style,
+        label=label, **look,
     )  # fmt: skip
     if above.any():
         sizes = np.unique(cloud.sizes[above])
         at_edge = np.full(len(sizes), TOP)
-        ax.plot(sizes, at_edge, marker=6, ms=5, clip_on=False, **style)  # 6: a caret up
+        ax.plot(sizes, at_edge, marker=6, ms=5, clip_on=False, **look)  # 6: a caret up
 
 
 def _write_terms(candidate: Candidate) -> str:

@@ -11,19 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.style import (
-    COLOURS,
-    DATA,
-    GREY,
-    TITLE,
-    WIDTH,
-    axis_label,
-    draw_over,
-    frame_limits,
-    legend_above,
-    make_grid,
-    make_panels,
-)
+from ep2sindy.figures import style
+from ep2sindy.figures.style import COLOURS, DATA, GREY, TITLE, WIDTH
 from ep2sindy.library.units import Clock
 from ep2sindy.model.comparison import LONG
 from ep2sindy.model.rollout import Rollout, simulate
@@ -47,7 +36,7 @@ def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Fi
     factor, unit = run.clock.scale(shown)
     n = len(run.state_names)
     height = float(np.clip(5.0 / n, 1.3, 2.2))
-    figure, axes = make_panels(n, 2, (WIDTH, height * n + 0.8), sharex="col", sharey="row")
+    figure, axes = style.make_panels(n, 2, (WIDTH, height * n + 0.8), sharex="col", sharey="row")
     since = run.t - run.t[0]
     parts = (since <= shown, since >= since[-1] - shown)
     for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
@@ -55,14 +44,14 @@ def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Fi
         for ax, part in zip(row, parts, strict=True):
             reached = part & (np.arange(len(part)) < len(model))
             data = factor * since[part], run.states[part, k]
-            draw_over(ax, data, (factor * since[reached], model[reached[: len(model)]]))
-        row[0].set_ylim(frame_limits(run.states[:, k], model))
-        row[0].set_ylabel(axis_label(name, run.units[name]))
+            style.draw_over(ax, data, (factor * since[reached], model[reached[: len(model)]]))
+        row[0].set_ylim(style.frame_limits(run.states[:, k], model))
+        row[0].set_ylabel(style.axis_label(name, run.units[name]))
     for ax, words in zip(axes[0], ("first periods", "last periods"), strict=True):
         ax.set_title(words, fontsize=TITLE)
     for ax in axes[-1]:
         ax.set_xlabel(f"time since the model's start ({unit})")
-    legend_above(figure, axes[0, 0].lines[:2])
+    style.legend_above(figure, axes[0, 0].lines[:2])
     return figure
 
 
@@ -73,7 +62,7 @@ def cycle_figure(run: Trajectory | None, cycle: LimitCycle) -> Figure:
     leaves the panel is not drawn again.
     """
     plane, paths = cycle.model.states[:2], paths_off(cycle)
-    figure, (ax,) = make_grid(1, width=4.4, height=3.8, extra=0.5)
+    figure, (ax,) = style.make_grid(1, width=4.4, height=3.8, extra=0.5)
     handles = [
         Line2D([], [], color=COLOURS[1], lw=2.0, label="the model's cycle"),
         Line2D([], [], color=COLOURS[5], marker="o", ms=4, lw=0.8, label="from other starts"),
@@ -89,10 +78,10 @@ def cycle_figure(run: Trajectory | None, cycle: LimitCycle) -> Figure:
         ax.plot(*path.states[0, :2], "o", color=COLOURS[5], ms=4)
     ax.plot(*closed.T, color=COLOURS[1], lw=2.0)
     shown = np.concatenate([closed, *(path.states[:1, :2] for path in paths)])
-    x_limits, y_limits = map(frame_limits, data.T, shown.T)
-    x_label, y_label = (axis_label(name, cycle.model.units[name]) for name in plane)
+    x_limits, y_limits = map(style.frame_limits, data.T, shown.T)
+    x_label, y_label = (style.axis_label(name, cycle.model.units[name]) for name in plane)
     ax.set(xlim=x_limits, ylim=y_limits, xlabel=x_label, ylabel=y_label)
-    legend_above(figure, handles)
+    style.legend_above(figure, handles)
     return figure
 
 
@@ -113,7 +102,7 @@ def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
     found = find_waveforms(run, rollout)
     assert found is not None
     data, model = found
-    figure, axes = make_grid(len(run.state_names), width=4.2, height=3.0, extra=0.5)
+    figure, axes = style.make_grid(len(run.state_names), width=4.2, height=3.0, extra=0.5)
     ours = data.waveform(2.0 * np.pi * PHASES)
     theirs = model.waveform(2.0 * np.pi * PHASES + best_shift(data, model))
     phase = np.mod(data.phase / (2.0 * np.pi), 1.0)
@@ -122,10 +111,10 @@ def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
             ax.plot(phase + shift, run.states[:, k], ".", ms=1.0, color=GREY, rasterized=True)
         ax.plot(PHASES, ours[:, k], color=DATA, lw=1.6, label="data")
         ax.plot(PHASES, theirs[:, k], color=COLOURS[0], lw=1.4, ls="--", label="model")
-        ax.set(xlabel="phase (periods)", ylabel=axis_label(name, run.units[name]))
+        ax.set(xlabel="phase (periods)", ylabel=style.axis_label(name, run.units[name]))
         ax.set_xlim(0.0, 2.0)
     samples = Line2D([], [], color=GREY, marker=".", ls="none", label="samples")
-    legend_above(figure, [samples, *axes[0].lines[-2:]])
+    style.legend_above(figure, [samples, *axes[0].lines[-2:]])
     return figure
 
 
@@ -151,14 +140,14 @@ def balance_figure(
 ) -> Figure:
     """A panel per process: its rate in the record and by the model's terms, in m^-3/s."""
     factor, unit = clock.scale(float(t[-1] - t[0]))
-    figure, axes = make_grid(
+    figure, axes = style.make_grid(
         len(parts), width=WIDTH / 2, height=2.2, extra=0.6, sharex=True, x_label=f"time ({unit})"
     )
     time = factor * (t - t[0])
     for ax, (name, (recorded, modelled)) in zip(axes, parts.items(), strict=True):
-        draw_over(ax, (time, recorded), (time, modelled))
+        style.draw_over(ax, (time, recorded), (time, modelled))
         ax.axhline(0.0, color=DATA, lw=0.5)
         ax.set_title("\n".join(wrap(name, 44)), fontsize=TITLE)
-    figure.supylabel(axis_label("rate", "m^-3/s"), fontsize=TITLE)
-    legend_above(figure, axes[0].lines[:2])
+    figure.supylabel(style.axis_label("rate", "m^-3/s"), fontsize=TITLE)
+    style.legend_above(figure, axes[0].lines[:2])
     return figure

@@ -29,18 +29,8 @@ from matplotlib.typing import ColorType
 
 from ep2sindy.data.fields import SPACE, cell_edges
 from ep2sindy.discovery.regimes import Regimes
-from ep2sindy.figures.style import (
-    COLOURS,
-    DATA,
-    MORE_COLOURS,
-    SMALL,
-    TITLE,
-    WIDTH,
-    legend_above,
-    make_grid,
-    make_panels,
-    unit_text,
-)
+from ep2sindy.figures import style
+from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, SMALL, TITLE, WIDTH
 from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.thruster.parameters import Thruster
 
@@ -77,7 +67,7 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
     shape = coef.sizes["equation"], len(terms)
     width, height = _panel_size(coef, min(PANEL_WIDTH, (WIDTH - 0.8) / len(terms) - 0.35))
     size = max(shape[1] * width + 0.8, 5.5), shape[0] * height + 1.1
-    figure, axes = make_panels(*shape, size, sharex=True, sharey="col" if flat else True)
+    figure, axes = style.make_panels(*shape, size, sharex=True, sharey="col" if flat else True)
     for column, term in zip(axes.T, terms, strict=True):
         column[0].set_title(f"${latex_term_name(str(term))}$", fontsize=TITLE)
         if flat:
@@ -96,7 +86,7 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
     if not flat:
         entries |= {"not selected": ABSENT}
     patches = [Patch(color=colour, label=label) for label, colour in entries.items()]
-    legend_above(figure, patches)
+    style.legend_above(figure, patches)
     return figure
 
 
@@ -143,7 +133,7 @@ def _draw_signed_maps(
 
 def _coef_unit(coef: xr.DataArray) -> str:
     unit = str(coef["coef_units"].values)
-    return "dimensionless" if unit == "1" else unit_text(unit)
+    return "dimensionless" if unit == "1" else style.unit_text(unit)
 
 
 def _decades(coef: Float[np.ndarray, "*shape"]) -> tuple[int, int]:
@@ -153,14 +143,12 @@ def _decades(coef: Float[np.ndarray, "*shape"]) -> tuple[int, int]:
     return int(np.floor(low)), max(int(np.ceil(high)), int(np.floor(low)) + 1)
 
 
-def _signed_colours() -> ListedColormap:
+def _signed_colours() -> Colormap:
     n = 200
     half = round((1.0 - GAP) * n) + 1  # the faintest shade begins before GAP, because of rounding
     shades = np.linspace(0.3, 1.0, half)
     blues, reds = colormaps["Blues"](shades[::-1]), colormaps["Reds"](shades)
-    found = ListedColormap([*blues, *[ABSENT] * (2 * (n - half)), *reds])
-    found.set_bad("white")
-    return found
+    return ListedColormap([*blues, *[ABSENT] * (2 * (n - half)), *reds]).with_extremes(bad="white")
 
 
 def _draw_signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.DataArray) -> None:
@@ -195,7 +183,7 @@ def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
     ]
     figure = _draw_panels(panels, outline, width=3.7, extra=0.75 + 0.2 * n)
     patches = [Patch(color=colours[k], label=_regime_text(regimes, k)) for k in range(n)]
-    legend_above(figure, patches, title="terms that act in each regime")
+    style.legend_above(figure, patches, title="terms that act in each regime")
     return figure
 
 
@@ -234,7 +222,7 @@ def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figu
                 text = f"{meaning.replace('_', ' ')} ({n})"
                 patches.append(Patch(facecolor=colour, edgecolor=DATA, lw=0.5, label=text))
     figure = _draw_panels(panels, outline, width=2.7, extra=0.9)
-    legend_above(figure, patches)
+    style.legend_above(figure, patches)
     return figure
 
 
@@ -260,7 +248,7 @@ def _draw_panels(
     """Draw the maps, as many in a row as fit. width: of each, and extra: height, in inches."""
     first = panels[0].values
     size, x_label = _panel_size(first, width), f"{space_axes(first)[0]} (cm)"
-    figure, axes = make_grid(
+    figure, axes = style.make_grid(
         len(panels), width=size[0], height=size[1], extra=extra, sharex=True,
         sharey=len(space_axes(first)) == 2, x_label=x_label,
     )  # fmt: skip

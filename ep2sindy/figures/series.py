@@ -18,25 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.style import (
-    COLOURS,
-    DATA,
-    GREY,
-    MORE_COLOURS,
-    SMALL,
-    TITLE,
-    WIDTH,
-    Limits,
-    axis_label,
-    draw_over,
-    frame_limits,
-    legend_above,
-    legend_curves,
-    make_grid,
-    make_panels,
-    slope_label,
-    unit_text,
-)
+from ep2sindy.figures import style
+from ep2sindy.figures.style import COLOURS, DATA, GREY, MORE_COLOURS, SMALL, TITLE, WIDTH, Limits
 from ep2sindy.forecasting.forecast import LEVEL
 from ep2sindy.forecasting.skill import MODEL, ForecastSkill
 from ep2sindy.library.units import Clock, unit_product
@@ -53,19 +36,19 @@ RARE = 0.01  # share of derivative samples, low or high, kept out of the scale a
 def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figure:
     """A row per state: its first `duration_s`, and its power spectrum up to `f_max_Hz`."""
     n = len(run.state_names)
-    figure, axes = make_panels(n, 2, (WIDTH, 2.2 * n + 0.6), sharex="col", widths=[3, 2])
+    figure, axes = style.make_panels(n, 2, (WIDTH, 2.2 * n + 0.6), sharex="col", widths=[3, 2])
     states = first_part(run.t, run.states, duration_s, run.clock)
     spectra = _spectra(run.t, run.states, f_max_Hz, run.clock)
     for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
         row[0].plot(states.x, states.y[:, k], color=DATA, lw=1)
-        row[0].set_ylabel(axis_label(name, run.units[name]))
+        row[0].set_ylabel(style.axis_label(name, run.units[name]))
         row[1].semilogy(spectra.x, spectra.y[:, k], color=COLOURS[0], lw=0.8)
         peak_Hz = dominant_frequency(run.t, run.states[:, k])
         peak = run.clock.frequency_scale(f_max_Hz)[0] * peak_Hz
         text = run.clock.frequency_text(peak_Hz)
         row[1].axvline(peak, color=COLOURS[1], lw=1, ls="--", label=text)
         row[1].legend(loc="upper right", frameon=False)
-        row[1].set_ylabel(f"power ({unit_text(_power_unit(run, name))})")
+        row[1].set_ylabel(f"power ({style.unit_text(_power_unit(run, name))})")
     axes[-1, 0].set_xlabel(_time_label(run.clock, duration_s))
     axes[-1, 1].set_xlabel(_frequency_label(run.clock, f_max_Hz))
     return figure
@@ -86,7 +69,7 @@ def trajectory_figure(
     """
     data = first_part(run.t, run.states, duration_s, run.clock)
     models = _runs(rollouts, statuses, duration_s, run.clock)
-    titles = [axis_label(name, run.units[name]) for name in run.state_names]
+    titles = [style.axis_label(name, run.units[name]) for name in run.state_names]
     x_label = _time_label(run.clock, duration_s, since)
     return _draw_rows(data, models, titles, x_label, limits=limits_of(data, models))[0]
 
@@ -108,7 +91,7 @@ def derivative_figure(
         slopes = slopes[:, [model.states.index(state) for state in run.state_names]]
         curves = first_part(run.t, clock.seconds * slopes, duration_s, clock)
         sides.append(replace(curves, label=name))
-    titles = [slope_label(name, clock.rate_unit(run.units[name])) for name in run.state_names]
+    titles = [style.slope_label(name, clock.rate_unit(run.units[name])) for name in run.state_names]
     x_label, limits = _time_label(clock, duration_s), limits_of(data, sides, RARE)
     return _draw_rows(data, sides, titles, x_label, limits=limits)[0]
 
@@ -131,7 +114,9 @@ def spectrum_figure(
         replace(_spectra(r.t, r.states, f_max_Hz, run.clock), label=_run_label(name, r, statuses))
         for name, r in rollouts.items()
     ]
-    titles = [f"power of {axis_label(name, _power_unit(run, name))}" for name in run.state_names]
+    titles = [
+        f"power of {style.axis_label(name, _power_unit(run, name))}" for name in run.state_names
+    ]
     figure, axes = _draw_rows(data, models, titles, _frequency_label(run.clock, f_max_Hz))
     for column, power, values in zip(axes.T, data.y.T, run.states.T, strict=True):
         peak = run.clock.frequency_scale(f_max_Hz)[0] * dominant_frequency(run.t, values)
@@ -160,11 +145,11 @@ def _draw_rows(
     """
     height = float(np.clip(5.0 / len(models), 1.05, 2.2))
     size = (WIDTH, height * len(models) + 1.2)
-    figure, axes = make_panels(len(models), len(titles), size, sharex=True, sharey="col")
+    figure, axes = style.make_panels(len(models), len(titles), size, sharex=True, sharey="col")
     for row, colour, model in zip(axes, cycle(MORE_COLOURS), models, strict=False):
         for k, ax in enumerate(row):
             frame = (_reach([data.x, model.x]), limits[k]) if limits else None
-            draw_over(
+            style.draw_over(
                 ax, (data.x, data.y[:, k]), (model.x, model.y[:, k]), colour=colour, limits=frame,
                 diverged=model.stops,
             )  # fmt: skip
@@ -175,7 +160,7 @@ def _draw_rows(
     for column, title in zip(axes.T, titles, strict=True):
         column[0].set_title(title, fontsize=TITLE)
         column[-1].set_xlabel(x_label)
-    legend_curves(figure, list(axes.flat))
+    style.legend_curves(figure, list(axes.flat))
     return figure, axes
 
 
@@ -257,7 +242,7 @@ def _runs(
 
 def limits_of(data: Curves, models: Sequence[Curves], rare: float = 0.0) -> list[Limits]:
     together = np.concatenate([curves.y for curves in models])
-    return [frame_limits(*pair, rare=rare) for pair in zip(data.y.T, together.T, strict=True)]
+    return [style.frame_limits(*pair, rare=rare) for pair in zip(data.y.T, together.T, strict=True)]
 
 
 def _run_label(name: str, run: Rollout, statuses: Mapping[str, str]) -> str:
@@ -284,14 +269,14 @@ def phase_figure(
     """
     data = first_part(run.t, run.states, duration_s, run.clock)
     models = _runs(rollouts, statuses, duration_s, run.clock)
-    x_label, y_label = (axis_label(name, run.units[name]) for name in run.state_names[:2])
-    figure, axes = make_grid(
+    x_label, y_label = (style.axis_label(name, run.units[name]) for name in run.state_names[:2])
+    figure, axes = style.make_grid(
         len(models), width=2.75, height=2.75, extra=0.7, sharex=True, sharey=True, x_label=x_label
     )
     x_limits, y_limits = limits_of(data, models)[:2]
     for ax, colour, model in zip(axes, cycle(MORE_COLOURS), models, strict=False):
         path, limits = (model.y[:, 0], model.y[:, 1]), (x_limits, y_limits)
-        draw_over(
+        style.draw_over(
             ax, (data.y[:, 0], data.y[:, 1]), path, colour=colour, limits=limits,
             diverged=model.stops,
         )  # fmt: skip
@@ -304,7 +289,7 @@ def phase_figure(
             ax.set_ylabel(y_label)
             # All panels share the first one's factor.
             ax.yaxis.get_offset_text().set_visible(place.is_first_row())
-    legend_curves(figure, axes)
+    style.legend_curves(figure, axes)
     return figure
 
 
@@ -321,7 +306,7 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
     noise = dict(zip(ahead.state_names, ahead.noise_std, strict=True))  # NaN if not measured
     names = [name for name in ahead.state_names if name in run.names and np.isfinite(noise[name])]
     width = 4.5 if len(names) == 1 else 3.0
-    figure, axes = make_grid(len(names) + 1, width=width, height=2.8, extra=0.4)
+    figure, axes = style.make_grid(len(names) + 1, width=width, height=2.8, extra=0.4)
     low, high = ahead.band(LEVEL)
     begin = run.t[max(0, int(np.searchsorted(run.t, ahead.t[0] - 1e-9 * run.dt_s)) - 1)]
     factor, unit = run.clock.scale(float(ahead.t[-1] - begin))
@@ -336,11 +321,13 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
         ax.fill_between(later, low[:, k], high[:, k], label=label, **band)
         ax.plot(later, mean, color=COLOURS[0], lw=1.2, label="forecast")
         ax.axvline(0.0, color=GREY, lw=0.8, ls="--")
-        ax.set(xlabel=f"time since the start ({unit})", ylabel=axis_label(name, run.units[name]))
-        ax.set_ylim(frame_limits(values, mean))
+        ax.set(
+            xlabel=f"time since the start ({unit})", ylabel=style.axis_label(name, run.units[name])
+        )
+        ax.set_ylim(style.frame_limits(values, mean))
     _draw_errors(axes[-1], skill)
     baselines = axes[-1].lines[1 : len(skill.nrmse)]  # the first line is the model's
-    legend_above(figure, [*axes[0].get_legend_handles_labels()[0], *baselines])
+    style.legend_above(figure, [*axes[0].get_legend_handles_labels()[0], *baselines])
     return figure
 
 
@@ -350,9 +337,9 @@ def _draw_errors(ax: Axes, skill: ForecastSkill) -> None:
     names = (MODEL, "persistence", "harmonics", "autoregression")
     colours = dict(zip(names, COLOURS, strict=False))
     for name, values in skill.nrmse.items():
-        style: dict[str, Any] = {"color": colours[name], "lw": 1.8 if name == MODEL else 1.0}
+        look: dict[str, Any] = {"color": colours[name], "lw": 1.8 if name == MODEL else 1.0}
         horizons = skill.horizons_s / unit_s
-        ax.plot(horizons, np.maximum(values, FLOOR), label=name, **style)
+        ax.plot(horizons, np.maximum(values, FLOOR), label=name, **look)
     ax.axhline(1.0, color=GREY, lw=0.8, ls="--")
     ax.set(yscale="log", ylabel="error (standard deviations)")
     ax.set_xlabel(f"horizon ({'periods' if in_periods else 'samples'})")

@@ -6,7 +6,7 @@ A frame sets the range of a panel whose curves may leave it, and marks where the
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +14,8 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
@@ -32,6 +34,10 @@ MORE_COLOURS = (*COLOURS, "#7F3C8D", "#666666")
 # One width in inches, of 96 px on a page, and two sizes of type in points: ticks, marks in panels
 # and legends are small; titles are as large as the labels of axes.
 WIDTH, TITLE, SMALL = 9.0, 10.0, 9.0
+
+# One hue from light to dark: legible with any colour vision, and in grey. A text on a shade beyond
+# DARK is white.
+CELLS, DARK = "Blues", 0.65
 
 Limits = tuple[float, float]
 
@@ -81,6 +87,19 @@ def make_panels(
     return figure, axes
 
 
+def make_row(n: int, *, width: float, height: float) -> tuple[Figure, Sequence[Axes]]:
+    """A figure of n panels beside each other that share both axes, each of this width in inches."""
+    size = (min(WIDTH, width * n + 0.4), height)
+    figure, (axes,) = make_panels(1, n, size, sharex=True, sharey=True)
+    return figure, axes
+
+
+def name_ticks(axis: Axis, places: Iterable[float], names: Sequence[str]) -> None:
+    """Name these places of an axis, and no others."""
+    axis.set_ticks([*places], names, fontsize=SMALL)
+    axis.set_ticks([], minor=True)
+
+
 def make_grid(
     n: int,
     *,
@@ -125,11 +144,24 @@ def legend_above(figure: Figure, handles: Sequence[Artist], *, title: str = "") 
     )  # fmt: skip
 
 
-def write_in_cell(ax: Axes, column: int, row: int, text: str, *, colour: str) -> Text:
-    """Write small text into the middle of a cell, on a map whose cells have unit sides."""
-    return ax.text(
-        column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=SMALL, color=colour
-    )
+def draw_cells(
+    ax: Axes, values: Float[np.ndarray, "rows columns"], texts: Sequence[str], most: float
+) -> list[Text]:
+    """Draw cells of unit sides with a text in each, blue by value from 0 to `most`, white for NaN.
+
+    texts: row by row. Returns them as drawn.
+    """
+    scale = Normalize(0.0, most)
+    grid: dict[str, Any] = {"edgecolors": "white", "linewidth": 0.8}
+    ax.pcolormesh(np.ma.masked_invalid(values), cmap=CELLS, norm=scale, **grid)
+    ax.tick_params(length=0)
+    centre: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
+    return [
+        ax.text(column + 0.5, row + 0.5, text, color="white" if dark else "black", **centre)
+        for ((row, column), dark), text in zip(
+            np.ndenumerate(np.asarray(scale(values) > DARK)), texts, strict=True
+        )
+    ]
 
 
 def hover_spot(ax: Axes, x: float, y: float, text: str) -> None:

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import pandas as pd
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
-from ep2sindy.figures.style import (
-    GREY,
-    SIGN,
-    SMALL,
-    TITLE,
-    WIDTH,
-    legend_above,
-    make_panels,
-    name_label,
-)
+from ep2sindy.figures import style
+from ep2sindy.figures.style import GREY, SIGN, TITLE
 
 # Status -> marker, the best first; any other run has no cycle.
 MARKERS = {"sustained": "o", "wrong frequency": "D", "wrong cycle": "s"}
@@ -34,38 +26,32 @@ def sustained_figure(rows: pd.DataFrame, *, labels: Mapping[str, str]) -> Figure
     """
     ways, points = (list(rows[key].unique()) for key in ("way", "point"))
     structures = list(rows["structure"].unique())
-    size = (min(WIDTH, 2.0 + 0.5 * len(points) * len(ways)), 1.9 + 0.3 * len(structures))
-    figure, (axes,) = make_panels(1, len(ways), size, sharex=True, sharey=True)
+    width, height = 1.6 / len(ways) + 0.5 * len(points), 1.9 + 0.3 * len(structures)
+    figure, axes = style.make_row(len(ways), width=width, height=height)
+    places = rows.assign(
+        x=rows["point"].map(points.index), y=rows["structure"].map(structures.index),
+        kind=rows["status"].where(rows["status"].isin([*MARKERS]), OTHER),
+    )  # fmt: skip
+    look: dict[str, Any] = {"cmap": "viridis_r", "norm": NORM, "edgecolors": SIGN, "lw": 0.5}
     for ax, way in zip(axes, ways, strict=True):
-        of_way = rows[rows["way"] == way]
-        cycles = of_way["status"].isin([*MARKERS])
+        kinds = dict([*places[places["way"] == way].groupby("kind")])
         for status, marker in MARKERS.items():
-            shown = of_way[of_way["status"] == status]
-            marks = ax.scatter(
-                shown["point"].map(points.index), shown["structure"].map(structures.index),
-                c=shown["amplitude_error"], marker=marker, s=80 if status == "sustained" else 40,
-                cmap="viridis_r", norm=NORM, edgecolors=SIGN, linewidths=0.5,
-            )  # fmt: skip
-        rest = of_way[~cycles]
-        ax.plot(
-            rest["point"].map(points.index), rest["structure"].map(structures.index), "x",
-            color=GREY, ms=6,
-        )  # fmt: skip
+            shown, size = kinds.get(status, places[:0]), 80 if status == "sustained" else 40
+            colours = shown["amplitude_error"]
+            marks = ax.scatter(shown["x"], shown["y"], size, colours, marker=marker, **look)
+        rest = kinds.get(OTHER, places[:0])
+        ax.plot(rest["x"], rest["y"], "x", color=GREY, ms=6)
         ax.set_title(way, fontsize=TITLE)
-        ax.set_xticks(
-            range(len(points)), ["\n".join(_split(point, 2)) for point in points], fontsize=SMALL
-        )
-        ax.set_yticks(range(len(structures)), [name.replace("_", " ") for name in structures])
-        ax.set_xlim(-0.5, len(points) - 0.5)
-        ax.set_ylim(len(structures) - 0.5, -0.5)
-        ax.set_xlabel("\n".join(name_label(name, labels) for name in _split(points[0], 0)))
-    colours = figure.colorbar(marks, ax=list(axes), label="error of the amplitude", extend="max")
-    colours.ax.set_yticks([0.01, 0.1, 1.0], ["1 %", "10 %", "100 %"])
-    signs = {**{marker: status for status, marker in MARKERS.items()}, "x": OTHER}
-    legend_above(
-        figure,
-        [Line2D([], [], ls="", marker=m, color=SIGN, label=text) for m, text in signs.items()],
-    )
+        ax.set_xlabel("\n".join(style.name_label(name, labels) for name in _split(points[0], 0)))
+    values = ["\n".join(_split(point, 2)) for point in points]
+    style.name_ticks(axes[0].xaxis, range(len(points)), values)
+    names = [name.replace("_", " ") for name in structures]
+    style.name_ticks(axes[0].yaxis, range(len(structures)), names)
+    axes[0].set(xlim=(-0.5, len(points) - 0.5), ylim=(len(structures) - 0.5, -0.5))
+    bar = figure.colorbar(marks, ax=list(axes), label="error of the amplitude", extend="max")
+    style.name_ticks(bar.ax.yaxis, [0.01, 0.1, 1.0], ["1 %", "10 %", "100 %"])
+    signs = [style.mark_sign(marker, status) for status, marker in MARKERS.items()]
+    style.legend_above(figure, [*signs, style.mark_sign("x", OTHER, GREY)])
     return figure
 
 

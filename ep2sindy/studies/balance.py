@@ -20,8 +20,14 @@ from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
-from ep2sindy.studies.processes import ComparedProcess, compared_processes, ends_of
-from ep2sindy.studies.source import IONS, NEUTRALS, Zones
+from ep2sindy.studies.processes import (
+    IONS,
+    NEUTRALS,
+    ComparedProcess,
+    Zones,
+    compared_processes,
+    ends_of,
+)
 from ep2sindy.studies.views import largest
 
 CAPTION = (

@@ -49,7 +49,8 @@ from ep2sindy.studies.fitted import (
 )
 from ep2sindy.studies.over_points import add_points
 from ep2sindy.studies.point_sources import Points, given_points
-from ep2sindy.studies.source import DivergedError, Source, Zones, split_in_time, zones_of
+from ep2sindy.studies.processes import Zones
+from ep2sindy.studies.source import DivergedError, Source, split_in_time, zones_of
 from ep2sindy.studies.structures import Structures
 from ep2sindy.studies.study import (
     Count,

@@ -24,8 +24,7 @@ from ep2sindy.regression.formulations import Weak
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.windows import Boxes
 from ep2sindy.report.results import Metric, Metrics, View
-from ep2sindy.studies.processes import compared_processes
-from ep2sindy.studies.source import Zones
+from ep2sindy.studies.processes import Zones, compared_processes
 from ep2sindy.studies.structures import Structure, balance_model
 from ep2sindy.studies.views import EVALUATION
 

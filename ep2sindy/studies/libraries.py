@@ -41,15 +41,8 @@ from ep2sindy.studies.library_result import (
     refitted_model,
 )
 from ep2sindy.studies.living import LivingSearch, add_living, living_model
-from ep2sindy.studies.source import (
-    NO_ZONES,
-    Sampling,
-    Source,
-    Zones,
-    n_before,
-    split_in_time,
-    zones_of,
-)
+from ep2sindy.studies.processes import NO_ZONES, Zones
+from ep2sindy.studies.source import Sampling, Source, n_before, split_in_time, zones_of
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Terms, ZeroOrMore
 from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module

@@ -34,7 +34,7 @@ from ep2sindy.selection.criteria import OtherSystem, Selection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import power_spectrum, samples_in_periods
-from ep2sindy.studies.source import NO_ZONES, TELLING, Zones, told_roles
+from ep2sindy.studies.processes import NO_ZONES, TELLING, Zones, told_roles
 from ep2sindy.studies.study import Count, Positive
 from ep2sindy.studies.views import CYCLE, add_samples, terms_text
 

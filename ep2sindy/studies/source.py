@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,11 +18,12 @@ from ep2sindy.data.sampling import ZoneAverage
 from ep2sindy.data.steps import records_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone, describe_zone
-from ep2sindy.library.library import Library, polynomial
-from ep2sindy.model.scores import r2
+from ep2sindy.library.library import Library
+from ep2sindy.library.units import Clock
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.screen import in_line
 from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.studies.processes import IONS, NEUTRALS, Zones
 from ep2sindy.studies.study import Deferred
 from ep2sindy.thruster.balance import zone_balance
 
@@ -145,7 +146,7 @@ def zones_of(source: Source, field: xr.Dataset, report: Report) -> Zones:
 
 
 def _balances(sampling: ZoneAverage, field: xr.Dataset, report: Report) -> dict[str, xr.Dataset]:
-    if not {"n_i", "n_n"} <= set(field.data_vars):
+    if not {IONS, NEUTRALS} <= set(field.data_vars):
         return {}
     zones = sampling.parts(field)
     if any(zone.r is not None for zone in zones.values()):
@@ -161,43 +162,39 @@ def _balances(sampling: ZoneAverage, field: xr.Dataset, report: Report) -> dict[
 def say_field(report: Report, field: xr.Dataset) -> None:
     """Report which data are used, for a study of every grid point."""
     t, clock = grid_points(field, "time"), clock_of(field)
-    words = [
-        field.attrs.get("file", ""),
-        describe_zone(None, field),
-        f"{len(t)} samples of {clock.duration_text(usual_step(t), digits=4)} "
-        f"from {clock.duration_text(t[0], digits=4)}",
-    ]
-    report.say(in_line(f"data: {'; '.join(word for word in words if word)}"))
-    say_doubts(report, field)
-
-
-def say_doubts(report: Report, field: xr.Dataset) -> None:
-    """Warn of a step that contradicts the file's own times."""
-    if STEP_DOUBT in field.attrs:
-        report.warn(field.attrs[STEP_DOUBT])
+    _say_samples(report, field, describe_zone(None, field), t, clock)
 
 
 def say_data(report: Report, data: Trajectory, field: xr.Dataset, place: str) -> None:
     """Report the data: file, zone, samples, units, missing values and warnings."""
     units = ", ".join(f"{name} in {unit}" for name, unit in data.units.items())
-    where = [field.attrs.get("file", ""), place]
     frequencies = ", ".join(
         f"{name} {data.clock.frequency_text(dominant_frequency(data.t, column))}"
         for name, column in zip(data.state_names, data.states.T, strict=True)
     )
-    words = [
-        *(text for text in where if text),
-        f"{data.n_samples} samples of {data.clock.duration_text(usual_step(data.t), digits=4)} "
-        f"from {data.clock.duration_text(data.t[0], digits=4)}",
-        units,
-        f"dominant frequency {frequencies}",
-    ]
-    report.say(in_line(f"data: {'; '.join(words)}"))
-    say_doubts(report, field)
+    more = [units, f"dominant frequency {frequencies}"]
+    _say_samples(report, field, place, data.t, data.clock, *more)
     if data.n_samples < field.sizes["time"]:
         report.warn(describe_gaps(data.t, field.sizes["time"]))
     elif text := describe_breaks(data.t):
         report.warn(text)
+
+
+def _say_samples(
+    report: Report,
+    field: xr.Dataset,
+    place: str,
+    t: Float[np.ndarray, " samples"],
+    clock: Clock,
+    *more: str,
+) -> None:
+    """Report file, place and samples; warn of a step that contradicts the file's own times."""
+    step, start = (clock.duration_text(time, digits=4) for time in (usual_step(t), t[0]))
+    samples = f"{len(t)} samples of {step} from {start}"
+    words = [field.attrs.get("file", ""), place, samples, *more]
+    report.say(in_line(f"data: {'; '.join(word for word in words if word)}"))
+    if STEP_DOUBT in field.attrs:
+        report.warn(field.attrs[STEP_DOUBT])
 
 
 def data_summary(data: Trajectory) -> dict[str, Any]:
@@ -284,6 +281,8 @@ VERDICTS = {
     "diverged": "the simulation diverged: the end of its record is no physics",
     "out": "the discharge has gone out: there is no plasma to learn from",
     "steady": "the simulation is steady: there is no oscillation to learn from",
+    "transit": "the simulation oscillates at {f_kHz:.3g} kHz, above 60 kHz: that is ions in "
+    "transit, not breathing",
     "decaying": "the simulation's oscillation dies out: what is found describes a transient",
 }
 
@@ -299,14 +298,14 @@ def is_simulation(attributes: Mapping[str, Any]) -> bool:
 
 def check_recorded(field: xr.Dataset) -> None:
     """Raise DivergedError for a run that diverged before it had recorded enough to study."""
-    if is_simulation(field.attrs) and field.attrs["status"] == "diverged":
-        n_samples = field.sizes["time"]
-        if n_samples < MIN_SAMPLES:
-            raise DivergedError(
-                f"the simulation must record {MIN_SAMPLES} samples or more to be studied: it "
-                f"diverged after {n_samples}; try shorter steps (++data.cfl=0.4), more cells, "
-                "other parameters or another start; +exp=simulate shows what it did"
-            )
+    n_samples = field.sizes.get("time", 0)
+    diverged = is_simulation(field.attrs) and field.attrs["status"] == "diverged"
+    if diverged and n_samples < MIN_SAMPLES:
+        raise DivergedError(
+            f"the simulation must record {MIN_SAMPLES} samples or more to be studied: it "
+            f"diverged after {n_samples}; try shorter steps (++data.cfl=0.4), more cells, "
+            "other parameters or another start; +exp=simulate shows what it did"
+        )
 
 
 def amiss(attributes: Mapping[str, Any]) -> list[str]:
@@ -314,14 +313,8 @@ def amiss(attributes: Mapping[str, Any]) -> list[str]:
     status = attributes["status"]
     if status == "oscillating":
         return doubts(attributes)
-    if status == "transit":
-        verdict = (
-            f"the simulation oscillates at {attributes['f_kHz']:.3g} kHz, above 60 kHz: that is "
-            "ions in transit, not breathing"
-        )
-    else:
-        verdict = VERDICTS.get(status, f"the simulation is {status}")
-    return [verdict, *doubts(attributes)]
+    verdict = VERDICTS.get(status, "the simulation is {status}")
+    return [verdict.format_map(attributes), *doubts(attributes)]
 
 
 def doubts(attributes: Mapping[str, Any]) -> list[str]:
@@ -377,83 +370,3 @@ def compile_kernels(data: Sequence[Deferred]) -> None:
         except ValueError:
             continue  # the point reports the reason when it is run
         return
-
-
-IONS, NEUTRALS = "n_i", "n_n"
-
-# Role -> what the balance calls it, and the terms that tell it: neutrals leave the faster the more
-# ions there are, and walls and anode give back what reaches them.
-TELLING: Mapping[str, tuple[str, Sequence[str]]] = {
-    f"{NEUTRALS} out": ("exit_n", [NEUTRALS, f"{IONS}*{NEUTRALS}"]),
-    f"{IONS} to {NEUTRALS}": ("returned", [IONS]),
-}
-
-
-@dataclass(frozen=True)
-class Zones:
-    """The zones of a record: balances of ions and neutrals, and lengths in m if there are several.
-
-    balances: by name, from `ep.thruster.zone_balance`; a single one is called "".
-    """
-
-    balances: Mapping[str, xr.Dataset] = field(default_factory=dict)
-    sizes: Mapping[str, float] = field(default_factory=dict)
-
-
-NO_ZONES = Zones()
-
-
-@dataclass(frozen=True)
-class FittedRate:
-    """A recorded rate by terms, their coefficients in SI, with R2 at each instant."""
-
-    terms: Mapping[str, float]
-    r2: float = float("nan")
-
-
-def told_roles(balances: Mapping[str, xr.Dataset], run: Trajectory) -> dict[str, FittedRate]:
-    """What the balances of zones tell about roles, over the samples of a run.
-
-    balances: by zone, from `ep.thruster.zone_balance`; a single one is called "". The inflow is the
-    mean supply of neutrals. In a single zone the neutrals that leave, and what walls and anode give
-    back, are told by least squares. A role that a balance does not give is left out.
-    """
-    found = {}
-    for zone, balance in balances.items():
-        if "supply" in balance:
-            name = f"{NEUTRALS}@{zone} in" if zone else f"{NEUTRALS} in"
-            found[name] = FittedRate({"1": float(balance["supply"].mean())})
-    if "" not in balances or not {IONS, NEUTRALS} <= set(run.state_names):
-        return found
-    known, library = recorded_rates(balances[""], run), polynomial(run.state_names, degree=2)
-    for role, (rate, terms) in TELLING.items():
-        if rate in known:
-            columns = library.evaluate(run.states)[:, [library.index(term) for term in terms]]
-            found[role] = fitted_rate(known[rate], columns, terms)
-    return found
-
-
-def fitted_rate(
-    rate: Float[np.ndarray, " samples"],
-    columns: Float[np.ndarray, "samples terms"],
-    terms: Sequence[str],
-) -> FittedRate:
-    """A rate by least squares on terms, whose values are the columns."""
-    size = np.abs(columns).max(axis=0)
-    coef = np.linalg.lstsq(columns / size, rate, rcond=None)[0] / size
-    return FittedRate(dict(zip(terms, coef.tolist(), strict=True)), rate_r2(rate, columns @ coef))
-
-
-def rate_r2(
-    recorded: Float[np.ndarray, " samples"], modelled: Float[np.ndarray, " samples"]
-) -> float:
-    """R2 at each instant; NaN for a recorded rate that varies by no more than rounding."""
-    if np.ptp(recorded) <= 1e-6 * np.abs(recorded).max():
-        return float("nan")
-    return float(r2(truth=recorded, prediction=modelled[None])[0])
-
-
-def recorded_rates(balance: xr.Dataset, data: Trajectory) -> dict[str, np.ndarray]:
-    """Terms of the balance at the samples of the trajectory."""
-    there = np.isin(balance["time"].values, data.t)
-    return {str(name): balance[name].values[there] for name in balance.data_vars}

@@ -16,8 +16,7 @@ from ep2sindy.library.relations import Constraint, constraint
 from ep2sindy.library.roles import Roles, constraint_of, shares_of, sum_known
 from ep2sindy.library.terms import variables_of
 from ep2sindy.model.model import SparseModel, model_of
-from ep2sindy.studies.processes import compared_processes, ends_of
-from ep2sindy.studies.source import Zones, told_roles
+from ep2sindy.studies.processes import Zones, compared_processes, ends_of, told_roles
 from ep2sindy.studies.study import Check, Coefficients, Terms
 
 ROLES_DEGREE = 3  # of the products that roles are played by
