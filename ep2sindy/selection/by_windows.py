@@ -18,6 +18,7 @@ from ep2sindy.selection.criteria import FLOOR, MAX_ERROR
 from ep2sindy.selection.systems import (
     Confirmed,
     Fold,
+    Stretch,
     Trial,
     TrialSystem,
     cut_stretches,
@@ -47,7 +48,7 @@ class WindowsLeftOut:
     that miss more than white noise are uncertain.
 
     runs: the records between their gaps. spread: standard deviation of each state over all runs.
-    n_windows: to judge on, in each fold, if there is room for as many.
+    n_windows: to refine on in each fold, and to judge on, if there is room for as many.
     """
 
     runs: Sequence[Trajectory]
@@ -55,15 +56,20 @@ class WindowsLeftOut:
     spread: Float[np.ndarray, " n_states"]
     states: Sequence[str]
     n_windows: int
-    margin = 1.0  # all within the bound are alike
     window_on_all = None  # one and a half periods
     n_reweights = 1
 
     @cached_property
     def window(self) -> int:
-        """Number of samples in each: one and a half periods, or half of what a fold holds out."""
-        room = min(max(part.stop - part.start for part in fold.held) for fold in self.folds)
+        """Number of samples in each: one and a half periods, or half of a fold's longest part."""
+        parts = [part for fold in self.folds for part in (fold.held, fold.fitted)]
+        room = min(max(each.stop - each.start for each in part) for part in parts)
         return max(MIN_SAMPLES, min(dominant_window(self.runs, self.states), room // 2))
+
+    def count(self, stretches: Sequence[Stretch]) -> int:
+        """Number of windows that share no samples."""
+        room = sum((part.stop - part.start) // self.window for part in stretches)
+        return min(self.n_windows, room)
 
     def admits(self, system: TrialSystem) -> bool:
         return bool(system.model.coef.any())
@@ -85,17 +91,16 @@ class WindowsLeftOut:
         )
         for k in doubtful[worse >= better]:
             models[k] = before[k]
-        window = fitted.data.shape[1]
-        room = sum((part.stop - part.start) // window for part in fold.held)
-        n_windows = min(self.n_windows, room)
-        held = cut_stretches(self.runs, fold.held, before[0], window=window, n_windows=n_windows)
+        held = cut_stretches(
+            self.runs, fold.held, before[0], window=self.window, n_windows=self.count(fold.held)
+        )
         return _residuals(models, held, progress) * (held.scale[: len(self.spread)] / self.spread)
 
     def figures(self, tried: Sequence[np.ndarray]) -> Float[np.ndarray, "systems 5"]:
-        """Errors in units of their bound."""
+        """Errors in units of their bound, zero up to the bound, as those systems are alike."""
         errors, bound = _errors_and_bound(np.concatenate(tried, axis=1))
         unknown = np.full_like(errors, np.nan)
-        shares = np.minimum(errors / bound, MAX_ERROR)
+        shares = np.where(errors > bound, np.minimum(errors / bound, MAX_ERROR), 0.0)
         return np.column_stack([shares, unknown, unknown, errors, errors])
 
     def confirm(self, trial: Trial, model: SparseModel) -> Confirmed:

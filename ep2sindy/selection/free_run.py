@@ -163,7 +163,7 @@ class FreeRunScore:
         measure, reason = self._measure(found.fronts, runs)
         trials = self._try(found.systems, measure, progress)
         living = find_living(trials)
-        ranked = order_equals(sorted(living, key=lambda trial: trial.rank(measure.margin)))
+        ranked = order_equals(sorted(living, key=lambda trial: trial.rank(self.margin)))
         by_error = sorted(trials, key=lambda trial: (trial.error, trial.loss))
         confirmed = self._confirm(ranked or by_error, measure, runs, progress)
         won = min(confirmed, key=lambda each: each.rank)
@@ -199,14 +199,14 @@ class FreeRunScore:
         """Refine every system without a fold, and judge it on that fold, in turn for every fold."""
         some = [k for k, system in enumerate(systems) if measure.admits(system)]
         some.sort(key=lambda k: systems[k].n_free)  # systems in a batch then cost about the same
-        trials = [Trial(system, MAX_ERROR, *[np.inf] * 4) for system in systems]
+        trials = [Trial(system) for system in systems]
         if not some:
             return trials
         tried, found = [systems[k] for k in some], []
         for fold in measure.folds:
             fitted = cut_stretches(
                 measure.runs, fold.fitted, tried[0].model, window=measure.window,
-                n_windows=self.n_windows, seed=self.seed,
+                n_windows=measure.count(fold.fitted), seed=self.seed,
             )  # fmt: skip
             refined = refine_systems(tried, fitted, progress, n_reweights=measure.n_reweights)
             found.append(measure.judge(tried, refined, fitted, fold, progress))
@@ -257,10 +257,6 @@ class CycleRuns:
     bounds: FreeRunBounds
     n_reweights = 0  # scale states by their standard deviation, as in the judging
 
-    @property
-    def margin(self) -> float:
-        return self.rule.margin
-
     @cached_property
     def window(self) -> int:
         """Number of samples in a window."""
@@ -271,6 +267,10 @@ class CycleRuns:
     @property
     def window_on_all(self) -> int:
         return self.window
+
+    def count(self, stretches: Sequence[Stretch]) -> int:
+        """Number of windows to refine on."""
+        return self.rule.n_windows
 
     def admits(self, system: TrialSystem) -> bool:
         """Whether it has all equations; one that lacks an equation cannot live."""

@@ -301,11 +301,11 @@ class Trial:
     """
 
     system: TrialSystem
-    error: float
-    f_error: float
-    amplitude: float
-    waveform: float
-    loss: float
+    error: float = MAX_ERROR
+    f_error: float = np.inf
+    amplitude: float = np.inf
+    waveform: float = np.inf
+    loss: float = np.inf
 
     def rank(self, margin: float) -> tuple[bool, int, float]:
         """Sorts the best of living systems first: those with room, the smallest, the closest."""
