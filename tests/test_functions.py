@@ -532,7 +532,9 @@ def test_saturation_is_found_in_units_far_from_one() -> None:
 def test_rules_that_run_models_take_functions() -> None:
     run = ep.pendulum().trajectory(noise=0.02, rng=0)
     library = polynomial(run.names, degree=1, functions=["sin(theta)"])
-    recipe = ep.Regression(search=ep.BestSubset(max_terms=1), selection=ep.FreeRunScore(bounds=None))
+    recipe = ep.Regression(
+        search=ep.BestSubset(max_terms=1), selection=ep.FreeRunScore(bounds=None)
+    )
     found = ep.discover(run, library, recipe).model
     assert set(found.terms("w")) == {"sin(theta)"}
 

@@ -209,7 +209,9 @@ def test_what_makes_no_sense_is_refused() -> None:
 
 def test_rules_that_refine_all_equations_serve_every_point() -> None:
     field = parabolas(Z[:1], R[:1])
-    result = ep.pointwise(field, searching(selection=ep.FreeRunScore(bounds=None)), workers=Serial())
+    result = ep.pointwise(
+        field, searching(selection=ep.FreeRunScore(bounds=None)), workers=Serial()
+    )
     assert result["n_terms"].item() == 2
 
 

@@ -134,7 +134,9 @@ def test_a_discovery_under_roles_is_printed_by_process() -> None:
     run = replace(run, states=run.states + 1e-6 * rng.normal(size=run.states.shape))
     roles = ep.Roles(exchange=[("x", "y")], outflow=["x", "y"], inflow={"x": 1.0}, nonnegative=True)
     method = ep.Regression(
-        search=ep.BestSubset(max_terms=3, n_best=60), selection=ep.FreeRunScore(bounds=None), depth=6
+        search=ep.BestSubset(max_terms=3, n_best=60),
+        selection=ep.FreeRunScore(bounds=None),
+        depth=6,
     )
     found = ep.discover(run, library.with_roles(roles), method)
     assert re.search(r"x' = 1 - 1 \(.*\) x y - 0\.5 \(.*\) x \[", repr(found))
