@@ -22,8 +22,12 @@ from ep2sindy.selection.systems import (
     Trial,
     TrialSystem,
     cut_stretches,
+    deal,
     plan_refinement,
 )
+
+# Fewest pairs of windows to cut the records into.
+MIN_PAIRS = 3
 
 # Standard errors by which the winner's error may exceed the least.
 N_ERRORS = 2.0
@@ -48,28 +52,47 @@ class WindowsLeftOut:
     that miss more than white noise are uncertain.
 
     runs: the records between their gaps. spread: standard deviation of each state over all runs.
-    n_windows: to refine on in each fold, and to judge on, if there is room for as many.
+    n_windows: that are judged, over all records, each in one fold.
     """
 
     runs: Sequence[Trajectory]
-    folds: Sequence[Fold]
     spread: Float[np.ndarray, " n_states"]
     states: Sequence[str]
     n_windows: int
+    n_folds: int
     window_on_all = None  # one and a half periods
     n_reweights = 1
 
     @cached_property
     def window(self) -> int:
-        """Number of samples in each: one and a half periods, or half of a fold's longest part."""
-        parts = [part for fold in self.folds for part in (fold.held, fold.fitted)]
-        room = min(max(each.stop - each.start for each in part) for part in parts)
-        return max(MIN_SAMPLES, min(dominant_window(self.runs, self.states), room // 2))
+        """Number of samples in each: one and a half periods, or what leaves three pairs."""
+        lengths = [run.n_samples for run in self.runs]
+        wanted = min(dominant_window(self.runs, self.states), sum(lengths) // (2 * MIN_PAIRS))
+        if max(lengths) < 2 * MIN_SAMPLES:
+            raise ValueError(
+                "a record must hold a window to refine on and another to judge on, of "
+                f"{MIN_SAMPLES} samples or more: at most {max(lengths)} came; use longer records"
+            )
+        return min(max(wanted, MIN_SAMPLES), max(lengths) // 2)
+
+    @cached_property
+    def folds(self) -> list[Fold]:
+        """Pairs of neighbouring windows, spread over every record that is long enough, dealt out.
+
+        Blocks of a record, as for free runs, would tell right from wrong less often.
+        """
+        lengths, window, found = [run.n_samples for run in self.runs], self.window, []
+        for number, length in enumerate(lengths):
+            n_pairs = max(1, round(self.n_windows / 2 * length / sum(lengths)))
+            n_pairs = min(n_pairs, length // (2 * window))
+            last = max(length - 2 * window, 0)
+            for start in np.linspace(0, last, n_pairs).round().astype(np.int64).tolist():
+                found += [Stretch(number, k, k + window) for k in (start, start + window)]
+        return deal(found, self.n_folds)
 
     def count(self, stretches: Sequence[Stretch]) -> int:
-        """Number of windows that share no samples."""
-        room = sum((part.stop - part.start) // self.window for part in stretches)
-        return min(self.n_windows, room)
+        """Number of windows: each stretch is one."""
+        return len(stretches)
 
     def admits(self, system: TrialSystem) -> bool:
         return bool(system.model.coef.any())

@@ -189,9 +189,8 @@ class FreeRunScore:
             parts = folds(runs, self.n_folds)
             return CycleRuns(self, runs, parts, smoothed, cycles, self.bounds), ""
         pieces = [piece for run in runs for piece in run.stretches(2 * MIN_SAMPLES)]
-        parts, spread = folds(pieces, self.n_folds), np.concatenate(smoothed).std(axis=0)
-        reason = f"{cycles}: " if cycles else ""
-        return WindowsLeftOut(pieces, parts, spread, states, self.n_windows), reason
+        spread, reason = np.concatenate(smoothed).std(axis=0), f"{cycles}: " if cycles else ""
+        return WindowsLeftOut(pieces, spread, states, self.n_windows, self.n_folds), reason
 
     def _try(
         self, systems: Sequence[TrialSystem], measure: Measure, progress: Progress
