@@ -17,7 +17,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
-from ep2sindy.discovery.method import AnyMethod
+from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.discovery.one_signal import (
     Attempt,
     Preparation,
@@ -56,6 +56,18 @@ ERRORS = (
 PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
 
 
+def judged_by(method: AnyMethod, signal: str) -> AnyMethod:
+    """The method; models that are run are judged by the signal, of which other states are made."""
+    if not isinstance(method, Regression) or method.selection.basis != "runs":
+        return method
+    from ep2sindy.selection.free_run import FreeRunScore  # loads torch, only for this rule
+
+    rule = method.selection
+    if not isinstance(rule, FreeRunScore) or rule.judged is not None:
+        return method
+    return replace(method, selection=replace(rule, judged=(signal,)))
+
+
 @dataclass(frozen=True)
 class Study:
     """Find states and equations of one signal, and test the model on time it has not seen.
@@ -92,7 +104,7 @@ class Study:
         with resumed(self.keep, report) as keeping:
             signal = self._prepared(data, keeping.once, report)
             attempts = try_in_turn(
-                fitted_part(signal, self.held_out), self.tried, self.method,
+                fitted_part(signal, self.held_out), self.tried, judged_by(self.method, self.signal),
                 seed=report.seed, progress=report.watch, once=keeping.once,
             )  # fmt: skip
         best = best_of(attempts)
