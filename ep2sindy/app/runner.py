@@ -18,7 +18,6 @@ import ep2sindy.studies
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
-from ep2sindy.report.about import ASIDE
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.report import Report
 from ep2sindy.report.screen import Screen
@@ -42,7 +41,7 @@ def run_config(config: DictConfig) -> Path:
     with start_run(config) as report:
         study.run(report)
         formats = config.get("formats", ["png"])
-        report.finish(purpose=purpose_of(kind), keys=keys_of(kind) - {*ASIDE}, formats=formats)
+        report.finish(purpose=purpose_of(kind), keys=keys_of(kind), formats=formats)
     return report.folder.path
 
 

@@ -117,17 +117,13 @@ class ConstrainedSolution:
         """The model of these coefficients. root: of their covariance; None takes `root`."""
         names, states = self.constraint.coefficients, self.constraint.states
         coef = self.constraint.coef(self.fit.coef)
-        values = [
-            {term: c for (s, term), c in zip(names, coef.tolist(), strict=True) if s == state}
-            for state in states
-        ]
         columns = [states.index(s) for s, _ in names]
         order = np.lexsort([[library.index(t) for _, t in names], columns])
         own = (self.root if root is None else root)[order[coef[order] != 0.0]]
         return SparseModel(
             library=library,
             states=states,
-            coef=coef_matrix(library, values),
+            coef=coef_matrix(library, [*self.constraint.equations(self.fit.coef).values()]),
             units=units,
             provenance=provenance,
             covariance=own @ own.T,

@@ -121,14 +121,17 @@ class Report:
         if isinstance(rows, ResultTable):
             frame, self.summary[name] = rows.csv(heading, by_state=by_state), rows.json()
             self.headline |= rows.headline()
-            seen = rows.screen(heading, by_state=by_state)
         else:
             frame, self.summary[name] = rows, json_rows(rows)
-            seen = rows.dropna(axis=1, how="all")  # as of published values, where there are none
         self.samples(name, frame)
-        if shown:
-            drawn = Table(seen, title=title, note=note, bold=bold, page_only=page_only)
-            self.add(shown if isinstance(shown, Table) else drawn)
+        if isinstance(shown, Table):
+            self.add(shown)
+        elif shown:
+            if isinstance(rows, ResultTable):
+                seen = rows.screen(heading, by_state=by_state)
+            else:
+                seen = rows.dropna(axis=1, how="all")  # published values, where there are none
+            self.add(Table(seen, title=title, note=note, bold=bold, page_only=page_only))
 
     def samples(self, name: str, frame: pd.DataFrame) -> None:
         """Add samples, such as those that a figure draws: tables/NAME.csv alone."""

@@ -16,10 +16,10 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Process, binding, constraint
 from ep2sindy.library.roles import process_amounts
 from ep2sindy.model.comparison import Status
-from ep2sindy.model.model import SparseModel
+from ep2sindy.model.model import SparseModel, model_of
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import RefinementChanges
-from ep2sindy.refinement.refine import BatchRefinement, refine, refine_batch, with_coef
+from ep2sindy.refinement.refine import BatchRefinement, refine, refine_batch
 from ep2sindy.refinement.steps import fastest_step
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.regression.front import Fronts
@@ -69,9 +69,8 @@ class TrialSystem:
         means: Float[np.ndarray, " processes"] | None = None,
     ) -> TrialSystem:
         """The system with these values of the free coefficients."""
-        empty = np.zeros((len(task.library), len(held.states)))
-        model = SparseModel(task.library, held.states, empty, task.runs[0].units)
-        return TrialSystem(with_coef(model, held, held.coef(free))[0], held, means)
+        model = model_of(task.library, held.equations(free), units=task.runs[0].units)
+        return TrialSystem(model, held, means)
 
     @property
     def n_free(self) -> int:

@@ -15,6 +15,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
+from ep2sindy.library.roles import Role
 from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
@@ -78,15 +79,16 @@ def expand(
                 f"{fit.form!r}"
             )
         form = usual if fit.form is None else forms.get(fit.form)
-        if not fit.n_points:
+        if not (fit.n_points or fit.n_windows):
             found.append(Way(name, name, fit, form))
             continue
         if not isinstance(form, Weak) or (own := boxes_of(form)) is None:
             raise ValueError(
-                f"fits.{name}.n_points is for a form of random windows (Weak with Boxes): got "
-                f"{form}"
+                f"fits.{name}.n_points and n_windows are for a form of random windows (Weak with "
+                f"Boxes): got {form}"
             )
-        for n_windows, n_points in product(fit.n_windows or [own.n_windows], fit.n_points):
+        numbers, lengths = fit.n_windows or [own.n_windows], fit.n_points or [own.n_points]
+        for n_windows, n_points in product(numbers, lengths):
             boxes = replace(own, n_points=n_points, n_windows=n_windows)
             varied = f"n_windows_{n_windows}_" if len(fit.n_windows) > 1 else ""
             its_form = replace(form, test_functions=boxes)
@@ -132,7 +134,7 @@ def first_model(
         return FirstModel(structure.given(library, train), None, {})
     held_to = structure.constraint(library, record.data, record.zones, relations=way.fit.relations)
     if way.form is None:
-        model, _ = balance_model(library, held_to, record.data, record.zones)
+        model = balance_model(library, held_to, record.data, record.zones)
         return FirstModel(model, held_to, {})
     rows = way.form.assemble([train], library, rng=np.random.default_rng(seed))
     words = {"formulation": repr(way.form), "trajectories": train.label}
@@ -229,18 +231,11 @@ def wrong_signs(model: SparseModel, held_to: Constraint | None, record: RecordPa
     if held_to is None or not held_to.processes or not record.zones.balances:
         return []
     return [
-        f"{_arrow(*process.ends)} by {term}"
+        f"{Role(*process.ends, how=None).name} by {term}"
         for process in compared_processes(model, held_to, record.data, record.zones)
         for term, coef in process.coef.items()
         if coef * process.counterpart.get(term, coef) < 0.0
     ]
-
-
-def _arrow(giver: str, taker: str) -> str:
-    """`n_n to n_i`, `n_i out`, `n_n in`."""
-    if giver and taker:
-        return f"{giver} to {taker}"
-    return f"{giver} out" if giver else f"{taker} in"
 
 
 # Several runs of one kind: over draws of windows, or over operating points.

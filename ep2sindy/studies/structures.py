@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from operator import add
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -84,8 +84,7 @@ class Structure:
         """
         states = list(run.state_names)
         if self.roles is None:
-            given: Mapping[str, Any] = self.terms or self.coefficients
-            terms = {state: list(map(str, given[state])) for state in states}
+            terms = {state: list(map(str, self.terms[state])) for state in states}
             return constraint(library, terms, self.relations if relations else ())
         told = told_roles(zones.balances, run)
         roles = self.roles.with_known({name: rate.terms for name, rate in told.items()})
@@ -108,10 +107,8 @@ Structures = Annotated[
 ]
 
 
-def balance_model(
-    library: Library, held: Constraint, run: Trajectory, zones: Zones
-) -> tuple[SparseModel, dict[str, float]]:
-    """The model whose processes are least squares on the recorded balance, and R2 of each.
+def balance_model(library: Library, held: Constraint, run: Trajectory, zones: Zones) -> SparseModel:
+    """The model whose processes are least squares on the recorded balance.
 
     Raises ValueError for a constraint without processes, or a process that is not recorded.
     """
@@ -128,5 +125,4 @@ def balance_model(
     values = [found[each] for each in asked]
     known, places = sum_known(held.known), [held.coefficients[k] for k in held.free]
     z = shares_of(held) @ np.array(values) + [known.get(place, 0.0) for place in places]
-    model = model_of(library, held.equations(z), units=run.units)
-    return model, {each.name: each.fit_r2 for each in processes}
+    return model_of(library, held.equations(z), units=run.units)
