@@ -91,7 +91,7 @@ def make_row(n: int, *, width: float, height: float) -> tuple[Figure, Sequence[A
     """A figure of n panels beside each other that share both axes, each of this width in inches."""
     size = (min(WIDTH, width * n + 0.4), height)
     figure, (axes,) = make_panels(1, n, size, sharex=True, sharey=True)
-    return figure, axes
+    return figure, [*axes]
 
 
 def name_ticks(axis: Axis, places: Iterable[float], names: Sequence[str]) -> None:
