@@ -6,6 +6,7 @@ A plugin of pytest (`-p tests.checked`), for the hook must stand before the pack
 from importlib import import_module
 from pathlib import Path
 
+from beartype import BeartypeConf, beartype
 from jaxtyping import install_import_hook
 
 PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
@@ -40,4 +41,6 @@ GUESTS = [
 
 for guest in GUESTS:
     import_module(guest)
-install_import_hook(MODULES, "beartype.beartype")
+# As for mypy, a whole number is a number (PEP 484).
+check_types = beartype(conf=BeartypeConf(is_pep484_tower=True))
+install_import_hook(MODULES, "tests.checked.check_types")

@@ -207,7 +207,7 @@ def explains(found: Discovery, signal: str) -> bool:
     if not free.is_similar or free.cycle is None:
         return free.is_similar
     n_periods = float(record.t[-1] - record.t[0]) / free.cycle.period_s
-    return free.multiplier**n_periods < SPIRALS
+    return bool(free.multiplier**n_periods < SPIRALS)
 
 
 def fitted_part(signal: Trace, held_out: float) -> Trace:

@@ -17,6 +17,9 @@ from ep2sindy.estimation.likelihood import TrajectoryFit, fit_paths, innovations
 from ep2sindy.estimation.problem import BySample, ByState, EstimationProblem, StateMask
 from ep2sindy.runtime.screen import joined
 
+# A record in pieces of different lengths, by sample and state.
+Pieces = Sequence[Float[np.ndarray, "_ d"]]
+
 FLOOR = 1e-3  # least noise, as a share of the RMS: no model and no integration is exact
 SIGNIFICANT = 3.5  # standard errors of an autocorrelation
 MAX_LASTING = 0.98
@@ -141,7 +144,7 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     )
 
 
-def are_noise(samples: Sequence[BySample], left: Sequence[BySample], n: float) -> StateMask:
+def are_noise(samples: Pieces, left: Pieces, n: float) -> StateMask:
     """True for states of which a model leaves no more than noise, so that intervals tell something.
 
     What it leaves is less than any model's error, or white, or lasts as noise does that the samples
@@ -175,14 +178,12 @@ def _expected_residuals(fit: TrajectoryFit, std: ByState) -> BySample:
     return np.where(np.isfinite(pull), pull, 0.0)
 
 
-def _memory(left: Sequence[BySample]) -> ByState:
+def _memory(left: Pieces) -> ByState:
     """Correlation of residuals from one sample to the next."""
     return np.clip(autocorrelations(left, [1])[0], 0.0, MAX_LASTING)
 
 
-def autocorrelations(
-    pieces: Sequence[BySample], lags: Sequence[int]
-) -> Float[np.ndarray, "lags d"]:
+def autocorrelations(pieces: Pieces, lags: Sequence[int]) -> Float[np.ndarray, "lags d"]:
     """Correlations of pieces of a record with themselves some samples later."""
     squares = sum(np.square(e).sum(axis=0) for e in pieces)
     products = [sum((e[lag:] * e[:-lag]).sum(axis=0) for e in pieces) for lag in lags]
@@ -212,9 +213,7 @@ def _growth_deviance(variance: BySample, e2: BySample) -> ByState:
     return np.log(variance).sum(axis=0) + len(e2) * np.log(np.maximum(ratio, TINY))
 
 
-def _tails(
-    problem: EstimationProblem, new: Sequence[BySample]
-) -> tuple[ByState, Int[np.ndarray, " d"]]:
+def _tails(problem: EstimationProblem, new: Pieces) -> tuple[ByState, Int[np.ndarray, " d"]]:
     """Kurtosis of the AR(1) innovations of the residuals of values, and the number of outliers."""
     d = len(problem.states)
     kurtosis, outliers = np.full(d, np.nan), np.zeros(d, dtype=np.int64)
@@ -280,7 +279,7 @@ def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray]) -> StateMa
     return held
 
 
-def _follow_states(fit: TrajectoryFit, new: Sequence[BySample]) -> StateMask:
+def _follow_states(fit: TrajectoryFit, new: Pieces) -> StateMask:
     """True if products of the states explain more of the residuals than they would of noise.
 
     What a library lacks is a function of the states, also where it lasts as noise does.
@@ -313,9 +312,9 @@ def powers_of(states: BySample, degree: int) -> np.ndarray:
 
 
 def _lasts_as_noise(
-    unit: Sequence[BySample],
-    samples: Sequence[BySample],
-    left: Sequence[BySample],
+    unit: Pieces,
+    samples: Pieces,
+    left: Pieces,
     std: ByState,
     memory: ByState,
     n: float,
@@ -332,7 +331,7 @@ def _lasts_as_noise(
 
 
 def _shown_by_samples(
-    samples: Sequence[BySample], left: Sequence[BySample], std: ByState, memory: ByState, n: float
+    samples: Pieces, left: Pieces, std: ByState, memory: ByState, n: float
 ) -> StateMask:
     """True if noise of this size and memory would leave differences as large as the samples'.
 
@@ -349,7 +348,7 @@ def _shown_by_samples(
     return far < ALIKE / np.sqrt(n)
 
 
-def _squared_differences(values: Sequence[BySample]) -> ByState:
+def _squared_differences(values: Pieces) -> ByState:
     """Mean squares of the third differences, NaN left out; zero where there are none."""
     differences = np.concatenate([np.diff(each, ORDER, axis=0) for each in values])
     count = np.maximum(np.isfinite(differences).sum(axis=0), 1)

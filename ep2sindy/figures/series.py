@@ -164,7 +164,7 @@ def _draw_rows(
     return figure, axes
 
 
-def _reach(parts: Sequence[Float[np.ndarray, " points"]]) -> Limits:
+def _reach(parts: Sequence[Float[np.ndarray, " _"]]) -> Limits:
     together = np.concatenate(parts)
     return float(together.min()), float(together.max())
 

@@ -41,7 +41,7 @@ CELLS, DARK = "Blues", 0.65
 
 Limits = tuple[float, float]
 
-Curve = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]  # abscissa, ordinate
+Curve = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # abscissa, ordinate
 
 Sharing = bool | Literal["row", "col"]
 

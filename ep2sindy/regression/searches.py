@@ -212,7 +212,13 @@ Scored = tuple[frozenset[int], float]  # a support, and the residual that it lea
 
 
 def exchange_terms(
-    xx: Grams, xy: Moments, yy: Squares, *, max_terms: int, n_best: int, known: Masks | None = None
+    xx: Grams,
+    xy: Moments,
+    yy: Squares,
+    *,
+    max_terms: int,
+    n_best: int,
+    known: Bool[np.ndarray, "_ terms"] | None = None,
 ) -> Masks:
     """The best `n_best` supports found of every size up to max_terms, the empty one first.
 

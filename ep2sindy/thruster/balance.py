@@ -119,7 +119,7 @@ def _estimated(field: xr.Dataset, zone: Zone, *, axisymmetric: bool) -> Terms:
     if "z" not in field.dims:
         return terms
     slices = zone_slices(field, zone).get("z", slice(None))
-    inner = np.arange(field.sizes["z"])[slices]
+    inner = range(field.sizes["z"])[slices]
     length_m = float(cell_sizes(field, "z", axisymmetric=axisymmetric)[slices].sum())
     if "u_iz" in field:
 
