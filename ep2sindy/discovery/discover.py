@@ -65,12 +65,13 @@ def discover(
     runs whose states or units differ, states or samples that repeat, runs that lack parameters, or
     points that do not suffice for the law.
 
+    >>> from dataclasses import replace
     >>> growth = (0.5, 0.7, 0.9, 1.1)
     >>> runs = [ep.lotka_volterra(a=a).trajectory(noise=0.02, rng=0) for a in growth]
     >>> runs = [replace(run, parameters={"a": a}) for run, a in zip(runs, growth)]
     >>> found = ep.discover(runs, method=ep.Regression(), law=1)
     >>> found.law.at(a=0.8).terms("x")
-    {'x': 0.79..., 'x*y': -0.99...}
+    {'x': 0.799..., 'x*y': -1.000...}
     """
     method = method or TrajectorySearch()
     trajectories = trajectories_of(runs, t=t, inputs=inputs, partial=True)

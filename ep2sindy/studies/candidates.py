@@ -85,8 +85,9 @@ def candidate_metrics(label: str) -> Metrics[CandidateRow]:
     return [
         Metric("equation", lambda row: row.candidate.equation),
         Metric("n_terms", lambda row: row.candidate.n_terms, View.ALL, "terms", "{}"),
-        Metric("r2_test", lambda row: row.candidate.r2_test, View.ALL, "R2 test", "{:.3f}"),
-        Metric("r2_train", lambda row: row.candidate.r2_train, View.SHOWN, "R2 train", "{:.3f}"),
+        Metric("r2", lambda row: row.candidate.r2, View.SCREEN, "R2", "{:.3f}"),
+        Metric("r2_test", lambda row: row.candidate.r2_test, View.FILES | View.HEADLINE),
+        Metric("r2_train", lambda row: row.candidate.r2_train),
         Metric(label, lambda row: row.candidate.score, View.ALL, label, "{:.3f}"),
         Metric("share", lambda row: row.candidate.share, View.SHOWN, format="{:.2f}"),
         Metric("selected", lambda row: row.is_selected),
