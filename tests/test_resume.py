@@ -140,7 +140,7 @@ def test_a_trace_that_ends_in_its_tests_searches_once(
     config = composed(*glance(scope(tmp_path / "scope.csv", *signal(12.0)), tmp_path))
     whole = computed(config)
     with monkeypatch.context() as patched:
-        patched.setattr(trace, "evaluate", ends)
+        patched.setattr(trace, "run_on_rest", ends)
         with pytest.raises(KeyboardInterrupt):
             computed(config)
     check_same(whole, computed(config))

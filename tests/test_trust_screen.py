@@ -104,4 +104,4 @@ def test_a_run_whose_screen_is_lost_leaves_all_its_files(screen: str, tmp_path: 
     (folder,) = (tmp_path / "outputs" / "discover").iterdir()
     names = {path.name for path in folder.iterdir()}
     assert {"summary.json", "report.html", "figures", "models", "tables", "run.log"} <= names
-    assert "Run freely from the first sample" in (folder / "run.log").read_text()
+    assert "run freely from one sample" in (folder / "run.log").read_text()
