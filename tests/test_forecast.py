@@ -10,7 +10,7 @@ import ep2sindy as ep
 from ep2sindy.data.numbers import quantiles
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.likelihood import linearise
-from ep2sindy.forecasting.skill import Autoregression, Harmonics, Persistence
+from ep2sindy.forecasting.baselines import Autoregression, Harmonics, Persistence
 from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
 from tests.models import model_of
