@@ -15,14 +15,18 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.baselines import (
     AUTOREGRESSION,
     HARMONICS,
+    N_STARTS,
     PERSISTENCE,
-    Baseline,
+    Autoregression,
     check_fitted,
     fit_baselines,
-    horizon_errors,
+    go_on,
+    measured_part,
     period_of,
+    root_mean,
     spread_evenly,
     spread_starts,
+    squared_errors,
 )
 from ep2sindy.forecasting.forecast import (
     LEVEL,
@@ -38,7 +42,6 @@ from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count
 
-N_STARTS = 40
 PERIODS_AHEAD = 4.0  # longest horizon
 N_HORIZONS = 120  # most horizons at which errors are counted
 NEARER = 0.9  # share of the model's error below which a baseline is clearly nearer
@@ -170,11 +173,16 @@ def forecast_skill(
     with watch.stage(len(first), "start", "forecasts") as advance:
         ends = rolling.ends(states_of, advance)
     ahead = rolling.forecast(ends, check_count("n_draws", n_draws), seed)
-    shown, (baselines, order) = spread_evenly(longest, N_HORIZONS), fit_baselines(fitted, names)
+    shown, own = spread_evenly(longest, N_HORIZONS), measured_part(record, names)
+    baselines = fit_baselines(own.window(0, n_fitted), longest)
+    linear = baselines.get(AUTOREGRESSION)
     paths = {MODEL: rolling.measured(ahead)}
-    paths |= {name: _go_on(each, rolling) for name, each in baselines.items()}
+    paths |= {name: go_on(each, own, first, longest) for name, each in baselines.items()}
     scale = zero_to_one(record.columns(names)[n_fitted:].std(axis=0))
-    errors = {n: horizon_errors(path, rolling.truth, scale)[shown] for n, path in paths.items()}
+    errors = {
+        name: root_mean(squared_errors(path, rolling.truth, scale))[shown]
+        for name, path in paths.items()
+    }
     return ForecastSkill(
         horizons_s=rolling.steps_s[shown],
         period_s=period_s,
@@ -182,7 +190,7 @@ def forecast_skill(
         coverage_90=rolling.coverage(ahead, LEVEL),
         n_starts=len(first),
         example=ahead[0],
-        order=order,
+        order=linear.order if isinstance(linear, Autoregression) else 0,
         clock=record.clock,
     )
 
@@ -211,12 +219,3 @@ def _horizon_of(record: Trajectory, n_fitted: int, period_s: float, horizon_s: f
             f"{left * record.dt_s:.4g} s are held out"
         )
     return min(n, max(1, left // 2)) if horizon_s is None else n
-
-
-def _go_on(
-    baseline: Baseline, rolling: RollingStarts
-) -> Float[np.ndarray, "starts ahead measured"]:
-    """What a baseline forecasts from every start."""
-    record, n = rolling.record, rolling.longest
-    samples, t = record.columns(rolling.estimator.names), record.t
-    return np.stack([baseline.ahead(samples[:k], t[:k], t[k : k + n]) for k in rolling.first])
