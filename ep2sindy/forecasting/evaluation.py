@@ -243,6 +243,12 @@ class Evaluation:
         )
         return text if self.rest is None else f"{text} It rests at {self._rest_text(self.rest)}."
 
+    @property
+    def rest_text(self) -> str:
+        """The rest points near the record, in a line; empty without any."""
+        places = [self._rest_text(rest) for rest in self.rest_points[:N_SHOWN]]
+        return f"rests at {'; and at '.join(places)}" if places else ""
+
     def _rest_text(self, rest: RestPoint) -> str:
         """Where the model rests, and what becomes of a small departure."""
         units, clock = self.model.units, self.rollout.clock

@@ -111,13 +111,15 @@ class ForecastSkill:
     def n_better(self) -> int:
         """Number of horizons, from the first on, over which the model is better than the rival.
 
-        At each of them its error is below one, so that it beats the mean of the samples, and the
-        gain in mean square error exceeds its standard error over the starts; averaged over all of
-        them, the gain is one that chance makes in a case of twenty.
+        At each of them the gain in mean square error, over the rival and over the mean of the
+        samples, exceeds its standard error over the starts; averaged over all of them, the gain
+        over the rival is one that chance makes in a case of twenty.
         """
-        gain, is_close = self.squared[self.rival] - self.squared[MODEL], self.nrmse[MODEL] < 1.0
-        n = 0
-        while n < len(is_close) and is_close[n] and self._exceeds(gain[:, n], n, EXCEEDS):
+        own, n = self.squared[MODEL], 0
+        gain = self.squared[self.rival] - own
+        while n < own.shape[1] and all(
+            self._exceeds(each[:, n], n, EXCEEDS) for each in (gain, 1.0 - own)
+        ):
             n += 1
         while n and not self._exceeds(gain[:, :n].mean(axis=1), n - 1, SURE):
             n -= 1
