@@ -122,6 +122,7 @@ class Study:
                 free,
                 file=NAME,
                 picture=f"free_run_{NAME}",
+                skill=skill,
                 more=[Text(free.caution, warning=True)] if free.caution else [],
                 where=where,
                 seen=skill is None,

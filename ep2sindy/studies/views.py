@@ -12,7 +12,8 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
-from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.forecasting.evaluation import Evaluation, size_text
+from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Block, Result, Text
@@ -132,25 +133,30 @@ def found_model(
     *,
     file: str,
     picture: str,
+    skill: ForecastSkill | None = None,
     more: Sequence[Block] = (),
     where: str,
     seen: bool = False,
     misfit: str = "",
     held: Constraint | None = None,
 ) -> Result:
-    """A model as what was found: its equations, and how it runs.
+    """A model as what was found: what it foresees, its equations, and how it runs.
 
-    found: how it was found, such as `Found from I_d`. file: its name among the run's models. where:
-    what it was run over, in words, such as `held-out time`. seen: whether it was fitted to that.
-    misfit: why it does not explain the data, a warning; may be empty. held: that its coefficients
-    obey, if it was found under roles.
+    found: how it was found, such as `Found from I_d`. file: its name among the run's models. skill:
+    of its forecasts, which are the headline; without them it is how the model runs. where: what it
+    was run over, in words, such as `held-out time`. seen: whether it was fitted to that. misfit:
+    why it does not explain the data, a warning; may be empty. held: that its coefficients obey, if
+    it was found under roles.
     """
     clock, model = run.rollout.clock, run.model
+    fate = _fate(run, seen=seen, misfit=misfit)
+    free = run_words(run) if skill is None else f"{fate}; {run_words(run)}"
     return Result(
-        f"{found}: a model that {_fate(run, seen=seen, misfit=misfit)}",
+        f"{found}: {f'a model that {fate}' if skill is None else skill.headline}",
         [
             *equations(model, clock, held=held),
-            Text(f"run freely from one sample over {where}: {run_words(run)}"),
+            Text(f"run freely from one sample over {where}: {free}"),
+            *map(Text, run.rest_texts),
             *([Text(misfit, warning=True)] if misfit else []),
             *more,
         ],
@@ -195,7 +201,7 @@ def run_words(run: Evaluation) -> str:
         found.append(f"frequency {frequency}")
     ratios = [value for value in run.amplitude_ratio.values() if np.isfinite(value)]
     if ratios:
-        ends = dict.fromkeys(f"{value:.3g}" for value in (min(ratios), max(ratios)))
+        ends = dict.fromkeys(size_text(value) for value in (min(ratios), max(ratios)))
         found.append(f"amplitude {' to '.join(ends)} times the data's")
     waveforms = [value for value in run.waveform_error.values() if np.isfinite(value)]
     if waveforms:
@@ -203,8 +209,13 @@ def run_words(run: Evaluation) -> str:
     if np.isfinite(run.periods):
         found.append(f"in phase for {round(run.periods)} periods")
     if not found and np.isfinite(run.nrmse):
-        found.append(f"{run.nrmse:.2g} standard deviations off")
+        found.append(f"{size_text(run.nrmse, '.2g')} standard deviations off")
     return "; ".join(found) or run.text
+
+
+def _size(ratio: float) -> str:
+    """A ratio of sizes in a table; a dash if it is not known."""
+    return size_text(ratio, ".3f") if ratio == ratio else "-"
 
 
 COMPARED = View.FILES | View.HEADLINE
@@ -217,9 +228,9 @@ EVALUATION: Metrics[Evaluation] = [
     Metric("frequency_Hz", lambda run: run.frequency_Hz),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.HEADLINE),
     Metric("f_error", lambda run: run.f_error, COMPARED),
-    Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.ALL, "amplitude {}", "{:.3f}"),
+    Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.ALL, "amplitude {}", _size),
     Metric("waveform_error", lambda run: run.waveform_error, View.ALL, "waveform {}", "{:.3f}"),
-    Metric("nrmse", lambda run: run.nrmse, View.ALL, format="{:.3f}"),
+    Metric("nrmse", lambda run: run.nrmse, View.ALL, format=_size),
     Metric("periods", lambda run: run.periods, View.SHOWN, "periods in phase", "{:.0f}"),
     Metric("status", lambda run: run.text, View.SHOWN),
 ]
