@@ -16,7 +16,8 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.forecasting.skill import ForecastSkill, check_fitted, forecast_skill
+from ep2sindy.forecasting.baselines import check_fitted
+from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
 from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Status, columns_of, record_of
 from ep2sindy.model.fixed_point import RestPoint, rest_point
 from ep2sindy.model.model import SparseModel

@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.numbers import band_of, quantiles
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.baselines import spread_evenly
 from ep2sindy.forecasting.state_estimation import FittedState, StateEstimator, tune_estimator
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
@@ -188,26 +188,6 @@ def _times(t: np.ndarray, step_s: float, horizon: float | ArrayLike) -> np.ndarr
             f"end at {t[-1]:.6g} s: {horizon!r} came"
         )
     return asked
-
-
-def spread_starts(
-    t: Float[np.ndarray, " samples"], first: int, longest: int, n: int
-) -> Int[np.ndarray, " starts"]:
-    """At most n starts of forecasts of `longest` samples, evenly spread from a first one on.
-
-    A forecast and the sample before it lie in one stretch without a gap, unless none of them does.
-    """
-    starts = np.arange(min(first, len(t) - longest), len(t) - longest + 1)
-    end = np.array(between_gaps(t))[:, 1]
-    piece = np.searchsorted(end, starts - 1, side="right")
-    inside = starts + longest <= end[piece]
-    starts = starts[inside] if inside.any() else starts
-    return starts[spread_evenly(len(starts), n)]
-
-
-def spread_evenly(n_all: int, n: int) -> Int[np.ndarray, " places"]:
-    """At most n places among n_all, evenly spread from the first to the last."""
-    return np.unique(np.linspace(0, n_all - 1, n).round().astype(np.int64))
 
 
 @dataclass(frozen=True, eq=False)
