@@ -17,10 +17,12 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
-from ep2sindy.discovery.method import AnyMethod, Regression
+from ep2sindy.discovery.foresight import foresee
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.one_signal import (
     Attempt,
     Preparation,
+    Told,
     best_of,
     fit_offset,
     fitted_part,
@@ -40,7 +42,7 @@ from ep2sindy.studies.forecasts import add_forecasts
 from ep2sindy.studies.living import CAPTIONS, add_cycle
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import Source, data_summary, in_unit, only, zone_of
-from ep2sindy.studies.study import A_LIST, Share
+from ep2sindy.studies.study import A_LIST, Share, Terms
 from ep2sindy.studies.views import CYCLE, EVALUATED, EVALUATION, add_samples, found_model
 
 NAME = "trace"  # of the model, in files
@@ -49,23 +51,16 @@ NOT_EXPLAINED = (
     "states are made by smoothing"
 )
 
+LINEAR = (
+    "nothing beyond a linear autoregression is foreseen, not even for a quarter of a turn: no "
+    "equations of a few states explain that, and only the first smoothed states are tried"
+)
+
 ERRORS = (
     "Forecasts: up to a period, where the model was fitted, in standard deviations. Unexplained: "
     "share of the next derivative that neighbours in these states leave."
 )
 PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
-
-
-def judged_by(method: AnyMethod, signal: str) -> AnyMethod:
-    """The method; models that are run are judged by the signal, of which other states are made."""
-    if not isinstance(method, Regression) or method.selection.basis != "runs":
-        return method
-    from ep2sindy.selection.free_run import FreeRunScore  # loads torch, only for this rule
-
-    rule = method.selection
-    if not isinstance(rule, FreeRunScore) or rule.judged is not None:
-        return method
-    return replace(method, selection=replace(rule, judged=(signal,)))
 
 
 @dataclass(frozen=True)
@@ -81,7 +76,7 @@ class Study:
     are taken; of more than two states, only for a signal that does not repeat itself.
     decimate, detrend: see `prepare_signal`. held_out: the share at the end of the record that is
     not fitted and serves as the test. keep: whether a run goes on with the finished searches of one
-    that was broken off.
+    that was broken off. exclude, relations, rests_at_zero: known of the equations, see `Told`.
     """
 
     source: Source
@@ -94,22 +89,41 @@ class Study:
     held_out: Share
     unit: str | None = None
     keep: bool = True
+    exclude: Terms | None = None
+    relations: Sequence[str] = ()
+    rests_at_zero: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.offset, str) and self.offset != "fit":
             raise ValueError(f"offset must be a number or fit: {self.offset!r} came")
 
+    @property
+    def told(self) -> Told:
+        """What is known of the equations."""
+        barred = {
+            state: [str(name) for name in names] for state, names in (self.exclude or {}).items()
+        }
+        return Told(barred, self.relations, self.rests_at_zero)
+
     def run(self, report: Report) -> None:
         data = self._sampled(report)
         with resumed(self.keep, report) as keeping:
             signal = self._prepared(data, keeping.once, report)
+            past = fitted_part(signal, self.held_out)
+            foresight = foresee(past)
+            if foresight.is_linear:
+                report.say(LINEAR)
             attempts = try_in_turn(
-                fitted_part(signal, self.held_out), self.tried, judged_by(self.method, self.signal),
+                past, self.tried, self.method, told=self.told, foresight=foresight,
                 seed=report.seed, progress=report.watch, once=keeping.once,
             )  # fmt: skip
         best = best_of(attempts)
         how = best.states.embedding.how
-        if how != "hidden" and any(each.how == "hidden" for each in self.tried):
+        if (
+            how != "hidden"
+            and not foresight.is_linear
+            and any(each.how == "hidden" for each in self.tried)
+        ):
             report.say(NOT_EXPLAINED)
         if how in ("derivative", "delays") and (hint := lost_mean(signal)):
             report.warn(hint)
