@@ -171,12 +171,6 @@ def test_a_run_that_diverges_is_not_a_number_and_counts_as_such() -> None:
     assert quantiles(runs, [0.5])[0, -1, 0] == pytest.approx(0.125, rel=1e-4)
 
 
-def test_where_the_mean_cycle_is_nearer_it_is_said() -> None:
-    slow = replace(SPRING, coef=0.97 * SPRING.coef)
-    skill = ep.model.forecast_skill(slow, spring(0.02), n_fitted=900, starts=20)
-    assert "the mean cycle, going on, is nearer" in skill.text
-
-
 def test_a_gap_is_no_obstacle() -> None:
     run = spring(0.05)
     kept = np.delete(np.arange(1200), slice(500, 560))

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from ep2sindy.data.gaps import between_gaps, usual_step
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.model.draws import draw_normal
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.spectrum import crossing_frequency, dominant_frequency
 
@@ -83,9 +84,9 @@ def root_mean(squared: Float[np.ndarray, "starts ahead"]) -> Float[np.ndarray, "
     return np.sqrt(squared.mean(axis=0))
 
 
-def measured_part(run: Trajectory, names: Sequence[str]) -> Trajectory:
-    """A record's measured states, with all its inputs, which every baseline may know ahead."""
-    return replace(run, states=run.columns(names), state_names=tuple(names), missing=None)
+def measured_part(run: Trajectory, names: Sequence[str], inputs: Sequence[str]) -> Trajectory:
+    """A record's measured states, with the inputs that every baseline may know ahead."""
+    return Trajectory(run.t, run.columns(names), names, run.columns(inputs), inputs)
 
 
 def baseline_errors(
@@ -100,7 +101,7 @@ def baseline_errors(
     Raises ValueError for parts that are too short.
     """
     check_fitted(run, n_fitted)
-    own = measured_part(run, names)
+    own = measured_part(run, names, run.input_names)
     first = spread_starts(own.t, n_fitted, longest, starts)
     truth = np.stack([own.states[k : k + longest] for k in first])
     scale = zero_to_one(own.states[n_fitted:].std(axis=0))
@@ -227,20 +228,42 @@ class Autoregression:
         return len(self.coef)
 
     def ahead(self, past: np.ndarray, t: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        return self._paths(past, t, inputs, np.zeros((1, 1, 1)))[0]
+
+    def draws(
+        self, past: np.ndarray, t: np.ndarray, inputs: np.ndarray, n: int, rng: np.random.Generator
+    ) -> Float[np.ndarray, "draws ahead n_states"]:
+        """Forecasts that are moved at every step as much as the residuals say."""
+        n_steps = len(_grid_around(t, len(past), self.step_s, 0))
+        none = np.zeros(len(self.constant))
+        moves = draw_normal(none, self.residual, n * n_steps, rng)
+        return self._paths(past, t, inputs, moves.reshape(n, n_steps, -1))
+
+    def _paths(
+        self,
+        past: np.ndarray,
+        t: np.ndarray,
+        inputs: np.ndarray,
+        moves: Float[np.ndarray, "draws _ _"],
+    ) -> Float[np.ndarray, "draws ahead n_states"]:
+        """Forecasts with these moves at every step."""
         grid = _grid_around(t, len(past), self.step_s, self.order)
+        shape = (len(moves), len(t) - len(past), past.shape[1])
         if grid[0] < t[0] - 0.5 * self.step_s:
-            return np.full((len(t) - len(past), past.shape[1]), np.nan)
+            return np.full(shape, np.nan)
         path, drive = _on_grid(grid, t[: len(past)], past), _on_grid(grid, t, inputs)
         if self.least is not None:
             path = np.log(np.where(path > 0.0, path, self.least))
+        paths = np.repeat(path[None], len(moves), axis=0)
+        moves = np.broadcast_to(moves, (len(moves), len(grid) - self.order, shape[2]))
         for k in range(self.order, len(grid)):
             driven = np.einsum("lij,lj->i", self.drive, drive[k - self.order : k + 1][::-1])
-            own = np.einsum("lij,lj->i", self.coef, path[k - self.order : k][::-1])
-            path[k] = self.constant + own + driven
+            own = np.einsum("lij,klj->ki", self.coef, paths[:, k - self.order : k][:, ::-1])
+            paths[:, k] = self.constant + own + driven + moves[:, k - self.order]
         if self.least is not None:
             with np.errstate(over="ignore"):  # an unstable one grows without bounds
-                path = np.exp(path)
-        return _on_grid(t[len(past) :], grid, path)
+                paths = np.exp(paths)
+        return np.stack([_on_grid(t[len(past) :], grid, each) for each in paths])
 
 
 def _fit_autoregression(
@@ -380,7 +403,8 @@ class Neighbours:
             [np.arange(begin + back[0], end - longest) for begin, end in pairwise(begins)]
         )
         values = np.concatenate(self.stretches)
-        return values[place[:, None] - back].reshape(len(place), -1), place, values
+        size = len(back) * values.shape[1]
+        return values[place[:, None] - back].reshape(len(place), size), place, values
 
     def _errors(self, apart: int, longest: int) -> dict[int, float]:
         """Mean square error over horizons up to `apart`, by the number of neighbours."""

@@ -216,8 +216,8 @@ class Evaluation:
 
     @cached_property
     def forecast(self) -> ForecastSkill | None:
-        """Skill of forecasts of the held-out part; None without it, or for a driven model."""
-        return None if self.forecasts is None or self.model.inputs else self.forecasts()
+        """Skill of forecasts of the held-out part; None without it."""
+        return None if self.forecasts is None else self.forecasts()
 
     @property
     def caution(self) -> str:
@@ -271,6 +271,7 @@ class Evaluation:
         )
         phase = f"in phase for {self.periods:.3g} periods; {self.phase_end:+.2g} periods at the end"
         found = [
+            ("forecasts", "" if self.forecast is None else self.forecast.text),
             ("status", self.text),
             ("frequency", _listed(frequencies) + error),
             ("amplitude ratio", _listed(_texts(self.amplitude_ratio))),
@@ -279,7 +280,6 @@ class Evaluation:
             ("phase", phase if np.isfinite(self.phase_end) else ""),
             ("cycle", cycle or ""),
             *(("rests at", self._rest_text(rest)) for rest in self.rest_points[:N_SHOWN]),
-            ("forecasts", "" if self.forecast is None else self.forecast.text),
             ("lack of fit", self.lack_of_fit),
         ]
         return [(name, value) for name, value in found if value]
