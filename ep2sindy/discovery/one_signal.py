@@ -48,7 +48,7 @@ MAX_FITTED = 3000  # samples from the end of the fitted part that a search for h
 
 # Samples and periods at its end on which hidden states are searched first: a law of more samples is
 # one of these, too.
-FIRST_PART, FIRST_PERIODS = 600, 8.0
+FIRST_PART, FIRST_PERIODS = 300, 8.0
 
 EXPLAINED = "their equations explain the signal to its noise"
 
@@ -57,7 +57,7 @@ MIN_JUDGED = 1.5  # periods that a held-out part must have
 
 
 @dataclass(frozen=True)
-class Told:
+class ToldFacts:
     """What is known of the equations of a signal and its states, beside what these are.
 
     exclude: state -> terms that its equation does not have. relations: between coefficients, as
@@ -112,7 +112,7 @@ class Preparation:
         Embedding(own, self.n_states, self.harmonics)  # refuses settings that no embedding has
 
     def search(
-        self, past: Trace, method: AnyMethod, told: Told, *, seed: int, progress: Progress,
+        self, past: Trace, method: AnyMethod, told: ToldFacts, *, seed: int, progress: Progress,
         once: Once,
     ) -> tuple[Embedded, Discovery]:  # fmt: skip
         """The states, and their equations. method: of smoothed states."""
@@ -134,11 +134,11 @@ class Preparation:
         )
         return states, once(partial(search, progress=progress))
 
-    def _library(self, states: Embedded, functions: Sequence[str], told: Told) -> Library:
+    def _library(self, states: Embedded, functions: Sequence[str], told: ToldFacts) -> Library:
         return told.add_to(states.library(self.degree, functions, self.function_degree), states)
 
     def _misfit(
-        self, states: Embedded, method: AnyMethod, told: Told, functions: Sequence[str]
+        self, states: Embedded, method: AnyMethod, told: ToldFacts, functions: Sequence[str]
     ) -> float:
         """Share of the derivatives that the largest candidates leave, the product over equations.
 
@@ -206,6 +206,23 @@ class Attempt:
         return [state for state in self.found.model.states if state not in known]
 
     @property
+    def is_damped_line(self) -> bool:
+        """Whether the model is x' = v, v' = a - b x - c v, with b positive and c not negative."""
+        states = self.found.model.states
+        if self.states.embedding.how != "derivative" or len(states) != 2:
+            return False
+        x, v = states
+        terms = self.found.model.terms(v)
+        swings = terms.get(x, 0.0) < 0.0 and terms.get(v, 0.0) <= 0.0
+        return swings and set(terms) <= {"1", x, v}
+
+    @property
+    def process_noise_std(self) -> dict[str, float]:
+        """What moves every state at random over a mean step beside the model, by state, in SI."""
+        process = self.estimator.noise.process.tolist()
+        return dict(zip(self.found.model.states, process, strict=True))
+
+    @property
     def noise_std(self) -> float:
         """Standard deviation of the noise in the signal, in its unit."""
         if not self.states.hidden:
@@ -216,7 +233,7 @@ class Attempt:
 
 def try_in_turn(
     past: Trace, tried: Sequence[Preparation], method: AnyMethod, *,
-    told: Told | None = None, foresight: Foresight | None = None,
+    told: ToldFacts | None = None, foresight: Foresight | None = None,
     seed: int = 0, progress: Progress = SILENT, once: Once = at_once,
 ) -> list[Attempt]:  # fmt: skip
     """Find a model of a signal by each preparation that can pay.
@@ -225,18 +242,18 @@ def try_in_turn(
     when it is run freely where it was fitted. They are left out otherwise, unless nothing else is
     tried. A law of all samples is one of a part of them, so a part is searched first. More than two
     states are tried only of a signal that does not repeat itself: one of two states either repeats
-    itself or spirals. Of a signal that is linear as far as it is foreseen, the first smoothed
-    states alone are tried. method: of the search in smoothed states; what runs models judges them
-    by the signal, and as far ahead as it is foreseen. told: of the equations. foresight: see
-    `foresee`. once: does each search, or takes it from a run that was broken off.
+    itself or spirals. Of a signal that is linear as far as it is foreseen, linear equations of the
+    first smoothed states alone are tried. method: of the search in smoothed states; what runs
+    models judges them by the signal, and as far ahead as it is foreseen. told: of the equations.
+    foresight: see `foresee`. once: does each search, or takes it from a run that was broken off.
     """
-    told, foresight = told or Told(), foresight or foresee(past)
+    told, foresight = told or ToldFacts(), foresight or foresee(past)
     smoothed = [each for each in tried if each.how != "hidden"]
     if past.cycle is not None and past.cycle.share >= REPEATS:
         tried = [each for each in tried if each.n_states == 2] or tried
         foresight = Foresight()
-    elif foresight.is_linear:
-        tried = smoothed[:1] or tried
+    elif foresight.is_linear and smoothed:
+        tried = [replace(smoothed[0], degree=1, functions=())]
     method, part = judged_by(method, past.name, foresight.ahead), end_of_periods(past)
     attempts, left_out = [], []
     for each in tried:

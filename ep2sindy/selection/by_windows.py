@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.evaluation import evaluate
 from ep2sindy.model.inputs import curve_through
 from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.model import SparseModel
@@ -66,7 +67,8 @@ class WindowsLeftOut:
 
     ahead: number of samples for which a record can be foreseen; None for one and a half periods.
     runs: the records between their gaps. spread: standard deviation of each state over all runs.
-    n_windows: that are judged, over all records, each in one fold.
+    n_windows: that are judged, over all records, each in one fold. judged: states that tell whether
+    a run goes on like its record; None for all.
     """
 
     runs: Sequence[Trajectory]
@@ -75,6 +77,7 @@ class WindowsLeftOut:
     n_windows: int
     n_folds: int
     ahead: int | None = None
+    judged: Sequence[str] | None = None
     n_reweights = 1
 
     @property
@@ -170,9 +173,15 @@ class WindowsLeftOut:
         return np.column_stack([shares, unknown, unknown, errors, errors])
 
     def confirm(self, trial: Trial, model: SparseModel) -> Confirmed:
-        """A system is confirmed if its coefficients, refined on all data, meet the demands."""
-        broken = trial.system.broken(model)
-        return Confirmed(trial, model, broken, share=float(not broken))
+        """A system is confirmed if its coefficients, refined on all data, meet the demands.
+
+        Systems that are alike as far as the records are foreseen must also go on like the longest.
+        """
+        demands, goes_on = trial.system.broken(model), True
+        if self.ahead is not None:
+            longest = max(self.runs, key=lambda each: float(np.ptp(each.t)))
+            goes_on = evaluate(model, longest, judged=self.judged).is_similar
+        return Confirmed(trial, model, demands, share=float(goes_on and not demands))
 
 
 def _residuals(

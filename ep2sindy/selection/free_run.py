@@ -189,7 +189,7 @@ class FreeRunScore:
             return CycleRuns(self, runs, parts, smoothed, cycles, self.bounds), ""
         pieces = [piece for run in runs for piece in run.stretches(2 * MIN_SAMPLES)]
         spread, reason = np.concatenate(smoothed).std(axis=0), f"{cycles}: " if cycles else ""
-        windows = self.n_windows, self.n_folds, self.ahead
+        windows = self.n_windows, self.n_folds, self.ahead, self.judged
         return WindowsLeftOut(pieces, spread, states, *windows), reason
 
     def _try(

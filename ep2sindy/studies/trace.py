@@ -22,7 +22,7 @@ from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.one_signal import (
     Attempt,
     Preparation,
-    Told,
+    ToldFacts,
     best_of,
     fit_offset,
     fitted_part,
@@ -30,7 +30,9 @@ from ep2sindy.discovery.one_signal import (
     try_in_turn,
 )
 from ep2sindy.figures.living import free_run_figure
+from ep2sindy.forecasting.baselines import AUTOREGRESSION
 from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.forecasting.skill import MODEL, ForecastSkill
 from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
@@ -53,8 +55,14 @@ NOT_EXPLAINED = (
 
 LINEAR = (
     "nothing beyond a linear autoregression is foreseen, not even for a quarter of a turn: no "
-    "equations of a few states explain that, and only the first smoothed states are tried"
+    "equations of a few states explain that, and only linear ones are tried"
 )
+
+AR_2 = (
+    "what noise drives about a line at one frequency forecasts as well as any autoregression: the "
+    "frequency, the damping and the size of the noise are all there is, and an AR(2) says all"
+)
+AS_WELL = 1.15  # largest ratio of two errors of forecasts that count as equal
 
 ERRORS = (
     "Forecasts: up to a period, where the model was fitted, in standard deviations. Unexplained: "
@@ -76,7 +84,7 @@ class Study:
     are taken; of more than two states, only for a signal that does not repeat itself.
     decimate, detrend: see `prepare_signal`. held_out: the share at the end of the record that is
     not fitted and serves as the test. keep: whether a run goes on with the finished searches of one
-    that was broken off. exclude, relations, rests_at_zero: known of the equations, see `Told`.
+    that was broken off. exclude, relations, rests_at_zero: known of the equations, see `ToldFacts`.
     """
 
     source: Source
@@ -98,12 +106,12 @@ class Study:
             raise ValueError(f"offset must be a number or fit: {self.offset!r} came")
 
     @property
-    def told(self) -> Told:
+    def told(self) -> ToldFacts:
         """What is known of the equations."""
         barred = {
             state: [str(name) for name in names] for state, names in (self.exclude or {}).items()
         }
-        return Told(barred, self.relations, self.rests_at_zero)
+        return ToldFacts(barred, self.relations, self.rests_at_zero)
 
     def run(self, report: Report) -> None:
         data = self._sampled(report)
@@ -129,6 +137,8 @@ class Study:
             report.warn(hint)
         states, free = run_on_rest(signal, best, progress=report.watch)
         skill = free.forecast
+        if best.is_damped_line and skill is not None and _equals_linear(skill):
+            report.say(AR_2)
         where = "its end, which was not fitted" if skill else "all of it, too short to hold out"
         report.found(
             found_model(
@@ -184,6 +194,15 @@ class Study:
         return replace(sampled, states=sampled.states + known)
 
 
+def _equals_linear(skill: ForecastSkill) -> bool:
+    """Whether a model forecasts half a turn as well as an autoregression, but no better."""
+    early = skill.horizons_s <= 0.5 * skill.period_s
+    if AUTOREGRESSION not in skill.nrmse or not early.any():
+        return False
+    ratio = skill.nrmse[MODEL][early].mean() / skill.nrmse[AUTOREGRESSION][early].mean()
+    return bool(1.0 / AS_WELL < ratio < AS_WELL)
+
+
 def lost_mean(signal: Trace) -> str | None:
     """A message if the signal is one-sided pulses about a mean of zero; otherwise None."""
     away = signal.x - np.median(signal.x)
@@ -227,6 +246,7 @@ def _add_signal(
     too_fast = "" if embedding.how == "hidden" else ", and what is too fast to be followed"
     share = 100.0 * best.noise_std / signal.x.std()
     noise = f"{best.noise_std:.3g} {signal.unit}".removesuffix(" 1")
+    moves = ", ".join(f"{state} by {size:.2g}" for state, size in best.process_noise_std.items())
     exact = ", ".join(f"{state}' = {term.replace('*', ' ')}" for state, term in known.items())
     report.section(
         f"The signal {signal.name}",
@@ -235,6 +255,7 @@ def _add_signal(
         f"states: {embedding.says}, {', '.join(states.state_names)} ({best.states.reason})"
         f"{'; known: ' if exact else ''}{exact}",
         f"noise{too_fast}: {noise}, {share:.2g} % of the standard deviation",
+        f"process noise, which moves the states at random beside the model in a step: {moves} (SI)",
         *signal.done,
     )
     chosen = [attempts.index(best)]
@@ -254,6 +275,7 @@ def _add_signal(
         "reason": best.states.reason,
         "known": dict(known),
         "noise_std": best.noise_std,
+        "process_noise_std": best.process_noise_std,
         "misfit": best.found.misfit,
         "note": best.found.note,
     }
