@@ -50,6 +50,10 @@ MAX_FITTED = 3000  # samples from the end of the fitted part that a search for h
 # one of these, too.
 FIRST_PART, FIRST_PERIODS = 300, 8.0
 
+# Fewest samples ahead at which models with nonlinear terms are compared: over fewer, what smoothing
+# does to the derivatives counts for more than the law.
+LEAST_AHEAD = 10
+
 EXPLAINED = "their equations explain the signal to its noise"
 
 MIN_FITTED = 4.0  # periods that a fitted part must have
@@ -254,6 +258,8 @@ def try_in_turn(
         foresight = Foresight()
     elif foresight.is_linear and smoothed:
         tried = [replace(smoothed[0], degree=1, functions=())]
+    elif (foresight.ahead or 0) < LEAST_AHEAD:
+        foresight = Foresight()
     method, part = judged_by(method, past.name, foresight.ahead), end_of_periods(past)
     attempts, left_out = [], []
     for each in tried:
