@@ -13,7 +13,7 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import judge_noise
-from ep2sindy.discovery.method import TrajectorySearch
+from ep2sindy.discovery.method import TrajectorySearch, of_means
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, join_points
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.operating.law import LawFunctions
@@ -22,6 +22,7 @@ from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count, check_kind
+from ep2sindy.signals.averaging import average_long
 
 
 @one_thread()
@@ -35,6 +36,7 @@ def discover(
     hidden: Sequence[str] | int = (),
     t: object = None,
     inputs: Sequence[str] = (),
+    decimate: int | str | None = "auto",
     seed: int | np.random.Generator = 0,
     workers: Workers | None = None,
     progress: Progress | bool = False,
@@ -49,8 +51,10 @@ def discover(
     `known` and `with_roles`. None means every product of the first run's variables and of hidden
     states up to degree 2. method: None means TrajectorySearch(), the best method we know for noisy
     data. hidden: names of states that nobody measured, or their number, for states h, or h1, h2,
-    ...; they and their equations are found with the others', by a `TrajectorySearch`. progress:
-    True shows bars.
+    ...; they and their equations are found with the others', by a `TrajectorySearch`. decimate:
+    number of samples that are replaced by their mean; "auto" leaves a hundred to a period of
+    records of over 20,000 samples together, and says so; None takes all samples. progress: True
+    shows bars.
 
     Runs whose `parameters` differ are of several operating points, and each point is searched
     alone, by the workers; `points` of the result holds what was found there. shared: True finds one
@@ -75,6 +79,9 @@ def discover(
     """
     method = method or TrajectorySearch()
     trajectories = trajectories_of(runs, t=t, inputs=inputs, partial=True)
+    trajectories, averaged = average_long(trajectories, decimate)
+    if averaged and isinstance(method, TrajectorySearch):
+        method = of_means(method)
     names = trajectories[0].names
     hidden = _hidden_names(hidden, names)
     library = polynomial(list(dict.fromkeys([*names, *hidden]))) if library is None else library
@@ -83,15 +90,18 @@ def discover(
     rng, watch = np.random.default_rng(seed), as_progress(progress)
     together = shared or law is not None
     if not together and all(run.parameters == task.runs[0].parameters for run in task.runs):
-        return _discover_point((task, rng), method=method, progress=watch)
+        found = _discover_point((task, rng), method=method, progress=watch)
+        return replace(found, remarks=(*found.remarks, *averaged))
     points = group_by_point(task.runs, [v for v in library.variables if v not in hidden])
     if together:
-        return _discover_together(task, points, method, law, rng, watch)
+        found = _discover_together(task, points, method, law, rng, watch)
+        return replace(found, remarks=(*found.remarks, *averaged))
     tasks = [replace(task, runs=own) for own in points.values()]
     pieces = list(zip(tasks, rng.spawn(len(tasks)), strict=True))
     stage = watch.stage(len(pieces), "point", "discovery")
-    found = collect(workers or Serial(), partial(_discover_point, method=method), pieces, stage)
-    return join_points(dict(zip(points, found, strict=True)), values_of(points))
+    each = collect(workers or Serial(), partial(_discover_point, method=method), pieces, stage)
+    found = join_points(dict(zip(points, each, strict=True)), values_of(points))
+    return replace(found, remarks=(*found.remarks, *averaged))
 
 
 def _hidden_names(hidden: Sequence[str] | int, taken: Sequence[str]) -> Sequence[str]:

@@ -344,6 +344,14 @@ def _limits(runs: Sequence[Trajectory]) -> tuple[str, ...]:
     return tuple(f"{each}: {way_out}" for each in words)
 
 
+def of_means(method: AnyMethod) -> AnyMethod:
+    """A method for samples that are means: those of an input that is held change linearly."""
+    if not isinstance(method, TrajectorySearch) or not method.courses:
+        return method
+    courses = {n: "linear" if how == "held" else how for n, how in method.courses.items()}
+    return replace(method, courses=courses)
+
+
 def method_of(
     formulation: Formulation,
     search: TrajectorySearch | Search,

@@ -9,8 +9,8 @@ not known of a signal is found here too: its lost offset, and numbers inside fun
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -19,6 +19,7 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.foresight import Foresight, foresee
 from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.problem import FIRST_MAX_TERMS
@@ -26,8 +27,9 @@ from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.forecasting.forecast import calibrate
 from ep2sindy.forecasting.skill import MODEL, forecast_skill
 from ep2sindy.forecasting.state_estimation import StateEstimator, estimate_states, tune_estimator
-from ep2sindy.library.library import polynomial
+from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.names import number_text
+from ep2sindy.library.relations import relations_of
 from ep2sindy.model.comparison import REPEATS, SPIRALS
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Once, at_once
@@ -44,10 +46,53 @@ DEPTH_OF_BOTH = 2
 
 MAX_FITTED = 3000  # samples from the end of the fitted part that a search for hidden states sees
 
+# Samples and periods at its end on which hidden states are searched first: a law of more samples is
+# one of these, too.
+FIRST_PART, FIRST_PERIODS = 300, 8.0
+
+# Fewest samples ahead at which models with nonlinear terms are compared: over fewer, what smoothing
+# does to the derivatives counts for more than the law.
+LEAST_AHEAD = 10
+
 EXPLAINED = "their equations explain the signal to its noise"
 
 MIN_FITTED = 4.0  # periods that a fitted part must have
 MIN_JUDGED = 1.5  # periods that a held-out part must have
+
+
+@dataclass(frozen=True)
+class ToldFacts:
+    """What is known of the equations of a signal and its states, beside what these are.
+
+    exclude: state -> terms that its equation does not have. relations: between coefficients, as
+    for `Library.relate`. rests_at_zero: whether a signal that is zero and does not change stays so:
+    no equation of its derivatives then has a term that is not zero there. States and terms that a
+    preparation lacks are passed over.
+    """
+
+    exclude: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    relations: Sequence[str] = ()
+    rests_at_zero: bool = False
+
+    def add_to(self, library: Library, states: Embedded) -> Library:
+        """The library of some states, with what is known of them."""
+        barred = {
+            state: [str(term) for term in terms if str(term) in library.names]
+            for state, terms in self.exclude.items()
+            if state in states.names and state not in states.known
+        }
+        if self.rests_at_zero and states.embedding.how == "derivative":
+            with np.errstate(all="ignore"):
+                at_rest = library.evaluate(np.zeros((1, len(library.variables))))[0]
+            moving = [n for n, value in zip(library.names, at_rest, strict=True) if value != 0.0]
+            for state in (s for s in states.names if s not in states.known):
+                barred[state] = [*barred.get(state, ()), *moving]
+        held = [
+            relation
+            for relation in relations_of(self.relations)
+            if all(s in states.names and t in library.names for _, s, t in relation.factors)
+        ]
+        return library.exclude(barred).relate(*held)
 
 
 @dataclass(frozen=True)
@@ -71,8 +116,9 @@ class Preparation:
         Embedding(own, self.n_states, self.harmonics)  # refuses settings that no embedding has
 
     def search(
-        self, past: Trace, method: AnyMethod, *, seed: int, progress: Progress, once: Once
-    ) -> tuple[Embedded, Discovery]:
+        self, past: Trace, method: AnyMethod, told: ToldFacts, *, seed: int, progress: Progress,
+        once: Once,
+    ) -> tuple[Embedded, Discovery]:  # fmt: skip
         """The states, and their equations. method: of smoothed states."""
         make = partial(embed, past, n_states=self.n_states, harmonics=self.harmonics)
         with progress.stage(None, "", f"{self.n_states} states of the signal"):
@@ -80,17 +126,24 @@ class Preparation:
         run, functions = states.run, self.functions
         if any(FITTED in text for text in functions):
             smoothed = make() if states.hidden else states
-            off = partial(self._misfit, smoothed, method)
+            off = partial(self._misfit, smoothed, method, told)
             functions = fit_functions(functions, smoothed.run, off)
         if states.hidden:
             run, method = end_of(run), by_trajectories(method)
         elif not states.known:
             method = replace(method, depth=min(method.depth, DEPTH_OF_BOTH))
-        library = states.library(self.degree, functions, self.function_degree)
-        search = partial(discover, run, library, method, hidden=states.hidden, seed=seed)
+        library = self._library(states, functions, told)
+        search = partial(
+            discover, run, library, method, hidden=states.hidden, decimate=None, seed=seed
+        )
         return states, once(partial(search, progress=progress))
 
-    def _misfit(self, states: Embedded, method: AnyMethod, functions: Sequence[str]) -> float:
+    def _library(self, states: Embedded, functions: Sequence[str], told: ToldFacts) -> Library:
+        return told.add_to(states.library(self.degree, functions, self.function_degree), states)
+
+    def _misfit(
+        self, states: Embedded, method: AnyMethod, told: ToldFacts, functions: Sequence[str]
+    ) -> float:
         """Share of the derivatives that the largest candidates leave, the product over equations.
 
         Infinite for functions that cannot be used on the states.
@@ -98,7 +151,7 @@ class Preparation:
         if isinstance(method, TrajectorySearch):
             method = Regression(search=BestSubset(max_terms=method.max_terms or FIRST_MAX_TERMS))
         try:
-            library = states.library(self.degree, functions, self.function_degree)
+            library = self._library(states, functions, told)
             equations = method.search_equations(Task([states.run], library), rng=0)
         except ValueError:
             return float("inf")
@@ -126,8 +179,13 @@ class Attempt:
 
     @staticmethod
     def of(
-        preparation: Preparation, states: Embedded, found: Discovery, progress: Progress
+        preparation: Preparation,
+        states: Embedded,
+        found: Discovery,
+        progress: Progress,
+        ahead: int | None = None,
     ) -> Attempt:
+        """Count the errors of forecasts. ahead: samples for which the signal is foreseen."""
         past, run, share = states.signal, states.run, float("nan")
         with progress.stage(None, "", "forecasts where it was fitted"):
             if states.hidden:
@@ -135,10 +193,11 @@ class Attempt:
             else:
                 share = unexplained(states)
             samples = complete_states(past, run)
+            longest_s = min(past.period_s, np.inf if ahead is None else ahead * past.run.dt_s)
             estimator = tune_estimator(found.model, samples, measured=[past.name])
             skill = forecast_skill(
                 found.model, past.run, n_fitted=len(past.t) // 2, starts=N_TRIED,
-                horizon_s=past.period_s, states_of=states.along, n_draws=N_DRAWS_TRIED,
+                horizon_s=longest_s, states_of=states.along, n_draws=N_DRAWS_TRIED,
                 estimator=estimator,
             )  # fmt: skip
         error = float(skill.nrmse[MODEL].mean())
@@ -151,6 +210,23 @@ class Attempt:
         return [state for state in self.found.model.states if state not in known]
 
     @property
+    def is_damped_line(self) -> bool:
+        """Whether the model is x' = v, v' = a - b x - c v, with b positive and c not negative."""
+        states = self.found.model.states
+        if self.states.embedding.how != "derivative" or len(states) != 2:
+            return False
+        x, v = states
+        terms = self.found.model.terms(v)
+        swings = terms.get(x, 0.0) < 0.0 and terms.get(v, 0.0) <= 0.0
+        return swings and set(terms) <= {"1", x, v}
+
+    @property
+    def process_noise_std(self) -> dict[str, float]:
+        """What moves every state at random over a mean step beside the model, by state, in SI."""
+        process = self.estimator.noise.process.tolist()
+        return dict(zip(self.found.model.states, process, strict=True))
+
+    @property
     def noise_std(self) -> float:
         """Standard deviation of the noise in the signal, in its unit."""
         if not self.states.hidden:
@@ -161,29 +237,65 @@ class Attempt:
 
 def try_in_turn(
     past: Trace, tried: Sequence[Preparation], method: AnyMethod, *,
+    told: ToldFacts | None = None, foresight: Foresight | None = None,
     seed: int = 0, progress: Progress = SILENT, once: Once = at_once,
 ) -> list[Attempt]:  # fmt: skip
-    """Find a model of a signal by each preparation.
+    """Find a model of a signal by each preparation that can pay.
 
     Hidden states end the list if their model explains the signal to its noise, and stays with it
     when it is run freely where it was fitted. They are left out otherwise, unless nothing else is
-    tried. More than two states are tried only of a signal that does not repeat itself: one of two
-    states either repeats itself or spirals. method: of the search in smoothed states. once: does
-    each search, or takes it from a run that was broken off.
+    tried. A law of all samples is one of a part of them, so a part is searched first. More than two
+    states are tried only of a signal that does not repeat itself: one of two states either repeats
+    itself or spirals. Of a signal that is linear as far as it is foreseen, linear equations of the
+    first smoothed states alone are tried. method: of the search in smoothed states; what runs
+    models judges them by the signal, and as far ahead as it is foreseen. told: of the equations.
+    foresight: see `foresee`. once: does each search, or takes it from a run that was broken off.
     """
+    told, foresight = told or ToldFacts(), foresight or foresee(past)
+    smoothed = [each for each in tried if each.how != "hidden"]
     if past.cycle is not None and past.cycle.share >= REPEATS:
         tried = [each for each in tried if each.n_states == 2] or tried
+        foresight = Foresight()
+    elif foresight.is_linear and smoothed:
+        tried = [replace(smoothed[0], degree=1, functions=())]
+    elif (foresight.ahead or 0) < LEAST_AHEAD:
+        foresight = Foresight()
+    method, part = judged_by(method, past.name, foresight.ahead), end_of_periods(past)
     attempts, left_out = [], []
     for each in tried:
-        states, found = each.search(past, method, seed=seed, progress=progress, once=once)
+        search = partial(
+            each.search, method=method, told=told, seed=seed, progress=progress, once=once
+        )
+        if each.how == "hidden" and smoothed and part is not past and search(part)[1].misfit:
+            continue
+        states, found = search(past)
         if not states.hidden:
-            attempts.append(Attempt.of(each, states, found, progress))
+            attempts.append(Attempt.of(each, states, found, progress, foresight.ahead))
         elif explains(found, past.name):
             states = replace(states, reason=EXPLAINED)
-            return [Attempt.of(each, states, found, progress)]
+            return [Attempt.of(each, states, found, progress, foresight.ahead)]
         else:
             left_out.append((each, states, found))
-    return attempts or [Attempt.of(*left_out[-1], progress)]
+    return attempts or [Attempt.of(*left_out[-1], progress, foresight.ahead)]
+
+
+def judged_by(method: AnyMethod, signal: str, ahead: int | None) -> AnyMethod:
+    """The method; models that are run are judged by the signal, of which other states are made."""
+    if not isinstance(method, Regression) or method.selection.basis != "runs":
+        return method
+    from ep2sindy.selection.free_run import FreeRunScore  # loads torch, only for this rule
+
+    rule = method.selection
+    if not isinstance(rule, FreeRunScore):
+        return method
+    judged = rule.judged or (signal,)
+    return replace(method, selection=replace(rule, judged=judged, ahead=rule.ahead or ahead))
+
+
+def end_of_periods(past: Trace) -> Trace:
+    """The last periods of a signal, on which a search for hidden states is tried first."""
+    n, wanted = len(past.t), max(FIRST_PART, round(FIRST_PERIODS * past.per_period))
+    return past if 2 * wanted > min(n, MAX_FITTED) else past.window(n - wanted, n)
 
 
 def best_of(attempts: Sequence[Attempt]) -> Attempt:

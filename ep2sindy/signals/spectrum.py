@@ -136,6 +136,17 @@ def crossing_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " 
     return float(np.sqrt((np.square(frequency) * excess).sum() / whole)) if whole else 0.0
 
 
+def lost_in_means(
+    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], *, width_s: float
+) -> float:
+    """Share of a signal's power above the noise that means over a width in s take from it."""
+    frequency, power = power_spectrum(t, x)
+    excess = _above_noise(power)
+    taken = np.square(1.0 - np.sinc(frequency * width_s))
+    whole = float(excess.sum())
+    return float((taken * excess).sum()) / whole if whole else 0.0
+
+
 def signal_memory_s(
     t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], *, kept: float
 ) -> float:

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.gaps import between_gaps, mean_step
+from ep2sindy.data.gaps import mean_step
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import Clock
 from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
+from ep2sindy.signals.averaging import average_alike
 from ep2sindy.signals.spectrum import (
     crossing_frequency,
     dominant_frequency,
@@ -23,12 +24,6 @@ MIN_PERIODS = 6.0  # fewest periods in a record on which a free run can be judge
 
 # Fewest samples per period: three harmonics. A signal that is sampled more rarely is aliased.
 MIN_SAMPLES = 6.0
-
-# Samples per period that resolve a breathing mode; more samples cost time and follow the noise.
-ENOUGH_SAMPLES = 100
-
-# Samples of the first look at a long record, which finds out how many may be averaged.
-FIRST_LOOK = 50_000
 
 # Least standard deviation of the waveform, as a share of the signal's, if there is a cycle. A cycle
 # found in white noise also has some.
@@ -136,38 +131,31 @@ def prepare_signal(
     name = run.state_names[0] if signal is None and len(run.state_names) == 1 else signal
     if name is None:
         raise ValueError(f"one signal must be named: this run has {list(run.names)}")
-    _check_settings(decimate, detrend)
-    t, x = run.t, run.columns([name])[:, 0]
-    t, evened = _restore_even_times(t)
-    t, x, averaged = _average(t, x, decimate)
-    cycle = find_cycle(t, x[:, None])
-    x, straightened, drifting = _remove_drift(t, x, name, cycle, detrend)
-    cycle = find_cycle(t, x[:, None]) if straightened else cycle
-    if cycle is not None and cycle.std[0] < MIN_VISIBLE * x.std():
-        cycle = None
-    frequency_Hz = crossing_frequency(t, x) if cycle is None else cycle.frequency_Hz
+    if not (isinstance(detrend, bool) or detrend == "auto"):
+        raise ValueError(f"detrend must be auto, true or false: got {detrend!r}")
+    t, evened = _restore_even_times(run.t)
     own = Trajectory(
         t=t,
-        states=x[:, None],
+        states=run.columns([name]),
         state_names=(name,),
         units={name: run.units[name]},
         label=name,
         clock=run.clock,
         parameters=run.parameters,
     )
+    (own,), averaged = average_alike([own], decimate)
+    t, x = own.t, own.states[:, 0]
+    cycle = find_cycle(t, x[:, None])
+    x, straightened, drifting = _remove_drift(t, x, name, cycle, detrend)
+    cycle = find_cycle(t, x[:, None]) if straightened else cycle
+    if cycle is not None and cycle.std[0] < MIN_VISIBLE * x.std():
+        cycle = None
+    frequency_Hz = crossing_frequency(t, x) if cycle is None else cycle.frequency_Hz
+    own = replace(own, states=x[:, None])
     done = (*evened, *straightened, *averaged)
     found = Trace(own, frequency_Hz, cycle, done, drifting)
     _check_oscillation(found)
     return found
-
-
-def _check_settings(decimate: object, detrend: object) -> None:
-    if not (decimate is None or decimate == "auto" or (type(decimate) is int and decimate >= 1)):
-        raise ValueError(
-            f"decimate must be auto, null or a whole number, one or more: {decimate!r} came"
-        )
-    if not (isinstance(detrend, bool) or detrend == "auto"):
-        raise ValueError(f"detrend must be auto, true or false: {detrend!r} came")
 
 
 def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> bool:
@@ -198,32 +186,6 @@ def _restore_even_times(t: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     return t, ()
 
 
-def _average(
-    t: np.ndarray, x: np.ndarray, decimate: int | str | None
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Samples replaced by means over neighbours, and what was done, in words."""
-    factor = _count_spare(t, x) if decimate == "auto" else int(decimate or 1)
-    if factor < 2:
-        return t, x, ()
-    pieces = between_gaps(t)
-    t, x = (np.concatenate([_means(each[a:b], factor) for a, b in pieces]) for each in (t, x))
-    return t, x, (f"means over {factor} samples: {len(t)} are left",)
-
-
-def _count_spare(t: np.ndarray, x: np.ndarray) -> int:
-    """Number of samples to average, so that a hundred are left in a period; 1 without a cycle.
-
-    A long record is looked at in means first. If they show too few samples to a period to decide,
-    all samples are taken.
-    """
-    for coarse in dict.fromkeys((max(1, len(t) // FIRST_LOOK), 1)):
-        rough_t, rough_x = _means(t, coarse), _means(x, coarse)
-        cycle = find_cycle(rough_t, rough_x[:, None])
-        if cycle is not None and (per_period := len(rough_t) / cycle.n_periods) > 4 * MIN_SAMPLES:
-            return max(1, int(coarse * per_period // ENOUGH_SAMPLES))
-    return 1
-
-
 def _check_oscillation(signal: Trace) -> None:
     """Raise ValueError for a signal that does not oscillate, or not often or not finely enough."""
     name, clock = signal.name, signal.clock
@@ -251,12 +213,6 @@ def _check_oscillation(signal: Trace) -> None:
             f" its harmonic number {signal.per_period / 2.0:.1f} is aliased to lower "
             "frequencies; sample faster"
         )
-
-
-def _means(values: np.ndarray, factor: int) -> np.ndarray:
-    """Means over `factor` consecutive samples; an incomplete group at the end is dropped."""
-    n = len(values) // factor
-    return values[: n * factor].reshape(n, factor).mean(axis=1)
 
 
 def _remove_drift(

@@ -13,7 +13,7 @@ import xarray as xr
 from ep2sindy.data.quantities import KNOWN_UNITS
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import AnyMethod, Regression
+from ep2sindy.discovery.method import AnyMethod, Regression, of_means
 from ep2sindy.forecasting.evaluation import evaluate
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
@@ -26,6 +26,7 @@ from ep2sindy.report.report import Report
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
+from ep2sindy.signals.averaging import average_long
 from ep2sindy.studies.balance import add_balance, model_balance
 from ep2sindy.studies.candidates import (
     add_candidates,
@@ -101,7 +102,8 @@ class Study:
     share of the record, on which such a model is tested; None means a quarter. forecasts: number of
     starts of forecasts, over the held-out part of a living model, or else over the last quarter of
     the record; zero leaves them out. hidden: states that nobody measured, relations between
-    coefficients, terms that an equation may not have (exclude), and roles, as for `discover`.
+    coefficients, terms that an equation may not have (exclude), roles, and means over
+    samples (decimate), as for `discover`.
     Raises ValueError for hidden states with several libraries or with living, which need samples of
     all states.
     """
@@ -121,6 +123,7 @@ class Study:
     relations: Sequence[str] = ()
     exclude: Terms | None = None
     roles: Roles | None = None
+    decimate: int | str | None = None
 
     def __post_init__(self) -> None:
         if self.hidden and (self.living is not None or len(self.libraries) > 1):
@@ -138,7 +141,10 @@ class Study:
         with report.progress(None, "", "data"):
             fields = self.source.fields()
         cases = self._served_by(fields[0], report)
-        runs = self._records(fields, cases, report)
+        runs, averaged = average_long(self._records(fields, cases, report), self.decimate)
+        method = of_means(self.method) if averaged else self.method
+        for text in averaged:
+            report.say(text)
         # Each case has its own random stream, so that adding a case changes no other.
         streams = np.random.default_rng(report.seed).spawn(len(cases))
         pairs = list(zip(cases.items(), streams, strict=True))
@@ -147,7 +153,7 @@ class Study:
         for (name, case), rng in count_pieces(report.watch, pairs, "library"):
             library = case.library(fields[0], self.source.trajectory, self.hidden)
             results[name] = self._result(
-                runs, library, case.method(self.method), self.thesis.get(name, {}), zones,
+                runs, library, case.method(method), self.thesis.get(name, {}), zones,
                 rng=rng, progress=report.watch,
             )  # fmt: skip
         files = [str(field.attrs.get("file", "")) for field in fields]
@@ -208,7 +214,8 @@ class Study:
         measured = runs[0]
         barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
         known = library.exclude(barred).relate(*self.relations).with_roles(self.roles)
-        found = discover(list(runs), known, method, hidden=self.hidden, seed=rng, progress=progress)
+        search = partial(discover, list(runs), known, method, hidden=self.hidden, decimate=None)
+        found = search(seed=rng, progress=progress)
         runs = runs if found.estimate is None else found.estimate.runs
         s = self.rollout_s
         n_samples = [run.n_samples if s is None else samples_in(run, s) for run in runs]

@@ -17,10 +17,12 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
-from ep2sindy.discovery.method import AnyMethod, Regression
+from ep2sindy.discovery.foresight import foresee
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.one_signal import (
     Attempt,
     Preparation,
+    ToldFacts,
     best_of,
     fit_offset,
     fitted_part,
@@ -28,7 +30,9 @@ from ep2sindy.discovery.one_signal import (
     try_in_turn,
 )
 from ep2sindy.figures.living import free_run_figure
+from ep2sindy.forecasting.baselines import AUTOREGRESSION
 from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.forecasting.skill import MODEL, ForecastSkill
 from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
@@ -40,7 +44,7 @@ from ep2sindy.studies.forecasts import add_forecasts
 from ep2sindy.studies.living import CAPTIONS, add_cycle
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import Source, data_summary, in_unit, only, zone_of
-from ep2sindy.studies.study import A_LIST, Share
+from ep2sindy.studies.study import A_LIST, Share, Terms
 from ep2sindy.studies.views import CYCLE, EVALUATED, EVALUATION, add_samples, found_model
 
 NAME = "trace"  # of the model, in files
@@ -49,23 +53,22 @@ NOT_EXPLAINED = (
     "states are made by smoothing"
 )
 
+LINEAR = (
+    "nothing beyond a linear autoregression is foreseen, not even for a quarter of a turn: no "
+    "equations of a few states explain that, and only linear ones are tried"
+)
+
+AR_2 = (
+    "what noise drives about a line at one frequency forecasts as well as any autoregression: the "
+    "frequency, the damping and the size of the noise are all there is, and an AR(2) says all"
+)
+AS_WELL = 1.15  # largest ratio of two errors of forecasts that count as equal
+
 ERRORS = (
     "Forecasts: up to a period, where the model was fitted, in standard deviations. Unexplained: "
     "share of the next derivative that neighbours in these states leave."
 )
 PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
-
-
-def judged_by(method: AnyMethod, signal: str) -> AnyMethod:
-    """The method; models that are run are judged by the signal, of which other states are made."""
-    if not isinstance(method, Regression) or method.selection.basis != "runs":
-        return method
-    from ep2sindy.selection.free_run import FreeRunScore  # loads torch, only for this rule
-
-    rule = method.selection
-    if not isinstance(rule, FreeRunScore) or rule.judged is not None:
-        return method
-    return replace(method, selection=replace(rule, judged=(signal,)))
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ class Study:
     are taken; of more than two states, only for a signal that does not repeat itself.
     decimate, detrend: see `prepare_signal`. held_out: the share at the end of the record that is
     not fitted and serves as the test. keep: whether a run goes on with the finished searches of one
-    that was broken off.
+    that was broken off. exclude, relations, rests_at_zero: known of the equations, see `ToldFacts`.
     """
 
     source: Source
@@ -94,27 +97,48 @@ class Study:
     held_out: Share
     unit: str | None = None
     keep: bool = True
+    exclude: Terms | None = None
+    relations: Sequence[str] = ()
+    rests_at_zero: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.offset, str) and self.offset != "fit":
             raise ValueError(f"offset must be a number or fit: {self.offset!r} came")
 
+    @property
+    def told(self) -> ToldFacts:
+        """What is known of the equations."""
+        barred = {
+            state: [str(name) for name in names] for state, names in (self.exclude or {}).items()
+        }
+        return ToldFacts(barred, self.relations, self.rests_at_zero)
+
     def run(self, report: Report) -> None:
         data = self._sampled(report)
         with resumed(self.keep, report) as keeping:
             signal = self._prepared(data, keeping.once, report)
+            past = fitted_part(signal, self.held_out)
+            foresight = foresee(past)
+            if foresight.is_linear:
+                report.say(LINEAR)
             attempts = try_in_turn(
-                fitted_part(signal, self.held_out), self.tried, judged_by(self.method, self.signal),
+                past, self.tried, self.method, told=self.told, foresight=foresight,
                 seed=report.seed, progress=report.watch, once=keeping.once,
             )  # fmt: skip
         best = best_of(attempts)
         how = best.states.embedding.how
-        if how != "hidden" and any(each.how == "hidden" for each in self.tried):
+        if (
+            how != "hidden"
+            and not foresight.is_linear
+            and any(each.how == "hidden" for each in self.tried)
+        ):
             report.say(NOT_EXPLAINED)
         if how in ("derivative", "delays") and (hint := lost_mean(signal)):
             report.warn(hint)
         states, free = run_on_rest(signal, best, progress=report.watch)
         skill = free.forecast
+        if best.is_damped_line and skill is not None and _equals_linear(skill):
+            report.say(AR_2)
         where = "its end, which was not fitted" if skill else "all of it, too short to hold out"
         report.found(
             found_model(
@@ -171,6 +195,15 @@ class Study:
         return replace(sampled, states=sampled.states + known)
 
 
+def _equals_linear(skill: ForecastSkill) -> bool:
+    """Whether a model forecasts half a turn as well as an autoregression, but no better."""
+    early = skill.horizons_s <= 0.5 * skill.period_s
+    if AUTOREGRESSION not in skill.nrmse or not early.any():
+        return False
+    ratio = skill.nrmse[MODEL][early].mean() / skill.nrmse[AUTOREGRESSION][early].mean()
+    return bool(1.0 / AS_WELL < ratio < AS_WELL)
+
+
 def lost_mean(signal: Trace) -> str | None:
     """A message if the signal is one-sided pulses about a mean of zero; otherwise None."""
     away = signal.x - np.median(signal.x)
@@ -214,6 +247,7 @@ def _add_signal(
     too_fast = "" if embedding.how == "hidden" else ", and what is too fast to be followed"
     share = 100.0 * best.noise_std / signal.x.std()
     noise = f"{best.noise_std:.3g} {signal.unit}".removesuffix(" 1")
+    moves = ", ".join(f"{state} by {size:.2g}" for state, size in best.process_noise_std.items())
     exact = ", ".join(f"{state}' = {term.replace('*', ' ')}" for state, term in known.items())
     report.section(
         f"The signal {signal.name}",
@@ -222,6 +256,7 @@ def _add_signal(
         f"states: {embedding.says}, {', '.join(states.state_names)} ({best.states.reason})"
         f"{'; known: ' if exact else ''}{exact}",
         f"noise{too_fast}: {noise}, {share:.2g} % of the standard deviation",
+        f"process noise, which moves the states at random beside the model in a step: {moves} (SI)",
         *signal.done,
     )
     chosen = [attempts.index(best)]
@@ -241,6 +276,7 @@ def _add_signal(
         "reason": best.states.reason,
         "known": dict(known),
         "noise_std": best.noise_std,
+        "process_noise_std": best.process_noise_std,
         "misfit": best.found.misfit,
         "note": best.found.note,
     }
