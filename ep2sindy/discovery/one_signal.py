@@ -19,7 +19,7 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.foresight import Foresight, foresee
+from ep2sindy.discovery.foresight import is_linear
 from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.problem import FIRST_MAX_TERMS
@@ -49,10 +49,6 @@ MAX_FITTED = 3000  # samples from the end of the fitted part that a search for h
 # Samples and periods at its end on which hidden states are searched first: a law of more samples is
 # one of these, too.
 FIRST_PART, FIRST_PERIODS = 300, 8.0
-
-# Fewest samples ahead at which models with nonlinear terms are compared: over fewer, what smoothing
-# does to the derivatives counts for more than the law.
-LEAST_AHEAD = 10
 
 EXPLAINED = "their equations explain the signal to its noise"
 
@@ -179,13 +175,8 @@ class Attempt:
 
     @staticmethod
     def of(
-        preparation: Preparation,
-        states: Embedded,
-        found: Discovery,
-        progress: Progress,
-        ahead: int | None = None,
+        preparation: Preparation, states: Embedded, found: Discovery, progress: Progress
     ) -> Attempt:
-        """Count the errors of forecasts. ahead: samples for which the signal is foreseen."""
         past, run, share = states.signal, states.run, float("nan")
         with progress.stage(None, "", "forecasts where it was fitted"):
             if states.hidden:
@@ -193,11 +184,10 @@ class Attempt:
             else:
                 share = unexplained(states)
             samples = complete_states(past, run)
-            longest_s = min(past.period_s, np.inf if ahead is None else ahead * past.run.dt_s)
             estimator = tune_estimator(found.model, samples, measured=[past.name])
             skill = forecast_skill(
                 found.model, past.run, n_fitted=len(past.t) // 2, starts=N_TRIED,
-                horizon_s=longest_s, states_of=states.along, n_draws=N_DRAWS_TRIED,
+                horizon_s=past.period_s, states_of=states.along, n_draws=N_DRAWS_TRIED,
                 estimator=estimator,
             )  # fmt: skip
         error = float(skill.nrmse[MODEL].mean())
@@ -237,7 +227,7 @@ class Attempt:
 
 def try_in_turn(
     past: Trace, tried: Sequence[Preparation], method: AnyMethod, *,
-    told: ToldFacts | None = None, foresight: Foresight | None = None,
+    told: ToldFacts | None = None, linear: bool | None = None,
     seed: int = 0, progress: Progress = SILENT, once: Once = at_once,
 ) -> list[Attempt]:  # fmt: skip
     """Find a model of a signal by each preparation that can pay.
@@ -246,21 +236,18 @@ def try_in_turn(
     when it is run freely where it was fitted. They are left out otherwise, unless nothing else is
     tried. A law of all samples is one of a part of them, so a part is searched first. More than two
     states are tried only of a signal that does not repeat itself: one of two states either repeats
-    itself or spirals. Of a signal that is linear as far as it is foreseen, linear equations of the
-    first smoothed states alone are tried. method: of the search in smoothed states; what runs
-    models judges them by the signal, and as far ahead as it is foreseen. told: of the equations.
-    foresight: see `foresee`. once: does each search, or takes it from a run that was broken off.
+    itself or spirals. Of a linear signal, linear equations of the first smoothed states alone are
+    tried. method: of the search in smoothed states; a rule that runs models judges them by the
+    signal. told: of the equations. linear: whether the signal is (`is_linear`); None finds out.
+    once: does each search, or takes it from a run that was broken off.
     """
-    told, foresight = told or ToldFacts(), foresight or foresee(past)
+    told, linear = told or ToldFacts(), is_linear(past) if linear is None else linear
     smoothed = [each for each in tried if each.how != "hidden"]
     if past.cycle is not None and past.cycle.share >= REPEATS:
         tried = [each for each in tried if each.n_states == 2] or tried
-        foresight = Foresight()
-    elif foresight.is_linear and smoothed:
+    elif linear and smoothed:
         tried = [replace(smoothed[0], degree=1, functions=())]
-    elif (foresight.ahead or 0) < LEAST_AHEAD:
-        foresight = Foresight()
-    method, part = judged_by(method, past.name, foresight.ahead), end_of_periods(past)
+    method, part = judged_by(method, past.name), end_of_periods(past)
     attempts, left_out = [], []
     for each in tried:
         search = partial(
@@ -270,26 +257,25 @@ def try_in_turn(
             continue
         states, found = search(past)
         if not states.hidden:
-            attempts.append(Attempt.of(each, states, found, progress, foresight.ahead))
+            attempts.append(Attempt.of(each, states, found, progress))
         elif explains(found, past.name):
             states = replace(states, reason=EXPLAINED)
-            return [Attempt.of(each, states, found, progress, foresight.ahead)]
+            return [Attempt.of(each, states, found, progress)]
         else:
             left_out.append((each, states, found))
-    return attempts or [Attempt.of(*left_out[-1], progress, foresight.ahead)]
+    return attempts or [Attempt.of(*left_out[-1], progress)]
 
 
-def judged_by(method: AnyMethod, signal: str, ahead: int | None) -> AnyMethod:
+def judged_by(method: AnyMethod, signal: str) -> AnyMethod:
     """The method; models that are run are judged by the signal, of which other states are made."""
     if not isinstance(method, Regression) or method.selection.basis != "runs":
         return method
     from ep2sindy.selection.free_run import FreeRunScore  # loads torch, only for this rule
 
     rule = method.selection
-    if not isinstance(rule, FreeRunScore):
+    if not isinstance(rule, FreeRunScore) or rule.judged is not None:
         return method
-    judged = rule.judged or (signal,)
-    return replace(method, selection=replace(rule, judged=judged, ahead=rule.ahead or ahead))
+    return replace(method, selection=replace(rule, judged=(signal,)))
 
 
 def end_of_periods(past: Trace) -> Trace:

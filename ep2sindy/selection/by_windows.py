@@ -10,11 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.forecasting.evaluation import evaluate
-from ep2sindy.model.inputs import curve_through
-from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.vector_field import VectorField
 from ep2sindy.refinement.refine import BatchRefinement, smooth_batch
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, dominant_window
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -32,13 +28,6 @@ from ep2sindy.selection.systems import (
 
 # Fewest pairs of windows to cut the records into.
 MIN_PAIRS = 3
-
-# Integration steps per sample. One step suffices for the true model of every noise-free system of
-# `systems`: its error stays below 1e-9 variances. The second step is for sparser samples.
-N_SUBSTEPS = 2
-
-# A state that is farther from its mean than this many standard deviations has diverged.
-BLOW_UP = 20.0
 
 # Standard errors by which the winner's error may exceed the least.
 N_ERRORS = 2.0
@@ -61,14 +50,9 @@ class WindowsLeftOut:
     is two of them. n is the number of residuals times (1 - rho) / (1 + rho), rho being the
     autocorrelation of the leader's residuals from sample to sample. So differences between models
     that miss more than white noise are uncertain.
-    A record that cannot be foreseen for one and a half periods tells no models apart over so long:
-    all of them are as wrong as the mean. Its windows are as long as it can be foreseen, and systems
-    run through them from the first sample.
 
-    ahead: number of samples for which a record can be foreseen; None for one and a half periods.
     runs: the records between their gaps. spread: standard deviation of each state over all runs.
-    n_windows: that are judged, over all records, each in one fold. judged: states that tell whether
-    a run goes on like its record; None for all.
+    n_windows: that are judged, over all records, each in one fold.
     """
 
     runs: Sequence[Trajectory]
@@ -76,21 +60,14 @@ class WindowsLeftOut:
     states: Sequence[str]
     n_windows: int
     n_folds: int
-    ahead: int | None = None
-    judged: Sequence[str] | None = None
+    window_on_all = None  # one and a half periods
     n_reweights = 1
-
-    @property
-    def window_on_all(self) -> int | None:
-        """Samples of the windows of the last refinement; None: one and a half periods."""
-        return None if self.ahead is None else self.window
 
     @cached_property
     def window(self) -> int:
         """Number of samples in each: one and a half periods, or what leaves three pairs."""
         lengths = [run.n_samples for run in self.runs]
         wanted = min(dominant_window(self.runs, self.states), sum(lengths) // (2 * MIN_PAIRS))
-        wanted = wanted if self.ahead is None else min(wanted, self.ahead + 1)
         if max(lengths) < 2 * MIN_SAMPLES:
             raise ValueError(
                 "a record must hold a window to refine on and another to judge on, of "
@@ -137,33 +114,10 @@ class WindowsLeftOut:
         )
         for k in doubtful[worse >= better]:
             models[k] = before[k]
-        if self.ahead is not None:
-            return self._run_through(models, fold.held)
         held = cut_stretches(
             self.runs, fold.held, before[0], window=self.window, n_windows=self.count(fold.held)
         )
         return _residuals(models, held, progress) * (held.scale[: len(self.spread)] / self.spread)
-
-    def _run_through(
-        self, models: Sequence[SparseModel], held: Sequence[Stretch]
-    ) -> Float[np.ndarray, "systems windows samples n_states"]:
-        """Distances of runs from the first samples of windows, in standard deviations."""
-        first, off = models[0], []
-        coefs = np.stack([model.coef for model in models])
-        field = VectorField.of(first.library, [*first.states, *first.inputs], coefs)
-        samples = np.concatenate([run.columns(first.states) for run in self.runs])
-        centre, reach = samples.mean(axis=0), BLOW_UP * self.spread
-        for number, run in enumerate(self.runs):
-            begins = np.array([part.start for part in held if part.run == number], dtype=np.int64)
-            if not len(begins):
-                continue
-            inputs = run.columns(first.inputs)
-            curve = curve_through(run.t, inputs, [None] * inputs.shape[1]) if first.inputs else None
-            steps = WindowSteps.along(run.t, curve, begins, self.window, N_SUBSTEPS)
-            truth = run.columns(first.states)[begins[:, None] + np.arange(self.window)]
-            paths = run_many(field, truth[:, 0], steps, centre=centre, reach=reach)
-            off.append((paths - truth) / self.spread)
-        return np.concatenate(off, axis=1)
 
     def figures(self, tried: Sequence[np.ndarray]) -> Float[np.ndarray, "systems 5"]:
         """Errors in units of their bound, zero up to the bound, as those systems are alike."""
@@ -173,15 +127,9 @@ class WindowsLeftOut:
         return np.column_stack([shares, unknown, unknown, errors, errors])
 
     def confirm(self, trial: Trial, model: SparseModel) -> Confirmed:
-        """A system is confirmed if its coefficients, refined on all data, meet the demands.
-
-        Systems that are alike as far as the records are foreseen must also go on like the longest.
-        """
-        demands, goes_on = trial.system.broken(model), True
-        if self.ahead is not None:
-            longest = max(self.runs, key=lambda each: float(np.ptp(each.t)))
-            goes_on = evaluate(model, longest, judged=self.judged).is_similar
-        return Confirmed(trial, model, demands, share=float(goes_on and not demands))
+        """A system is confirmed if its coefficients, refined on all data, meet the demands."""
+        broken = trial.system.broken(model)
+        return Confirmed(trial, model, broken, share=float(not broken))
 
 
 def _residuals(

@@ -33,7 +33,7 @@ from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch
 from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
-from ep2sindy.selection.by_windows import BLOW_UP, N_SUBSTEPS, WindowsLeftOut
+from ep2sindy.selection.by_windows import WindowsLeftOut
 from ep2sindy.selection.criteria import MAX_ERROR, Basis, Decision
 from ep2sindy.selection.systems import (
     Confirmed,
@@ -58,6 +58,13 @@ MIN_WINDOWS = 30  # fewest windows to refine the winner on
 
 # Free coefficients more than the smallest attracting system has, for one that attracts everything.
 DEARER = 1
+
+# Integration steps per sample. One step suffices for the true model of every noise-free system of
+# `systems`: its error stays below 1e-9 variances. The second step is for sparser samples.
+N_SUBSTEPS = 2
+
+# A state that is farther from its mean than this many standard deviations has diverged.
+BLOW_UP = 20.0
 
 N_REACHING = 64  # starts around a cycle that are run, for the share that reaches it
 
@@ -106,9 +113,7 @@ class FreeRunScore:
     record.
     judged: states whose cycle counts, for example the one that was measured if the others are
     derived from it; None takes all. n_starts: number of runs over every held-out part for models
-    without inputs, at phases spread over the period; all must end on the cycle. ahead: number of
-    samples for which records can be foreseen, if that is less than one and a half periods: windows
-    of so many are judged then, and no cycles.
+    without inputs, at phases spread over the period; all must end on the cycle.
     max_combinations: of more, the most promising are tried, those whose candidates rank best in
     their own fronts; the note says so. n_confirmed: most systems to refine on all data. seed: of
     the random windows.
@@ -124,15 +129,14 @@ class FreeRunScore:
     max_combinations: int = 4096
     judged: Sequence[str] | None = None
     n_starts: int = 1
-    ahead: int | None = None
     label: ClassVar[str] = "free-run error"
     basis: ClassVar[Basis] = "runs"
 
     def __post_init__(self) -> None:
         if self.bounds is not None:
             check_kind("bounds", self.bounds, FreeRunBounds, "ep.model.FreeRunBounds()")
-        names = ("n_windows", "n_confirmed", "max_combinations", "n_starts", "ahead")
-        set_counts(self, {"n_folds": 2} | dict.fromkeys(names, 1))
+        least = dict.fromkeys(("n_windows", "n_confirmed", "max_combinations", "n_starts"), 1)
+        set_counts(self, {"n_folds": 2} | least)
         if not self.window_periods > 0.0:
             raise ValueError(f"window_periods must be positive: {self.window_periods} came")
         if not 0.0 < self.margin <= 1.0:
@@ -180,17 +184,13 @@ class FreeRunScore:
                 f"{list(runs[0].state_names)}"
             )
         smoothed = [KalmanSmoother().smooth(run.t, run.columns(states)) for run in runs]
-        if self.ahead is not None:
-            cycles: list[Cycle] | str = f"beyond {self.ahead} samples nothing is foreseen"
-        else:
-            cycles = "" if self.bounds is None else find_cycles(runs, states)
+        cycles = "" if self.bounds is None else find_cycles(runs, states)
         if self.bounds is not None and not isinstance(cycles, str):
             parts = folds(runs, self.n_folds)
             return CycleRuns(self, runs, parts, smoothed, cycles, self.bounds), ""
         pieces = [piece for run in runs for piece in run.stretches(2 * MIN_SAMPLES)]
         spread, reason = np.concatenate(smoothed).std(axis=0), f"{cycles}: " if cycles else ""
-        windows = self.n_windows, self.n_folds, self.ahead, self.judged
-        return WindowsLeftOut(pieces, spread, states, *windows), reason
+        return WindowsLeftOut(pieces, spread, states, self.n_windows, self.n_folds), reason
 
     def _try(
         self, systems: Sequence[TrialSystem], measure: Measure, progress: Progress

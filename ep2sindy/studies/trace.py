@@ -17,7 +17,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
-from ep2sindy.discovery.foresight import foresee
+from ep2sindy.discovery.foresight import is_linear
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.one_signal import (
     Attempt,
@@ -118,20 +118,16 @@ class Study:
         with resumed(self.keep, report) as keeping:
             signal = self._prepared(data, keeping.once, report)
             past = fitted_part(signal, self.held_out)
-            foresight = foresee(past)
-            if foresight.is_linear:
+            linear = is_linear(past)
+            if linear:
                 report.say(LINEAR)
             attempts = try_in_turn(
-                past, self.tried, self.method, told=self.told, foresight=foresight,
+                past, self.tried, self.method, told=self.told, linear=linear,
                 seed=report.seed, progress=report.watch, once=keeping.once,
             )  # fmt: skip
         best = best_of(attempts)
         how = best.states.embedding.how
-        if (
-            how != "hidden"
-            and not foresight.is_linear
-            and any(each.how == "hidden" for each in self.tried)
-        ):
+        if how != "hidden" and not linear and any(each.how == "hidden" for each in self.tried):
             report.say(NOT_EXPLAINED)
         if how in ("derivative", "delays") and (hint := lost_mean(signal)):
             report.warn(hint)
