@@ -56,10 +56,10 @@ NOISE_BELOW, SHARE_BELOW = 6.0, 0.05
 class Trace:
     """An oscillating signal of at least six periods.
 
-    run: the signal as a run of one state. frequency_Hz: of its cycle, or the mean rate at which it
-    rises through its mean. cycle: None for a signal that oscillates without repeating itself, such
-    as chaos. done: processing already applied to the samples, in words. advice: processing that is
-    recommended.
+    run: the signal as a run of one state, with the inputs that drive it. frequency_Hz: of its
+    cycle, or the mean rate at which it rises through its mean. cycle: None for a signal that
+    oscillates without repeating itself, such as chaos. done: processing already applied to the
+    samples, in words. advice: processing that is recommended.
     """
 
     run: Trajectory
@@ -120,11 +120,11 @@ def prepare_signal(
 ) -> Trace:
     """Make a trace of one variable of a run.
 
-    run: as `discover` takes it. signal: None takes the only state. decimate: number of samples that
-    are replaced by their mean; "auto" leaves a hundred per period, None leaves all. detrend:
-    whether to subtract the straight line that the signal follows beside its cycle, and keep the
-    mean; "auto" does so if the line is certain, and large beside the troughs of a positive signal
-    or beside the standard deviation of any other.
+    run: as `discover` takes it; its inputs stay beside the signal. signal: None takes the only
+    state. decimate: number of samples that are replaced by their mean; "auto" leaves a hundred per
+    period, None leaves all. detrend: whether to subtract the straight line that the signal follows
+    beside its cycle, and keep the mean; "auto" does so if the line is certain, and large beside the
+    troughs of a positive signal or beside the standard deviation of any other.
     Raises ValueError for a signal that does not oscillate, under six periods or under six samples a
     period, or a wrong setting.
 
@@ -139,7 +139,7 @@ def prepare_signal(
     _check_settings(decimate, detrend)
     t, x = run.t, run.columns([name])[:, 0]
     t, evened = _restore_even_times(t)
-    t, x, averaged = _average(t, x, decimate)
+    (t, x, *inputs), averaged = _average([t, x, *run.inputs.T], decimate)
     cycle = find_cycle(t, x[:, None])
     x, straightened, drifting = _remove_drift(t, x, name, cycle, detrend)
     cycle = find_cycle(t, x[:, None]) if straightened else cycle
@@ -150,7 +150,9 @@ def prepare_signal(
         t=t,
         states=x[:, None],
         state_names=(name,),
-        units={name: run.units[name]},
+        inputs=np.stack(inputs, axis=1) if inputs else np.empty((len(t), 0)),
+        input_names=run.input_names,
+        units=run.units,
         label=name,
         clock=run.clock,
         parameters=run.parameters,
@@ -199,15 +201,19 @@ def _restore_even_times(t: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
 
 
 def _average(
-    t: np.ndarray, x: np.ndarray, decimate: int | str | None
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Samples replaced by means over neighbours, and what was done, in words."""
+    columns: list[np.ndarray], decimate: int | str | None
+) -> tuple[list[np.ndarray], tuple[str, ...]]:
+    """Columns of times, the signal and inputs, as means over neighbours; what was done, in words.
+
+    Inputs are averaged like the signal, which follows the mean of what drives it.
+    """
+    t, x = columns[:2]
     factor = _count_spare(t, x) if decimate == "auto" else int(decimate or 1)
     if factor < 2:
-        return t, x, ()
+        return columns, ()
     pieces = between_gaps(t)
-    t, x = (np.concatenate([_means(each[a:b], factor) for a, b in pieces]) for each in (t, x))
-    return t, x, (f"means over {factor} samples: {len(t)} are left",)
+    fewer = [np.concatenate([_means(c[a:b], factor) for a, b in pieces]) for c in columns]
+    return fewer, (f"means over {factor} samples: {len(fewer[0])} are left",)
 
 
 def _count_spare(t: np.ndarray, x: np.ndarray) -> int:
