@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.runs import Run, trajectory_of
@@ -34,6 +35,9 @@ MAINS_Hz, MAINS_ERROR, N_MAINS, MAINS_TOLD = (50.0, 60.0), 1e-3, 4, 3e-3
 # A year has 365 to 365.25 days. Two decades hold three periods: an error of 0.02 is rarely met.
 CALENDAR, CALENDAR_ERROR, CALENDAR_TOLD = ("day", "week", "year"), 1e-3, 0.02
 
+REPEATS = (
+    0.9  # least share of the variance that the waveform explains where a phase is told from it
+)
 MIN_TOLD = 20  # fewest periods in which a phase that keeps time is told from one that walks
 # Mean square of a random walk of n unit steps about its best line, over n: one in a hundred walks
 # of twenty steps is below this, and fewer of longer ones (simulated).
@@ -41,6 +45,7 @@ LEAST_WALK = 0.0147
 # Standard deviations in a median absolute deviation of normal values, and the standard error of its
 # square, as a share, times the root of their number; errors beyond which moves are sure.
 MADS, MAD_ERROR, N_SURE = 1.4826, 2.33, 4.0
+LEAST_MOVE = 0.005  # of an amplitude, as a share: less may come from where samples fall in a period
 
 RESTING, LONG_HELD, FEW_LEVELS = 0.5, 5.0, 3  # share of steps, samples, and levels of a held value
 CLEAN = 0.05  # most noise of a wave that somebody sets, in its standard deviations
@@ -50,6 +55,7 @@ PURER = 20.0  # least ratio of what is no sine in a signal to that in one that d
 SAME_LINE = 0.5  # most difference of two frequencies that are one, in units of 1 / duration
 FOLLOWS = 0.1  # least share of a signal's variance at the frequency of a wave that it goes with
 MOST_SUBHARMONIC = 3  # periods of a drive in one of the signal, at most
+CUBIC = 3  # degree of the splines between samples
 SETTLED = 3  # a drive is looked for after the first of so many parts of a record, a transient
 
 
@@ -109,7 +115,7 @@ class PhaseRecord:
         )
         n_periods = int((t[-1] - t[0]) * cycle.frequency_Hz + 1e-6)
         even = t[0] + np.arange(n * n_periods) / (n * cycle.frequency_Hz)
-        pieces = np.interp(even, t, x).reshape(n_periods, n)
+        pieces = make_interp_spline(t, x, k=CUBIC)(even).reshape(n_periods, n)
         line = pieces @ np.exp(-2j * np.pi * np.arange(n) / n) * (2.0 / n)
         size, phase, k = np.abs(line), np.unwrap(np.angle(line)), np.arange(n_periods)
         slope, start = np.polyfit(k, phase, 1)
@@ -127,26 +133,31 @@ class PhaseRecord:
         )
 
     @property
-    def keeps_time(self) -> bool:
-        """Whether the phase returns, as to a drive, although the amplitude has moves of its own.
+    def moves(self) -> float:
+        """Variance of the amplitude's moves from period to period, less noise; 0 if it is not sure.
 
-        What moves the amplitude of a self-sustained oscillation moves its phase by as much (in rad,
-        as a share) at least, and nothing brings that back: its squares about the best line grow
-        with the record. They lie below the bound in one of a hundred such records, at most. The
-        moves are the residuals of an autoregression, by their median, so that a transient does not
-        count, and less white noise; without moves for sure, nothing can be told.
+        They are the residuals of an autoregression, by their median, so that a transient does not
+        count.
         """
-        n = len(self.phase)
+        n, a = len(self.phase), self.amplitude
         if n < MIN_TOLD:
-            return False
-        a = self.amplitude
+            return 0.0
         past = np.column_stack([a[1:-1], a[:-2]])
         coef = np.linalg.lstsq(past, a[2:], rcond=None)[0]
         size = MADS * float(np.median(np.abs(a[2:] - past @ coef)))
         white = self.noise * (1.0 + float(coef @ coef))
         moves = size**2 - white
-        is_sure = moves > N_SURE * MAD_ERROR / np.sqrt(n) * white
-        return is_sure and float(np.square(self.phase).mean()) < LEAST_WALK * n * moves
+        return moves if moves > max(N_SURE * MAD_ERROR / n**0.5 * white, LEAST_MOVE**2) else 0.0
+
+    @property
+    def keeps_time(self) -> bool:
+        """Whether the phase returns, as to a drive, although the amplitude has moves of its own.
+
+        What moves the amplitude of a self-sustained oscillation moves its phase by as much (in rad,
+        as a share) at least, and nothing brings that back: its squares about the best line grow
+        with the record. They lie below the bound in one of a hundred such records, at most.
+        """
+        return float(np.square(self.phase).mean()) < LEAST_WALK * len(self.phase) * self.moves
 
 
 def ask_whether_driven(
@@ -178,6 +189,18 @@ def ask_whether_driven(
     )
 
 
+def say_what_is_not_told(signal: Trace) -> str | None:
+    """A remark if the record shows neither a walking phase nor one that keeps time; else None."""
+    if signal.cycle is None or signal.run.input_names:
+        return None
+    if PhaseRecord.of(signal.t, signal.x, signal.cycle).moves > 0.0:
+        return None
+    return (
+        f"this record does not tell whether {signal.name} sustains itself or is driven: neither "
+        "its amplitude nor its phase moves from period to period by more than its noise"
+    )
+
+
 def _looks_driven(signal: Trace) -> tuple[str, float] | None:
     """Why a signal by itself looks driven, and the period in s; None if it does not."""
     if signal.cycle is None:
@@ -194,7 +217,9 @@ def _looks_driven(signal: Trace) -> tuple[str, float] | None:
         order, words, f_Hz, _ = found[0]
         what = f"{order} times its frequency" if order > 1 else "its frequency"
         return f"{what} is {words} to its resolution", 1.0 / f_Hz
-    if len(between_gaps(signal.t)) > 1 or not record.keeps_time:
+    # A phase that hardly diffuses while the amplitude varies much is also that of some chaos.
+    repeats = signal.cycle.share >= REPEATS
+    if not (repeats and len(between_gaps(signal.t)) == 1 and record.keeps_time):
         return None
     varies = 100.0 * float(record.amplitude.std())
     return (

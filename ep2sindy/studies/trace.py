@@ -36,7 +36,7 @@ from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
 from ep2sindy.runtime.parallel import Once
-from ep2sindy.signals.driving import add_drive, ask_whether_driven
+from ep2sindy.signals.driving import add_drive, ask_whether_driven, say_what_is_not_told
 from ep2sindy.signals.trace import Trace, prepare_signal
 from ep2sindy.studies.candidates import add_candidates, add_estimate
 from ep2sindy.studies.forecasts import add_forecasts
@@ -134,13 +134,16 @@ class Study:
         skill = free.forecast
         seen = len(best.states.signal.t) == len(signal.t)
         where = "all of it, too short to hold out" if seen else "its end, which was not fitted"
+        remarks = [Text(free.caution, warning=True)] if free.caution else []
+        if not question and (remark := say_what_is_not_told(signal)):
+            remarks.append(Text(remark))
         report.found(
             found_model(
                 f"Found from {signal.name}",
                 free,
                 file=NAME,
                 picture=f"free_run_{NAME}",
-                more=[Text(free.caution, warning=True)] if free.caution else [],
+                more=remarks,
                 where=where,
                 seen=seen,
                 misfit=best.found.misfit,
