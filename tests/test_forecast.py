@@ -10,7 +10,6 @@ import ep2sindy as ep
 from ep2sindy.data.numbers import quantiles
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.likelihood import linearise
-from ep2sindy.forecasting.skill import Autoregression, Harmonics, Persistence
 from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
 from tests.models import model_of
@@ -172,51 +171,12 @@ def test_a_run_that_diverges_is_not_a_number_and_counts_as_such() -> None:
     assert quantiles(runs, [0.5])[0, -1, 0] == pytest.approx(0.125, rel=1e-4)
 
 
-def test_an_autoregression_finds_its_own_order_and_goes_on() -> None:
-    rng, x = np.random.default_rng(0), [0.0, 0.0]
-    for _ in range(3000):
-        x.append(1.6 * x[-1] - 0.9 * x[-2] + 0.1 + 0.01 * rng.standard_normal())
-    run = Trajectory(np.arange(3002.0), np.array(x)[:, None], ("x",))
-    found = Autoregression.of(run)
-    assert found.order >= 2
-    assert found.coef[:2, 0, 0] == pytest.approx([1.6, -0.9], abs=0.1)
-    level = 0.1 / (1.0 - 1.6 + 0.9)
-    far = found.ahead(run.states, run.t, np.arange(500.0))
-    assert far[-1, 0] == pytest.approx(level, abs=0.01)
-    both = Autoregression.of(spring(0.0))
-    ahead = both.ahead(spring(0.0).states[:1000], spring(0.0).t[:1000], spring(0.0).t[1000:1100])
-    np.testing.assert_allclose(ahead, spring(0.0).states[1000:1100], atol=1e-3)
-    uneven = Trajectory(np.cumsum(rng.uniform(0.5, 1.5, 500)), np.array(x)[:500, None], ("x",))
-    assert Autoregression.of(uneven) is None
-
-
-def test_the_other_baselines_go_on_as_they_say() -> None:
-    run = spring(0.01)
-    past, later = run.window(0, 900), run.t[900:960]
-    cycle = Harmonics.of(past)
-    np.testing.assert_allclose(
-        cycle.ahead(past.states, past.t, later), spring(0.0).states[900:960], atol=0.06
-    )  # 72 phases are tried
-    np.testing.assert_array_equal(
-        Persistence().ahead(past.states, past.t, later), np.tile(past.states[-1], (60, 1))
-    )
-    noise = np.random.default_rng(0).standard_normal((400, 1))
-    assert Harmonics.of(Trajectory(np.arange(400.0), noise, ("x",))) is None
-
-
-def test_where_the_mean_cycle_is_nearer_it_is_said() -> None:
-    slow = replace(SPRING, coef=0.97 * SPRING.coef)
-    skill = ep.model.forecast_skill(slow, spring(0.02), n_fitted=900, starts=20)
-    assert "the mean cycle, going on, is nearer" in skill.text
-
-
 def test_a_gap_is_no_obstacle() -> None:
     run = spring(0.05)
     kept = np.delete(np.arange(1200), slice(500, 560))
     gappy = Trajectory(run.t[kept], run.states[kept], run.state_names)
     skill = ep.model.forecast_skill(SPRING, gappy, n_fitted=800, starts=10)
-    assert "autoregression" not in skill.nrmse
-    assert skill.text.startswith("better than persistence for")
+    assert set(skill.nrmse) >= {"model", "autoregression", "neighbours"}
     assert 0.8 <= skill.coverage_90 <= 1.0
 
 

@@ -10,7 +10,7 @@ from benchmarks.known_systems import noisy
 from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.problem import scale_problem
-from ep2sindy.forecasting.forecast import spread_starts
+from ep2sindy.forecasting.baselines import spread_starts
 from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.refinement.windows import cut_windows, dominant_window
 

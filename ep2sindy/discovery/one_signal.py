@@ -136,8 +136,6 @@ class Attempt:
                 share = unexplained(states)
             samples = complete_states(past, run)
             estimator = tune_estimator(found.model, samples, measured=[past.name])
-            if found.model.inputs:  # of which forecasts know nothing
-                return Attempt(preparation, states, found, run, estimator, float("nan"), share)
             skill = forecast_skill(
                 found.model, past.run, n_fitted=len(past.t) // 2, starts=N_TRIED,
                 horizon_s=past.period_s, states_of=states.along, n_draws=N_DRAWS_TRIED,

@@ -317,7 +317,8 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
         values, mean = run.columns([name])[shown, 0], ahead.states[:, k]
         ax.plot(since, values, ".", ms=3, color=DATA, label="samples")
         band: dict[str, Any] = {"color": COLOURS[0], "alpha": 0.25, "lw": 0}
-        label = f"band of {100.0 * LEVEL:.0f} %"
+        of = "" if ahead.sound is None else ", the autoregression's"
+        label = f"band of {100.0 * LEVEL:.0f} %{of}"
         ax.fill_between(later, low[:, k], high[:, k], label=label, **band)
         ax.plot(later, mean, color=COLOURS[0], lw=1.2, label="forecast")
         ax.axvline(0.0, color=GREY, lw=0.8, ls="--")
@@ -332,14 +333,12 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
 
 
 def _draw_errors(ax: Axes, skill: ForecastSkill) -> None:
-    in_periods = np.isfinite(skill.period_s)
-    unit_s = skill.period_s if in_periods else float(skill.horizons_s[0])
-    names = (MODEL, "persistence", "harmonics", "autoregression")
+    names = (MODEL, "persistence", "harmonics", "autoregression", "neighbours")
     colours = dict(zip(names, COLOURS, strict=False))
     for name, values in skill.nrmse.items():
         look: dict[str, Any] = {"color": colours[name], "lw": 1.8 if name == MODEL else 1.0}
-        horizons = skill.horizons_s / unit_s
+        horizons = skill.horizons_s / skill.unit_s
         ax.plot(horizons, np.maximum(values, FLOOR), label=name, **look)
     ax.axhline(1.0, color=GREY, lw=0.8, ls="--")
     ax.set(yscale="log", ylabel="error (standard deviations)")
-    ax.set_xlabel(f"horizon ({'periods' if in_periods else 'samples'})")
+    ax.set_xlabel(f"horizon ({skill.unit})")

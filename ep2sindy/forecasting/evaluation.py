@@ -16,7 +16,8 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.forecasting.skill import ForecastSkill, check_fitted, forecast_skill
+from ep2sindy.forecasting.baselines import check_fitted
+from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
 from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Status, columns_of, record_of
 from ep2sindy.model.fixed_point import RestPoint, rest_point
 from ep2sindy.model.model import SparseModel
@@ -215,8 +216,8 @@ class Evaluation:
 
     @cached_property
     def forecast(self) -> ForecastSkill | None:
-        """Skill of forecasts of the held-out part; None without it, or for a driven model."""
-        return None if self.forecasts is None or self.model.inputs else self.forecasts()
+        """Skill of forecasts of the held-out part; None without it."""
+        return None if self.forecasts is None else self.forecasts()
 
     @property
     def caution(self) -> str:
@@ -241,6 +242,12 @@ class Evaluation:
             f"from 0.3 to 3 times the cycle's mean reach it{slowly}."
         )
         return text if self.rest is None else f"{text} It rests at {self._rest_text(self.rest)}."
+
+    @property
+    def rest_text(self) -> str:
+        """The rest points near the record, in a line; empty without any."""
+        places = [self._rest_text(rest) for rest in self.rest_points[:N_SHOWN]]
+        return f"rests at {'; and at '.join(places)}" if places else ""
 
     def _rest_text(self, rest: RestPoint) -> str:
         """Where the model rests, and what becomes of a small departure."""
@@ -270,6 +277,7 @@ class Evaluation:
         )
         phase = f"in phase for {self.periods:.3g} periods; {self.phase_end:+.2g} periods at the end"
         found = [
+            ("forecasts", "" if self.forecast is None else self.forecast.text),
             ("status", self.text),
             ("frequency", _listed(frequencies) + error),
             ("amplitude ratio", _listed(_texts(self.amplitude_ratio))),
@@ -278,7 +286,6 @@ class Evaluation:
             ("phase", phase if np.isfinite(self.phase_end) else ""),
             ("cycle", cycle or ""),
             *(("rests at", self._rest_text(rest)) for rest in self.rest_points[:N_SHOWN]),
-            ("forecasts", "" if self.forecast is None else self.forecast.text),
             ("lack of fit", self.lack_of_fit),
         ]
         return [(name, value) for name, value in found if value]

@@ -17,10 +17,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.numbers import band_of, quantiles
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.baselines import (
+    AUTOREGRESSION,
+    Autoregression,
+    measured_part,
+    spread_starts,
+)
 from ep2sindy.forecasting.state_estimation import FittedState, StateEstimator, tune_estimator
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
@@ -38,6 +43,7 @@ StatesOf = Callable[[Trajectory], Trajectory]
 
 # Starts of the forecasts whose bands are calibrated, draws of each, and how far they go.
 N_STARTS, N_DRAWS, PERIODS_AHEAD = 24, 60, 1.5
+LEAST_HELD = 0.6  # share of fitted samples that bands hold, below which they are not shown
 TOLERANCE = 0.03  # deviation from the level at which a band counts as calibrated
 FACTORS = 10.0 ** np.arange(-2.0, 2.1, 0.25)  # of the likeliest process noise
 
@@ -50,6 +56,9 @@ class Forecast:
     median of the draws, in SI. draws: (draws, samples, n_states), runs from starts and with
     coefficients drawn by their covariance, under the record's process noise; NaN where a run has
     diverged. noise_std: (n_states,), of the sensor's noise; NaN for states that it does not show.
+    sound: (draws, samples, measured), draws of an autoregression, the sensor's noise included,
+    whose band stands in place of the model's, which did not hold where the model was fitted; None
+    if it did.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -60,6 +69,7 @@ class Forecast:
     units: Mapping[str, str]
     clock: Clock = SECONDS
     seed: int = field(default=0, repr=False)
+    sound: Float[np.ndarray, "draws samples _"] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("t", "states", "draws", "noise_std"):
@@ -74,8 +84,16 @@ class Forecast:
         """
         rng = np.random.default_rng(self.seed)
         noise = np.nan_to_num(self.noise_std) * rng.standard_normal(self.draws.shape)
-        low, high = band_of(self.draws + noise, level)
+        draws = self.draws + noise
+        if self.sound is not None:
+            draws[..., np.isfinite(self.noise_std)] = self.sound
+        low, high = band_of(draws, level)
         return low, high
+
+    @property
+    def band_of(self) -> str:
+        """Whose band it is: `model`, or `autoregression`."""
+        return "model" if self.sound is None else AUTOREGRESSION
 
     @property
     def diverged(self) -> float:
@@ -148,7 +166,8 @@ def forecast(
     likeliest ones for the record that the model was fitted to; the latter is then scaled until
     bands hold 90 % of that record, if it is long enough (`calibrate`). The bands follow from the
     uncertainty of the start, from the covariance of the model's coefficients if it has one, from
-    this process noise, and from the noise.
+    this process noise, and from the noise. If they hold under 60 % of that record all the same,
+    they are those of an autoregression that is fitted to it.
     history: samples of the measured states and of the inputs; a Trajectory, a table or (t, x).
     States of the model that it lacks are told from the others (`estimate_states`).
     horizon: duration in s, in steps of the history; or the times (samples,) themselves, in s.
@@ -170,11 +189,31 @@ def forecast(
     times = _times(past.t, past.dt_s, horizon)
     known = past if fitted_to is None else trajectory_of(fitted_to)
     estimator = calibrate(tune_estimator(model, known, measured=measured), known, seed=seed)
-    end = estimator.filter(past)
-    return draw_forecasts(
+    end, grid = estimator.filter(past), np.append(past.t[-1], times)
+    ahead = draw_forecasts(
         estimator, [end], past.t[-1:], times[None], inputs=inputs,
         n_draws=check_count("n_draws", n_draws), seed=seed, clock=past.clock,
     )[0]  # fmt: skip
+    if not estimator.held < LEAST_HELD:
+        return ahead
+    own, known = (measured_part(run, estimator.names, model.inputs) for run in (past, known))
+    later = driven(model.inputs, inputs, grid, model.courses)[1][1:]
+    linear, t = Autoregression.of(known), np.append(own.t, times)
+    return with_band_of(linear, ahead, own.states, t, np.vstack([own.inputs, later]))
+
+
+def with_band_of(
+    linear: Autoregression | None,
+    ahead: Forecast,
+    past: Float[np.ndarray, "samples measured"],
+    t: Float[np.ndarray, " times"],
+    inputs: Float[np.ndarray, "times n_inputs"],
+) -> Forecast:
+    """The forecast with the band of an autoregression. t and inputs: see `Baseline.ahead`."""
+    if linear is None:
+        return ahead
+    draws = linear.draws(past, t, inputs, len(ahead.draws), np.random.default_rng(ahead.seed))
+    return replace(ahead, sound=draws)
 
 
 def _times(t: np.ndarray, step_s: float, horizon: float | ArrayLike) -> np.ndarray:
@@ -188,26 +227,6 @@ def _times(t: np.ndarray, step_s: float, horizon: float | ArrayLike) -> np.ndarr
             f"end at {t[-1]:.6g} s: {horizon!r} came"
         )
     return asked
-
-
-def spread_starts(
-    t: Float[np.ndarray, " samples"], first: int, longest: int, n: int
-) -> Int[np.ndarray, " starts"]:
-    """At most n starts of forecasts of `longest` samples, evenly spread from a first one on.
-
-    A forecast and the sample before it lie in one stretch without a gap, unless none of them does.
-    """
-    starts = np.arange(min(first, len(t) - longest), len(t) - longest + 1)
-    end = np.array(between_gaps(t))[:, 1]
-    piece = np.searchsorted(end, starts - 1, side="right")
-    inside = starts + longest <= end[piece]
-    starts = starts[inside] if inside.any() else starts
-    return starts[spread_evenly(len(starts), n)]
-
-
-def spread_evenly(n_all: int, n: int) -> Int[np.ndarray, " places"]:
-    """At most n places among n_all, evenly spread from the first to the last."""
-    return np.unique(np.linspace(0, n_all - 1, n).round().astype(np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,13 +262,35 @@ class RollingStarts:
         """Forecasts from fitted states; at equal steps, all of them are drawn together."""
         t, begins = self.record.t, self.record.t[self.first - 1]
         draw = partial(draw_forecasts, self.estimator, n_draws=n_draws, clock=self.record.clock)
-        if is_uniform(t):
+        inputs = self.record.columns(self.estimator.model.inputs)
+        if is_uniform(t) and not inputs.size:
             times = begins[:, None] + self.steps_s
             return draw(ends, begins, times, seed=seed)
         times = np.stack([t[k : k + self.longest] for k in self.first])
         return [
-            draw([end], begin[None], own[None], seed=seed + k)[0]
-            for k, (end, begin, own) in enumerate(zip(ends, begins, times, strict=True))
+            draw(
+                [end],
+                begin[None],
+                own[None],
+                inputs=inputs[k - 1 : k + self.longest],
+                seed=seed + n,
+            )[0]
+            for n, (k, end, begin, own) in enumerate(
+                zip(self.first.tolist(), ends, begins, times, strict=True)
+            )
+        ]
+
+    def with_sound_bands(
+        self, ahead: Sequence[Forecast], linear: Autoregression | None
+    ) -> list[Forecast]:
+        """The forecasts, with an autoregression's bands if the model's did not hold before."""
+        if not self.estimator.held < LEAST_HELD:
+            return list(ahead)
+        own = measured_part(self.record, self.estimator.names, self.estimator.model.inputs)
+        ends = [(k, k + self.longest) for k in self.first.tolist()]
+        return [
+            with_band_of(linear, each, own.states[:k], own.t[:end], own.inputs[:end])
+            for each, (k, end) in zip(ahead, ends, strict=True)
         ]
 
     def measured(self, ahead: Sequence[Forecast]) -> Float[np.ndarray, "starts ahead measured"]:
@@ -281,14 +322,14 @@ def calibrate(
     """The estimator with process noise whose bands hold 90 % of the record that it was tuned on.
 
     run: that record. states_of: as for `forecast_skill`. Forecasts of up to one and a half periods
-    from its later half are counted. An estimator that is calibrated already, a driven model, and a
-    record at unequal steps come back unchanged.
+    from its later two thirds are counted. Of a record that is too short for these, the estimator
+    comes back unchanged.
     """
     ahead = max(2, int(PERIODS_AHEAD * estimator.per_period))
-    first = np.arange(max(estimator.memory, run.n_samples // 3), run.n_samples - ahead)
-    if estimator.model.inputs or not is_uniform(run.t) or len(first) < N_STARTS:
+    begin = max(estimator.memory, run.n_samples // 3)
+    if run.n_samples - ahead - begin < N_STARTS:
         return estimator
-    first = first[spread_evenly(len(first), N_STARTS)]
+    first = spread_starts(run.t, begin, ahead, N_STARTS)
     rolling = RollingStarts(estimator, run, first, ahead)
 
     def coverage(factor: float) -> float:
@@ -296,9 +337,11 @@ def calibrate(
         return scaled.coverage(scaled.forecast(ends, N_DRAWS, seed), LEVEL)
 
     with progress.stage(None, "", "width of the forecasts' bands"):
-        ends = rolling.ends(states_of)
-        if abs(coverage(1.0) - LEVEL) <= TOLERANCE:
-            return estimator
-        # More process noise makes wider bands.
-        above = bisect_left(FACTORS[1:-1], LEVEL, key=coverage) + 1
-    return rolling.scale_process(float(FACTORS[above])).estimator
+        ends, factor = rolling.ends(states_of), 1.0
+        held = coverage(factor)
+        if abs(held - LEVEL) > TOLERANCE:
+            # More process noise makes wider bands.
+            above = bisect_left(FACTORS[1:-1], LEVEL, key=coverage) + 1
+            factor = float(FACTORS[above])
+            held = coverage(factor)
+    return replace(rolling.scale_process(factor).estimator, held=held)

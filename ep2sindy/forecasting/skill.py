@@ -4,24 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
-from typing import Protocol, runtime_checkable
-from warnings import catch_warnings, simplefilter
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.special import stdtrit
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.baselines import (
+    AUTOREGRESSION,
+    HARMONICS,
+    N_STARTS,
+    NEIGHBOURS,
+    PERSISTENCE,
+    Autoregression,
+    check_fitted,
+    fit_baselines,
+    go_on,
+    measured_part,
+    period_of,
+    root_mean,
+    spread_starts,
+    squared_errors,
+)
 from ep2sindy.forecasting.forecast import (
     LEVEL,
     Forecast,
     RollingStarts,
     StatesOf,
     calibrate,
-    spread_evenly,
-    spread_starts,
 )
 from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.library.units import Clock
@@ -29,90 +43,149 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count
-from ep2sindy.signals.attractor import Cycle, find_cycle
-from ep2sindy.signals.spectrum import crossing_frequency, dominant_frequency, is_uniform
+from ep2sindy.signals.spectrum import is_uniform
 
-N_STARTS = 40
 PERIODS_AHEAD = 4.0  # longest horizon
-N_HORIZONS = 120  # most horizons at which errors are counted
-WORST = 10.0  # error, in standard deviations, that counts for a forecast that has diverged
 NEARER = 0.9  # share of the model's error below which a baseline is clearly nearer
-MODEL, PERSISTENCE, HARMONICS, AUTOREGRESSION = (
-    "model", "persistence", "harmonics", "autoregression",
-)  # fmt: skip
+MODEL = "model"
+WORDS = {
+    PERSISTENCE: "the last sample",
+    HARMONICS: "the mean cycle",
+    AUTOREGRESSION: "the autoregression",
+    NEIGHBOURS: "the record's own past (nearest neighbours)",
+}
 
-# Largest order of an autoregression of one state, and the sum of orders of one of several; samples
-# that it is fitted to, from the end of the record.
-MAX_ORDER, MAX_ORDERS, MAX_FITTED = 120, 40, 4000
-SAMPLES_PER_COEFFICIENT = 5  # fewest, of an autoregression
+# Errors are averaged over horizons of a twentieth of a period, or a 120th of the longest. At one
+# sample a right model and an autoregression are both at the floor of the noise: their difference is
+# a small part of it, and needs many samples to be seen. Over a twentieth of a period, by contrast,
+# what is to be forecast has hardly moved on.
+BINS_PER_PERIOD, MOST_BINS = 20, 120
+
+# Levels of Student's distribution: of a gain that exceeds its standard error, at every horizon; and
+# of one that chance alone makes in a case of twenty, on average over all of them.
+EXCEEDS, SURE = 0.841, 0.95
+# Degrees of freedom of a standard error, half the number of starts that do not overlap: with more,
+# correlated starts count as free ones.
+LEAST_FREE, MOST_FREE = 2, 8
 
 
 @dataclass(frozen=True, eq=False)
 class ForecastSkill:
     """Errors of forecasts from starts all over a held-out part, by horizon and by who forecasts.
 
-    horizons_s: (horizons,). period_s: NaN for a record without an oscillation. nrmse: by `model`,
-    `persistence`, `harmonics` and `autoregression`, (horizons,): root mean square error over starts
-    and measured states, in standard deviations of the held-out samples. A baseline that the record
-    does not allow is left out. coverage_90: share of the held-out samples that the bands of 90 %
-    hold. example: the forecast from the first start. order: of the autoregression.
+    horizons_s: (horizons,), each the longest of those that its errors are averaged over. period_s:
+    NaN for a record without an oscillation. step_s, apart_s: between samples, and between starts.
+    squared: by `model` and by the baselines `persistence`, `harmonics`, `autoregression` and
+    `neighbours`, (starts, horizons): mean square errors over measured states, in variances of the
+    held-out samples. A baseline that the record does not allow is left out. coverage_90: share of
+    the held-out samples that the bands of 90 % hold. example: the forecast from the first start.
+    order: of the autoregression. resampled: whether baselines took samples at other times.
     """
 
     horizons_s: Float[np.ndarray, " horizons"]
     period_s: float
-    nrmse: Mapping[str, Float[np.ndarray, " horizons"]]
+    step_s: float
+    apart_s: float
+    squared: Mapping[str, Float[np.ndarray, "starts horizons"]] = field(repr=False)
     coverage_90: float
-    n_starts: int
     example: Forecast = field(repr=False)
     order: int
     clock: Clock = field(repr=False)
+    resampled: bool = False
+
+    @cached_property
+    def nrmse(self) -> Mapping[str, Float[np.ndarray, " horizons"]]:
+        """Root mean square errors by who forecasts, in standard deviations of the held-out part."""
+        return MappingProxyType({name: root_mean(each) for name, each in self.squared.items()})
+
+    @property
+    def n_starts(self) -> int:
+        return len(self.squared[MODEL])
 
     @property
     def rival(self) -> str:
         """The baseline that counts: the autoregression, or persistence if there is none."""
         return AUTOREGRESSION if AUTOREGRESSION in self.nrmse else PERSISTENCE
 
-    @property
-    def better_span_s(self) -> tuple[float, float]:
-        """The longest span of horizons over which the model is better than the rival, in s.
+    @cached_property
+    def n_better(self) -> int:
+        """Number of horizons, from the first on, over which the model is better than the rival.
 
-        From zero if it begins at the first horizon; (0, 0) if there is none.
+        At each of them the gain in mean square error, over the rival and over the mean of the
+        samples, exceeds its standard error over the starts; averaged over all of them, the gain
+        over the rival is one that chance makes in a case of twenty.
         """
-        is_better = self.nrmse[MODEL] < self.nrmse[self.rival]
-        edges = np.flatnonzero(np.diff(is_better, prepend=False, append=False)).reshape(-1, 2)
-        if not len(edges):
-            return 0.0, 0.0
-        begin, end = edges[np.argmax(edges[:, 1] - edges[:, 0])].tolist()
-        return float(self.horizons_s[begin]) if begin else 0.0, float(self.horizons_s[end - 1])
+        own, n = self.squared[MODEL], 0
+        gain = self.squared[self.rival] - own
+        while n < own.shape[1] and all(
+            self._exceeds(each[:, n], n, EXCEEDS) for each in (gain, 1.0 - own)
+        ):
+            n += 1
+        while n and not self._exceeds(gain[:, :n].mean(axis=1), n - 1, SURE):
+            n -= 1
+        return n
+
+    def _exceeds(self, gain: Float[np.ndarray, " starts"], horizon: int, level: float) -> bool:
+        """Whether gains of the starts are positive beside their standard error."""
+        n_apart = len(gain) * self.apart_s / float(self.horizons_s[horizon])  # do not overlap
+        most = min(MOST_FREE, len(gain) - 1)
+        n_free = int(np.clip(0.5 * n_apart, min(LEAST_FREE, most), most))
+        if not n_free:
+            return False
+        bound = stdtrit(n_free, level) * standard_error(gain, n_free)
+        return bool(gain.mean() > bound)
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the model forecasts better than the rival from the first horizon on."""
+        return self.n_better > 0
 
     @property
     def better_until_periods(self) -> float:
-        """The end of that span in periods, or in samples for a record without an oscillation."""
-        return self._in_unit(self.better_span_s[1])
+        """How long it does, in periods, or in samples for a record without an oscillation."""
+        return float(self.horizons_s[self.n_better - 1]) / self.unit_s if self.n_better else 0.0
+
+    @property
+    def nearest(self) -> str:
+        """What is nearest to the samples over all horizons, in words; a model if that is sure."""
+        gain = self.squared[self.rival] - self.squared[MODEL]
+        mean = {name: float(errors.mean()) for name, errors in self.nrmse.items()}
+        if not self._exceeds(gain.mean(axis=1), -1, SURE):
+            del mean[MODEL]
+        least = min(mean, key=mean.__getitem__)
+        if mean[least] >= 1.0:
+            return "the mean of the record"
+        return WORDS.get(least, "the model, over all horizons,")
 
     @property
     def text(self) -> str:
         """One sentence, such as `better than an autoregression (AR 18) for 3.1 periods`."""
-        rival = f"an autoregression (AR {self.order})" if self.order else self.rival
-        return f"{self._beside(rival)}{self._beside_the_cycle()}"
+        rival = f"an autoregression (AR {self.order})" if self.order else WORDS[self.rival]
+        if not self.is_better:
+            nearest = self.nearest
+            return f"no better than {rival}" + f"; {nearest} is nearest" * (
+                nearest != WORDS[self.rival]
+            )
+        more = " and more" if self.n_better == len(self.horizons_s) else ""
+        until = f"{self.better_until_periods:.2g} {self.unit}{more}"
+        return f"better than {rival} for {until}{self._beside_others()}"
 
-    def _beside(self, rival: str) -> str:
-        begin, end = self.better_span_s
-        if not end:
-            return f"at no horizon better than {rival}"
-        unit = "periods" if np.isfinite(self.period_s) else "samples"
-        more = " and more" if end >= self.horizons_s[-1] else ""
-        until = f"{self._in_unit(end):.2g} {unit}{more}"
-        span = f"for {until}" if not begin else f"from {self._in_unit(begin):.2g} to {until} ahead"
-        return f"better than {rival} {span}"
+    @property
+    def headline(self) -> str:
+        """What was found, by what it foresees: `a model that forecasts better than ...`."""
+        return f"a model that forecasts {self.text}" if self.is_better else (
+            f"nothing that forecasts {self.text.removeprefix('no ')}"
+        )  # fmt: skip
 
-    def _beside_the_cycle(self) -> str:
-        """A remark if the mean cycle, going on, is nearer than the model at most horizons."""
-        if HARMONICS not in self.nrmse:
-            return ""
-        nearer = self.nrmse[HARMONICS] < NEARER * self.nrmse[MODEL]
-        words = "; the mean cycle, going on, is nearer at most horizons"
-        return words if nearer.mean() > 0.5 else ""
+    def _beside_others(self) -> str:
+        """A remark if the mean cycle or neighbours are nearer than the model at most horizons."""
+        nearer = [
+            WORDS[name]
+            for name in (HARMONICS, NEIGHBOURS)
+            if name in self.nrmse and (self.nrmse[name] < NEARER * self.nrmse[MODEL]).mean() > 0.5
+        ]
+        are = "are" if len(nearer) > 1 else "is"
+        return f"; {' and '.join(nearer)} {are} nearer at most horizons" if nearer else ""
 
     def at(self, horizon_s: float) -> dict[str, float]:
         """Errors at the horizon nearest to the given one, by who forecasts."""
@@ -124,16 +197,35 @@ class ForecastSkill:
         last = len(self.horizons_s) - 1
         places = sorted({round(k / 16 * last) for k in (0, 1, 2, 4, 8, 12, 16)})
         return {
-            "horizons_periods": [self._in_unit(h) for h in self.horizons_s[places].tolist()],
+            "text": self.text,
+            "is_better": self.is_better,
+            "horizons_periods": [h / self.unit_s for h in self.horizons_s[places].tolist()],
             "nrmse": {name: values[places].tolist() for name, values in self.nrmse.items()},
             "better_until_periods": self.better_until_periods,
             "coverage_90": self.coverage_90,
+            "band_of": self.example.band_of,
         }
 
-    def _in_unit(self, duration_s: float) -> float:
-        """A duration in periods, or in samples."""
-        unit_s = self.period_s if np.isfinite(self.period_s) else float(self.horizons_s[0])
-        return duration_s / unit_s
+    @property
+    def unit_s(self) -> float:
+        """What horizons are counted in: periods, or samples."""
+        return self.period_s if np.isfinite(self.period_s) else self.step_s
+
+    @property
+    def unit(self) -> str:
+        return "periods" if np.isfinite(self.period_s) else "samples"
+
+
+def standard_error(gain: Float[np.ndarray, " starts"], n_free: int) -> float:
+    """Standard error of the mean of gains that are correlated from start to start.
+
+    The power of slow variations, which is what a mean is uncertain by, is that of the first
+    `n_free` cosines: the ratio to it has Student's distribution with as many degrees of freedom.
+    Source: Lazarus, Lewis, Stock & Watson 2018, doi:10.1080/07350015.2018.1506926.
+    """
+    n = len(gain)
+    waves = np.cos(np.pi * np.outer(np.arange(1, n_free + 1), (np.arange(n) + 0.5) / n))
+    return float(np.sqrt(2.0 * np.square(waves @ gain).mean()) / n)
 
 
 @one_thread()
@@ -158,67 +250,58 @@ def forecast_skill(
     the longest horizon; None takes four periods, or what half of the rest allows. measured: as for
     `forecast`. states_of: makes the states of a past whose first columns are the measured ones
     (`ep.embed`). estimator: calibrated on the fitted part. n_draws: of every forecast.
-    Raises ValueError for a driven model, or a part that is too short.
+    Inputs of a model are known ahead, also to the autoregression.
+    Raises ValueError for a part that is too short, or a record without an input.
     """
     record, watch = trajectory_of(run), as_progress(progress)
-    fitted = _fitted_part(model, record, n_fitted)
+    check_fitted(record, n_fitted)
+    fitted = record.window(0, n_fitted)
     if estimator is None:
         estimator = tune_estimator(model, fitted, measured=measured, progress=watch)
         estimator = calibrate(estimator, fitted, states_of=states_of, progress=watch)
-    names, period_s = estimator.names, _period_of(fitted, estimator.names)
+    names, period_s = estimator.names, period_of(fitted, estimator.names)
     longest = _horizon_of(record, n_fitted, period_s, horizon_s)
     first = spread_starts(record.t, n_fitted, longest, check_count("starts", starts))
+    own = measured_part(record, names, model.inputs)
+    baselines = fit_baselines(own.window(0, n_fitted), longest)
+    linear = baselines.get(AUTOREGRESSION)
+    assert linear is None or isinstance(linear, Autoregression)
     rolling = RollingStarts(estimator, record, first, longest)
     with watch.stage(len(first), "start", "forecasts") as advance:
         ends = rolling.ends(states_of, advance)
     ahead = rolling.forecast(ends, check_count("n_draws", n_draws), seed)
-    shown, (baselines, order) = spread_evenly(longest, N_HORIZONS), _fit_baselines(fitted, names)
+    ahead = rolling.with_sound_bands(ahead, linear)
+    begins = _bins(longest, period_s / record.dt_s)
+    scale = zero_to_one(own.states[n_fitted:].std(axis=0))
     paths = {MODEL: rolling.measured(ahead)}
-    paths |= {name: _go_on(each, rolling) for name, each in baselines.items()}
-    scale = zero_to_one(record.columns(names)[n_fitted:].std(axis=0))
-    errors = {n: horizon_errors(path, rolling.truth, scale)[shown] for n, path in paths.items()}
+    paths |= {name: go_on(each, own, first, longest) for name, each in baselines.items()}
+    errors = {name: squared_errors(path, rolling.truth, scale) for name, path in paths.items()}
     return ForecastSkill(
-        horizons_s=rolling.steps_s[shown],
+        horizons_s=rolling.steps_s[np.append(begins[1:], longest) - 1],
         period_s=period_s,
-        nrmse=MappingProxyType(errors),
+        step_s=record.dt_s,
+        apart_s=float(np.ptp(record.t[first])) / max(1, len(first) - 1),
+        squared=MappingProxyType({name: _average(each, begins) for name, each in errors.items()}),
         coverage_90=rolling.coverage(ahead, LEVEL),
-        n_starts=len(first),
         example=ahead[0],
-        order=order,
+        order=0 if linear is None else linear.order,
         clock=record.clock,
+        resampled=not is_uniform(record.t),
     )
 
 
-def _fitted_part(model: SparseModel, record: Trajectory, n_fitted: int) -> Trajectory:
-    """The samples that were fitted. Raises ValueError for a driven model, or too few samples."""
-    if model.inputs:
-        raise ValueError(
-            f"the skill of forecasts is counted for models without inputs: this one is driven by "
-            f"{list(model.inputs)}, whose future nobody knows; compare `model.rollout` along them"
-        )
-    check_fitted(record, n_fitted)
-    return record.window(0, n_fitted)
+def _bins(longest: int, per_period: float) -> Int[np.ndarray, " horizons"]:
+    """Where the bins of horizons begin, over which errors are averaged, in samples."""
+    width = per_period / BINS_PER_PERIOD if np.isfinite(per_period) else longest / MOST_BINS
+    return np.arange(0, longest, max(1, round(width)))
 
 
-def check_fitted(record: Trajectory, n_fitted: int) -> None:
-    """Raise ValueError for a fitted or a held-out part of too few samples."""
-    if not 8 <= n_fitted <= record.n_samples - 4:
-        raise ValueError(
-            "the fitted part must have eight samples or more, and leave four: "
-            f"n_fitted={n_fitted} came for {record.n_samples} samples"
-        )
-
-
-def _period_of(run: Trajectory, names: Sequence[str]) -> float:
-    """Period of the record, or mean time between crossings; NaN if it holds fewer than two."""
-    values = run.columns(names)
-    cycle = find_cycle(run.t, values)
-    if cycle is None:
-        frequency_Hz = max(crossing_frequency(run.t, column) for column in values.T)
-    else:
-        frequency_Hz = cycle.frequency_Hz
-    enough = frequency_Hz * float(run.t[-1] - run.t[0]) >= 2.0
-    return 1.0 / frequency_Hz if enough else float("nan")
+def _average(
+    squared: Float[np.ndarray, "starts ahead"], begins: Int[np.ndarray, " horizons"]
+) -> Float[np.ndarray, "starts horizons"]:
+    """Means over the bins."""
+    sizes = np.diff(np.append(begins, squared.shape[1]))
+    return np.add.reduceat(squared, begins, axis=1) / sizes
 
 
 def _horizon_of(record: Trajectory, n_fitted: int, period_s: float, horizon_s: float | None) -> int:
@@ -234,141 +317,3 @@ def _horizon_of(record: Trajectory, n_fitted: int, period_s: float, horizon_s: f
             f"{left * record.dt_s:.4g} s are held out"
         )
     return min(n, max(1, left // 2)) if horizon_s is None else n
-
-
-def _fit_baselines(fitted: Trajectory, names: Sequence[str]) -> tuple[dict[str, Baseline], int]:
-    """The baselines that the record allows, by name, and the order of the autoregression."""
-    own = Trajectory(fitted.t, fitted.columns(names), tuple(names))
-    found: dict[str, Baseline] = {PERSISTENCE: Persistence()}
-    if (harmonics := Harmonics.of(own)) is not None:
-        found[HARMONICS] = harmonics
-    if (linear := Autoregression.of(own)) is not None:
-        found[AUTOREGRESSION] = linear
-    return found, 0 if linear is None else linear.order
-
-
-def _go_on(
-    baseline: Baseline, rolling: RollingStarts
-) -> Float[np.ndarray, "starts ahead measured"]:
-    """What a baseline forecasts from every start."""
-    record, n = rolling.record, rolling.longest
-    samples, t = record.columns(rolling.estimator.names), record.t
-    return np.stack([baseline.ahead(samples[:k], t[:k], t[k : k + n]) for k in rolling.first])
-
-
-def horizon_errors(
-    forecast: Float[np.ndarray, "starts ahead measured"],
-    truth: Float[np.ndarray, "starts ahead measured"],
-    scale: Float[np.ndarray, " measured"] | float,
-) -> Float[np.ndarray, " ahead"]:
-    """Root mean square error over starts and states at every horizon, in `scale`."""
-    off = np.nan_to_num(np.abs(forecast - truth) / scale, nan=WORST, posinf=WORST)
-    return np.sqrt(np.square(np.minimum(off, WORST)).mean(axis=(0, 2)))
-
-
-# Forecasts without a model of the system, which a model must beat to be worth anything.
-
-
-@runtime_checkable
-class Baseline(Protocol):
-    """Interface of the baselines: forecasts of the next samples from the past alone."""
-
-    def ahead(
-        self, past: Float[np.ndarray, "samples n_states"], t: Float[np.ndarray, " samples"],
-        times: Float[np.ndarray, " ahead"],
-    ) -> Float[np.ndarray, "ahead n_states"]: ...  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Persistence:
-    """The last sample stays."""
-
-    def ahead(self, past: np.ndarray, t: np.ndarray, times: np.ndarray) -> np.ndarray:
-        return np.repeat(past[-1:], len(times), axis=0)
-
-
-@dataclass(frozen=True, eq=False)
-class Harmonics:
-    """The mean waveform of a record goes on, at the phase that the last period shows."""
-
-    cycle: Cycle
-
-    @staticmethod
-    def of(run: Trajectory) -> Harmonics | None:
-        """None for a record without a period."""
-        cycle = find_cycle(run.t, run.states)
-        return None if cycle is None else Harmonics(cycle)
-
-    def ahead(self, past: np.ndarray, t: np.ndarray, times: np.ndarray) -> np.ndarray:
-        turns = 2.0 * np.pi * self.cycle.frequency_Hz
-        late = t >= t[-1] - 1.0 / self.cycle.frequency_Hz
-        shifts = 2.0 * np.pi * np.arange(72) / 72.0
-        spread = np.where(self.cycle.std > 0.0, self.cycle.std, 1.0)
-        off = [
-            np.square((self.cycle.waveform(turns * t[late] + shift) - past[late]) / spread).sum()
-            for shift in shifts
-        ]
-        return self.cycle.waveform(turns * times + shifts[int(np.argmin(off))])
-
-
-@dataclass(frozen=True, eq=False)
-class Autoregression:
-    """A linear autoregression, of all states at once, whose order has the least AIC.
-
-    constant: (n_states,). coef: (order, n_states, n_states), of the last sample first.
-    """
-
-    constant: Float[np.ndarray, " n_states"]
-    coef: Float[np.ndarray, "order n_states n_states"]
-
-    @staticmethod
-    def of(run: Trajectory) -> Autoregression | None:
-        """None for steps that are not equal, or too few samples."""
-        d = run.states.shape[1]
-        most = _largest_order(run)
-        if most < 1 or not is_uniform(run.t):
-            return None
-        states = run.states[-MAX_FITTED:]
-        mean, scale = states.mean(axis=0), zero_to_one(states.std(axis=0))
-        x = (states - mean) / scale
-        if d == 1:
-            from statsmodels.tsa.ar_model import AutoReg, ar_select_order  # takes a second
-
-            with catch_warnings():  # of a record without noise, for which any solution is exact
-                simplefilter("ignore")
-                lags = ar_select_order(x[:, 0], maxlag=most, ic="aic").ar_lags or [1]
-                params = AutoReg(x[:, 0], lags=max(lags)).fit().params
-            constant, coef = params[:1], params[1:].reshape(-1, 1, 1)
-        else:
-            from statsmodels.tsa.vector_ar.var_model import VAR
-
-            fit = VAR(x).fit(maxlags=most, ic="aic")
-            if fit.k_ar == 0:
-                return None
-            constant, coef = fit.intercept, fit.coefs
-        coef = coef * scale[:, None] / scale
-        constant = scale * constant + mean - coef.sum(axis=0) @ mean
-        return Autoregression(constant, coef)
-
-    @property
-    def order(self) -> int:
-        return len(self.coef)
-
-    def ahead(self, past: np.ndarray, t: np.ndarray, times: np.ndarray) -> np.ndarray:
-        known = list(past[-self.order :])
-        if len(known) < self.order:
-            return np.full((len(times), past.shape[1]), np.nan)
-        for _ in range(len(times)):
-            last = np.array(known[: -self.order - 1 : -1])
-            known.append(self.constant + np.einsum("lij,lj->i", self.coef, last))
-        return np.array(known[self.order :])
-
-
-def _largest_order(run: Trajectory) -> int:
-    """Largest order that is tried: two periods, if there are samples enough."""
-    frequency_Hz = max(dominant_frequency(run.t, column) for column in run.states.T)
-    periods = frequency_Hz * float(run.t[-1] - run.t[0])
-    d = run.states.shape[1]
-    most = MAX_ORDER if d == 1 else MAX_ORDERS / d
-    wanted = 2.0 * run.n_samples / periods if periods >= 1.0 else most
-    return int(min(wanted, most, run.n_samples / (SAMPLES_PER_COEFFICIENT * d)))

@@ -93,6 +93,7 @@ class StateEstimator:
     n_substeps: int
     per_period: float
     noise: ModelNoise
+    held: float = float("nan")
 
     @property
     def measured(self) -> Bool[np.ndarray, " n_states"]:

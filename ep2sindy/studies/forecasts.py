@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
@@ -21,7 +20,8 @@ CAPTION = (
     "Forecast from the first held-out sample on, fitted to the past alone, with the band "
     "that is to hold 90 % of the samples. Last panel: error of forecasts from starts all over the "
     "held-out part, by horizon (1: no better than the mean); persistence: the last sample "
-    "stays; harmonics: the mean cycle goes on; autoregression: linear, its order by AIC."
+    "stays; harmonics: the mean cycle goes on; autoregression: linear in the samples or in their "
+    "logarithms, its order by AIC; neighbours: what followed the most similar moments."
 )
 
 
@@ -38,8 +38,8 @@ def why_none(run: Trajectory, n_fitted: int) -> str:
 def skill_of(
     model: SparseModel, run: Trajectory, *, n_fitted: int, starts: int, progress: Progress = SILENT
 ) -> ForecastSkill | None:
-    """Skill of a model of measured states; None for a driven or empty model, or a short record."""
-    if not starts or model.inputs or is_short(run, n_fitted) or not model.coef.any():
+    """Skill of a model of measured states; None for an empty model, or a short record."""
+    if not starts or is_short(run, n_fitted) or not model.coef.any():
         return None
     return forecast_skill(model, run, n_fitted=n_fitted, starts=starts, progress=progress)
 
@@ -60,18 +60,21 @@ def add_forecasts(
 
 def _table(skill: ForecastSkill) -> Table:
     """Errors at a few horizons, by who forecasts."""
-    in_periods = bool(np.isfinite(skill.period_s))
-    unit_s = skill.period_s if in_periods else float(skill.horizons_s[0])
-    last = float(skill.horizons_s[-1]) / unit_s
+    in_periods = skill.unit == "periods"
+    last = float(skill.horizons_s[-1]) / skill.unit_s
     asked = SHOWN_PERIODS if in_periods else (1.0, 2.0, 4.0, 8.0, 16.0)
     shown = [each for each in asked if each <= 1.02 * last] or [last]
-    rows = pd.DataFrame([skill.at(each * unit_s) for each in shown])
-    unit = "period" if in_periods else "sample"
-    ahead = [f"{each:g} {unit}{'s' if each > 1 else ''} ahead" for each in shown]
+    rows = pd.DataFrame([skill.at(each * skill.unit_s) for each in shown])
+    units = [skill.unit if each > 1 else skill.unit[:-1] for each in shown]
+    ahead = [f"{each:g} {unit} ahead" for each, unit in zip(shown, units, strict=True)]
     rows.insert(0, "horizon", ahead)
+    bands = "the bands"
+    if skill.example.sound is not None:
+        bands = "the model's bands held under 60 % where it was fitted; the autoregression's"
+    steps = " Baselines take the samples interpolated onto equal steps." if skill.resampled else ""
     return Table(
         rows,
         title="error of forecasts (standard deviations)",
-        note=f"{skill.n_starts} starts, each fitted to the past alone; the bands of 90 % hold "
-        f"{100.0 * skill.coverage_90:.0f} % of the samples.",
+        note=f"{skill.n_starts} starts, each fitted to the past alone; {bands} of 90 % hold "
+        f"{100.0 * skill.coverage_90:.0f} % of the samples.{steps}",
     )

@@ -143,6 +143,7 @@ class Study:
                 free,
                 file=NAME,
                 picture=f"free_run_{NAME}",
+                skill=skill,
                 more=remarks,
                 where=where,
                 seen=seen,

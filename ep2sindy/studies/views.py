@@ -13,6 +13,7 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
 from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Block, Result, Text
@@ -132,25 +133,30 @@ def found_model(
     *,
     file: str,
     picture: str,
+    skill: ForecastSkill | None = None,
     more: Sequence[Block] = (),
     where: str,
     seen: bool = False,
     misfit: str = "",
     held: Constraint | None = None,
 ) -> Result:
-    """A model as what was found: its equations, and how it runs.
+    """A model as what was found: what it foresees, its equations, and how it runs.
 
-    found: how it was found, such as `Found from I_d`. file: its name among the run's models. where:
-    what it was run over, in words, such as `held-out time`. seen: whether it was fitted to that.
-    misfit: why it does not explain the data, a warning; may be empty. held: that its coefficients
-    obey, if it was found under roles.
+    found: how it was found, such as `Found from I_d`. file: its name among the run's models. skill:
+    of its forecasts, which are the headline; without them it is how the model runs. where: what it
+    was run over, in words, such as `held-out time`. seen: whether it was fitted to that. misfit:
+    why it does not explain the data, a warning; may be empty. held: that its coefficients obey, if
+    it was found under roles.
     """
     clock, model = run.rollout.clock, run.model
+    fate = _fate(run, seen=seen, misfit=misfit)
+    free = run_words(run) if skill is None else f"{fate}; {run_words(run)}"
     return Result(
-        f"{found}: a model that {_fate(run, seen=seen, misfit=misfit)}",
+        f"{found}: {f'a model that {fate}' if skill is None else skill.headline}",
         [
             *equations(model, clock, held=held),
-            Text(f"run freely from one sample over {where}: {run_words(run)}"),
+            Text(f"run freely from one sample over {where}: {free}"),
+            *([Text(run.rest_text)] if run.rest_text else []),
             *([Text(misfit, warning=True)] if misfit else []),
             *more,
         ],

@@ -1,0 +1,94 @@
+"""What a sentence about forecasts says: better than an autoregression, or nothing of the kind."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ep2sindy.forecasting.forecast import Forecast
+from ep2sindy.forecasting.skill import EXCEEDS, SURE, ForecastSkill, standard_error
+from ep2sindy.library.units import SECONDS
+
+N_HORIZONS = 40
+AHEAD = Forecast(
+    t=np.ones(1), states=np.ones((1, 1)), draws=np.ones((1, 1, 1)), noise_std=np.zeros(1),
+    state_names=("x",), units={"x": "1"},
+)  # fmt: skip
+
+
+def skill(apart_s: float = 1.0, **squared: np.ndarray) -> ForecastSkill:
+    """Of errors (starts, horizons) up to two periods of a second."""
+    horizons_s = np.linspace(0.05, 2.0, N_HORIZONS)
+    return ForecastSkill(
+        horizons_s, 1.0, 0.05, apart_s, squared, 0.9, example=AHEAD, order=3, clock=SECONDS
+    )
+
+
+def errors(size: float | np.ndarray, *, seed: int = 0, n: int = 40) -> np.ndarray:
+    """Square errors that scatter by a tenth, independently."""
+    rng = np.random.default_rng(seed)
+    return size * (1.0 + 0.1 * rng.standard_normal((n, N_HORIZONS)))
+
+
+def test_a_gain_at_all_horizons_is_told() -> None:
+    found = skill(model=errors(0.1), autoregression=errors(0.3, seed=1))
+    assert found.text == "better than an autoregression (AR 3) for 2 periods and more"
+    assert found.headline == f"a model that forecasts {found.text}"
+    assert found.better_until_periods == 2.0
+
+
+def test_a_span_begins_at_the_first_horizon_and_ends_with_the_gain() -> None:
+    grows = np.where(np.arange(N_HORIZONS) < 20, 0.1, 0.6)
+    found = skill(model=errors(grows), autoregression=errors(0.3, seed=1))
+    assert found.text == "better than an autoregression (AR 3) for 1 periods"
+    later = skill(model=errors(grows[::-1]), autoregression=errors(0.3, seed=1))
+    assert later.text == "no better than an autoregression (AR 3)"
+    assert later.headline == "nothing that forecasts better than an autoregression (AR 3)"
+
+
+def test_errors_above_the_mean_s_are_no_forecast() -> None:
+    found = skill(model=errors(1.5), autoregression=errors(3.0, seed=1))
+    assert not found.is_better
+    assert "the mean of the record is nearest" in found.text
+
+
+def test_what_is_nearest_is_named() -> None:
+    both = {"model": errors(0.3), "autoregression": errors(0.2, seed=1)}
+    assert skill(**both, harmonics=errors(0.1, seed=2)).text == (
+        "no better than an autoregression (AR 3); the mean cycle is nearest"
+    )
+    better = {"model": errors(0.2), "autoregression": errors(0.3, seed=1)}
+    assert skill(**better, neighbours=errors(0.1)).text.endswith(
+        "; the record's own past (nearest neighbours) is nearer at most horizons"
+    )
+    assert "than the last sample for" in replace(
+        skill(model=errors(0.2), persistence=errors(0.3)), order=0
+    ).text  # fmt: skip
+
+
+def test_one_start_or_equal_errors_tell_nothing() -> None:
+    assert not skill(model=errors(0.1, n=1), autoregression=errors(0.3, n=1)).is_better
+    assert not skill(model=errors(0.1), autoregression=errors(0.1)).is_better
+
+
+@pytest.mark.parametrize("overlap", [1, 5, 10])
+def test_correlated_starts_are_allowed_for(overlap) -> None:
+    """Overlapping forecasts share what moves them. Without a gain, chance exceeds its standard
+    error in one case of six, and is sure in one of twenty.
+    """
+    rng, n, n_cases = np.random.default_rng(overlap), 40, 1000
+    found = skill(apart_s=2.0 / overlap, model=errors(0.1), autoregression=errors(0.1))
+    gains = [
+        np.convolve(rng.standard_normal(n + overlap - 1), np.ones(overlap), "valid")
+        for _ in range(n_cases)
+    ]
+    for level in (EXCEEDS, SURE):
+        share = np.mean([found._exceeds(gain, -1, level) for gain in gains])
+        # Two standard deviations of such a share, and a quarter of it for what few waves miss.
+        assert share == pytest.approx(1.0 - level, abs=0.025 + 0.25 * (1.0 - level))
+
+
+def test_a_standard_error_is_that_of_the_mean() -> None:
+    rng = np.random.default_rng(0)
+    found = [standard_error(rng.standard_normal(400), 8) for _ in range(200)]
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(1.0 / 20.0, rel=0.1)
