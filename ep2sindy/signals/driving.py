@@ -283,7 +283,8 @@ def _sets(signal: Trace, t: np.ndarray, u: np.ndarray) -> str:
 
 def _impurity(cycle: Cycle, x: np.ndarray) -> float:
     """Share of the variance that is not the fundamental's."""
-    return 1.0 - 0.5 * float(np.abs(cycle.harmonics[0, 0]) ** 2 / x.var())
+    rest = x - (cycle.harmonics[0, 0] * np.exp(1j * cycle.phase)).real
+    return float(rest.var() / x.var())
 
 
 HELD = "held between steps"
@@ -305,28 +306,35 @@ def describe_set(t: Float[np.ndarray, " samples"], u: Float[np.ndarray, " sample
         leaps = np.median(moved) > 1.5 * moved.min() or len(np.unique(u)) <= FEW_LEVELS
         return HELD if lasts and leaps else ""
     cycle = find_cycle(t, u[:, None])
-    if cycle is None or (u - cycle.waveform(cycle.phase)[:, 0]).std() > CLEAN * u.std():
+    if cycle is None:
         return ""
-    if _is_wave(cycle, np.cos):
+    left = float((u - cycle.waveform(cycle.phase)[:, 0]).var() / u.var())
+    if _is_wave(cycle, np.cos, left):
         return WAVES[0]
     first, second = np.abs(np.append(cycle.harmonics[:, 0], 0.0))[:2]
-    rise = np.arccos(min(2.0 * second / first, 0.98)) / np.pi  # share of the period
+    rise = np.arccos(min(2.0 * second / first, 1.0 - 1e-6)) / np.pi  # share of the period
 
     def sweep(phase: np.ndarray) -> np.ndarray:
         share = phase / (2.0 * np.pi) % 1.0
         return np.where(share < rise, share / rise, (1.0 - share) / (1.0 - rise))
 
-    found = _is_wave(cycle, sweep) or _is_wave(cycle, lambda phase: sweep(-phase))
+    found = _is_wave(cycle, sweep, left) or _is_wave(cycle, lambda p: sweep(-p), left)
     return WAVES[1] if found else ""
 
 
-def _is_wave(cycle: Cycle, wave: Callable[[np.ndarray], np.ndarray]) -> bool:
-    """Whether the waveform is a given one, at some phase and of any size."""
-    phase = 2.0 * np.pi * np.arange(720) / 720
-    own = cycle.waveform(phase)[:, 0]
-    a, b = (each - each.mean() for each in (own, wave(phase)))
-    products = np.fft.irfft(np.fft.rfft(a).conj() * np.fft.rfft(b), len(a))
-    return bool(np.abs(products).max() > SAME * np.sqrt((a @ a) * (b @ b)))
+def _is_wave(cycle: Cycle, wave: Callable[[np.ndarray], np.ndarray], left: float) -> bool:
+    """Whether a waveform is a given one, at some phase and of any size.
+
+    left: share of the variance that the waveform leaves; that of harmonics beyond it may be more.
+    """
+    n, n_points = len(cycle.harmonics), 720
+    ideal = np.fft.rfft(wave(2.0 * np.pi * np.arange(n_points) / n_points))[1:]
+    beyond = float(np.square(np.abs(ideal[n:])).sum() / np.square(np.abs(ideal)).sum())
+    own, same = np.zeros((2, n_points // 2 + 1), dtype=np.complex128)
+    own[1 : n + 1], same[1 : n + 1] = cycle.harmonics[:, 0], ideal[:n]
+    size = np.sqrt(np.square(np.abs(own)).sum() * np.square(np.abs(same)).sum())
+    shifted = 0.5 * n_points * np.fft.irfft(own.conj() * same, n_points)
+    return bool(left < CLEAN**2 + beyond and np.abs(shifted).max() > SAME * size)
 
 
 def propose_inputs(
