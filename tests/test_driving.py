@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.app.runner import run_config
 from ep2sindy.signals.driving import (
     ask_whether_driven,
     describe_set,
@@ -15,6 +17,7 @@ from ep2sindy.signals.driving import (
     say_what_is_not_told,
 )
 from ep2sindy.signals.trace import Trace, prepare_signal
+from tests.programs import composed, summary_of
 
 PERIOD_S = 5.3
 TURN = 2.0 * np.pi
@@ -214,3 +217,19 @@ def test_a_library_of_a_drive_lacks_what_its_sum_of_squares_says() -> None:
 def test_a_drive_needs_a_positive_period() -> None:
     with pytest.raises(ValueError, match="period_s must be"):
         ep.signals.add_drive(duffing(0.0), period_s=0.0)
+
+
+def test_a_study_asks_whether_a_signal_is_driven_and_takes_the_column(tmp_path: Path) -> None:
+    t, sweep, x = swept()
+    x = x + 0.02 * x.std() * np.random.default_rng(0).standard_normal(len(x))
+    path = tmp_path / "probe.csv"
+    columns = np.column_stack([t, x, sweep])
+    np.savetxt(path, columns, delimiter=",", header="time,x,V", comments="")
+    given = ["+exp=discover", "data=file", f"data.path={path}", "data.z.name=null"]
+    given += ["~data.variables", "trajectory.states=[x]", f"output={tmp_path}", "forecasts=0"]
+    both = "+data.variables={x:{name:x,unit:1},V:{name:V,unit:1}}"
+    asked = run_config(composed(*given, "+data.variables={x:{name:x,unit:1}}"))
+    assert "is x driven? It may be: V beside it looks set" in (asked / "run.log").read_text()
+    told = run_config(composed(*given, both, "inputs=[V]"))
+    assert "is x driven?" not in (told / "run.log").read_text()
+    assert set(summary_of(told)["models"]["model"]["equations"]["x"]) == {"x", "V", "V^2"}

@@ -147,7 +147,9 @@ class PhaseRecord:
         size = MADS * float(np.median(np.abs(a[2:] - past @ coef)))
         white = self.noise * (1.0 + float(coef @ coef))
         moves = size**2 - white
-        return moves if moves > max(N_SURE * MAD_ERROR / n**0.5 * white, LEAST_MOVE**2) else 0.0
+        return (
+            float(moves) if moves > max(N_SURE * MAD_ERROR / n**0.5 * white, LEAST_MOVE**2) else 0.0
+        )
 
     @property
     def keeps_time(self) -> bool:
@@ -157,7 +159,8 @@ class PhaseRecord:
         as a share) at least, and nothing brings that back: its squares about the best line grow
         with the record. They lie below the bound in one of a hundred such records, at most.
         """
-        return float(np.square(self.phase).mean()) < LEAST_WALK * len(self.phase) * self.moves
+        least = LEAST_WALK * len(self.phase) * self.moves
+        return bool(np.square(self.phase).mean() < least)
 
 
 def ask_whether_driven(
