@@ -135,8 +135,9 @@ class Study:
         seen = len(best.states.signal.t) == len(signal.t)
         where = "all of it, too short to hold out" if seen else "its end, which was not fitted"
         remarks = [Text(free.caution, warning=True)] if free.caution else []
-        if not question and (remark := say_what_is_not_told(signal)):
-            remarks.append(Text(remark))
+        lives = free.status is Status.SUSTAINED and not question
+        if lives and (remark := say_what_is_not_told(signal)):
+            remarks.append(Text(remark, page_only=True))
         report.found(
             found_model(
                 f"Found from {signal.name}",
