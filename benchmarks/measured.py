@@ -89,7 +89,21 @@ def show(name: str, found: Traced | str, horizons: dict[str, float]) -> None:
     for words, horizon in horizons.items():
         print(f"  {words} ahead: {found.at(horizon)}")
     if forecast := found.summary.get("forecasts", {}).get("trace"):
-        print(f"  bands of 90 % hold {100 * forecast['coverage_90']:.0f} %", flush=True)
+        print(f"  {forecast['text']}: {is_true(forecast)}")
+        print(
+            f"  bands of 90 %, the {forecast['band_of']}'s, hold "
+            f"{100 * forecast['coverage_90']:.0f} %",
+            flush=True,
+        )
+
+
+def is_true(forecast: dict[str, Any]) -> str:
+    """Whether the held-out part bears a sentence out: errors below one, and below the rival's."""
+    own, rival = (np.array(forecast["nrmse"][name]) for name in ("model", "autoregression"))
+    until = forecast["better_until_periods"]
+    told = np.array(forecast["horizons_periods"]) <= until * (1.0 + 1e-9)
+    holds = bool(((own < rival) & (own < 1.0))[told].all())
+    return "true" if holds and bool(until) == forecast["is_better"] else "not true"
 
 
 def read(name: str, column: str) -> tuple[np.ndarray, np.ndarray]:
@@ -160,6 +174,7 @@ def populations() -> None:
             if found.model.coef.any():
                 skill = ep.model.forecast_skill(found.model, run, n_fitted=n_fitted)
                 print(f"  {skill.text}; one step ahead {skill.at(run.dt_s)}")
+                print(f"  {is_true(skill.summary())}")
                 print(f"  bands of 90 % hold {100 * skill.coverage_90:.0f} %", flush=True)
 
 

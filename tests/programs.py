@@ -97,7 +97,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
 
 def check_end(log: str, page: str, result: Result, folder: Path) -> None:
     """The last lines say what was found, how to load it and what to open; the page begins so."""
-    last = "".join("".join(log.splitlines()[-14:]).split())  # long lines are broken
+    last = "".join("".join(log.splitlines()[-20:]).split())  # long lines are broken
     end = f"load: {result.load.format(folder)} open: {folder}/report.html"
     assert last.endswith("".join(end.split()))
     assert "".join(result.title.split()) in last

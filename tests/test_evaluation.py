@@ -11,7 +11,7 @@ import pytest
 from benchmarks.known_systems import noisy
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting import evaluation
-from ep2sindy.forecasting.evaluation import Evaluation, evaluate
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate, size_text
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.comparison import FreeRunBounds, Status, samples_in
 from ep2sindy.model.model import SparseModel, coef_matrix
@@ -260,9 +260,22 @@ def test_only_what_is_asked_for_is_computed_and_once(monkeypatch: pytest.MonkeyP
     assert calls.count("forecast_skill") == calls.count("limit_cycle") == 1
 
 
-def test_forecasts_need_held_out_samples_and_a_model_of_its_own() -> None:
+def test_of_a_line_of_rest_points_one_is_told() -> None:
+    run = record()
+    beside = evaluate(model_of({"x": {"y": 1.0}, "y": {"y": -1.0}}), run, n_samples=200)
+    (line,) = beside.rest_texts
+    assert "neutral: a departure neither grows nor decays" in line
+    far = evaluate(model_of({"x": {"1": 1e3, "x": -1.0}, "y": {"y": -1.0}}), run, n_samples=200)
+    assert far.rest_points == ()
+
+
+def test_a_run_that_left_is_not_told_in_its_size() -> None:
+    assert [size_text(x) for x in (0.5, 100.0, 4.11e7)] == ["0.5", "100", "over 100"]
+
+
+def test_forecasts_need_held_out_samples() -> None:
     assert evaluate(hopf(), record()).forecast is None
-    with pytest.raises(ValueError, match="n_fitted=1999 came for 2001 samples"):
+    with pytest.raises(ValueError, match="got n_fitted=1999 for 2001 samples"):
         evaluate(hopf(), record(), n_fitted=1999)
 
 

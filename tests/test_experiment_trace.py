@@ -76,7 +76,10 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
     assert "intervals are not given" in " ".join(log.split())  # of smoothed states
     assert summary["signal"]["misfit"]
     forecast = summary["forecasts"]["trace"]
-    assert set(forecast["nrmse"]) == {"model", "persistence", "harmonics", "autoregression"}
+    assert {"model", "harmonics", "autoregression", "neighbours"} <= set(forecast["nrmse"])
+    assert f"Found from I: nothing that forecasts {forecast['text'][3:]}" in " ".join(log.split())
+    assert "run freely from one sample over its end" in log
+    assert "unstable: a departure grows" in " ".join(log.split())
     assert max(forecast["nrmse"]["model"]) < 0.3
     (tried,) = summary["tried"]
     assert tried["n_states"] == 2

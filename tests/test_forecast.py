@@ -10,6 +10,8 @@ import ep2sindy as ep
 from ep2sindy.data.numbers import quantiles
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.likelihood import linearise
+from ep2sindy.forecasting import forecast as forecasts
+from ep2sindy.forecasting.forecast import calibrate
 from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
 from tests.models import model_of
@@ -17,6 +19,7 @@ from tests.models import model_of
 LINEAR = ep.polynomial(["x", "v"], degree=1)
 SPRING = ep.SparseModel(LINEAR, ["x", "v"], ep.model.coef_matrix(LINEAR, [{"v": 1.0}, {"x": -1.0}]))
 LORENZ = ep.lorenz()
+DRIVEN = model_of({"x": {"v": 1.0}, "v": {"x": -1.0, "v": -0.3, "u": 1.0}}, ["u"])
 
 
 @cache
@@ -98,6 +101,47 @@ def test_bands_grow_where_the_record_is_pushed() -> None:
         ep.model.forecast_skill(SPRING, run, n_fitted=900, starts=30).coverage_90 for run in runs
     ]
     assert 0.82 <= np.mean(held) <= 0.97  # 300 samples are few when pushes last
+
+
+def driven_spring(n: int = 1200) -> Trajectory:
+    """A damped spring that is pushed by an input which nobody could foresee."""
+    rng, t = np.random.default_rng(3), 0.1 * np.arange(n)
+    u = np.repeat(rng.standard_normal(n // 20), 20)
+    run = DRIVEN.simulate(t, [1.0, 0.0], inputs={"u": u})
+    noisy = run.states + 0.05 * rng.standard_normal((n, 2))
+    return Trajectory(t, noisy, ("x", "v"), u[:, None], ("u",))
+
+
+def test_inputs_are_known_ahead_to_model_and_autoregression() -> None:
+    run = driven_spring()
+    skill = ep.model.forecast_skill(DRIVEN, run, n_fitted=900, starts=20)
+    assert skill.is_better
+    assert skill.nrmse["model"].max() < 0.15
+    assert skill.nrmse["autoregression"][-1] < 0.5 * skill.nrmse["neighbours"][-1]
+    assert 0.8 <= skill.coverage_90 <= 0.97
+    own = ep.forecast(DRIVEN, run.window(0, 900), 5.0, inputs={"u": run.inputs[899:950, 0]})
+    assert np.abs(own.states - run.states[900:950]).max() < 0.4
+    with pytest.raises(ValueError, match="this model is driven by"):
+        ep.forecast(DRIVEN, run.window(0, 900), 5.0)
+
+
+def test_bands_that_did_not_hold_are_the_autoregression_s(monkeypatch) -> None:
+    run = driven_spring()
+    fitted = run.window(0, 900)
+    estimator = calibrate(tune_estimator(DRIVEN, fitted), fitted)
+    assert estimator.held == pytest.approx(0.9, abs=0.05)
+    for held, whose in ((0.59, "autoregression"), (0.61, "model")):
+        skill = ep.model.forecast_skill(
+            DRIVEN, run, n_fitted=900, starts=10, estimator=replace(estimator, held=held)
+        )
+        assert skill.example.band_of == whose
+        assert 0.75 <= skill.coverage_90 <= 1.0
+    monkeypatch.setattr(forecasts, "LEAST_HELD", 1.1)
+    ahead = ep.forecast(DRIVEN, fitted, 5.0, inputs={"u": run.inputs[899:950, 0]})
+    low, high = ahead.band()
+    inside = (low <= run.states[900:950]) & (run.states[900:950] <= high)
+    assert ahead.band_of == "autoregression"
+    assert 0.75 <= inside.mean() <= 1.0
 
 
 def test_a_state_that_was_not_measured_is_fitted_by_the_model() -> None:

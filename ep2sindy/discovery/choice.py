@@ -17,6 +17,7 @@ from scipy.linalg import block_diag
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory, spread_blocks
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, NoiseTest
+from ep2sindy.forecasting.evaluation import size_text
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
@@ -189,7 +190,9 @@ def _describe_misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> 
     more = {state: each.chi_squared for state, each in left.items() if not each.leaves_noise}
     if not more:
         return ""
-    parts = ", ".join(f"{state}' ({value:.3g} times its size)" for state, value in more.items())
+    parts = ", ".join(
+        f"{state}' ({size_text(value)} times its size)" for state, value in more.items()
+    )
     if set(more) & set(related):
         return (
             f"the model leaves more than white noise of {parts} under its relations: intervals are "

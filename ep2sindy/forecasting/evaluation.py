@@ -36,8 +36,10 @@ from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency
 
 N_REST = 16  # samples of a record from which rest points are looked for
 NEUTRAL = 1e-6  # growth per turn of a departure from a rest point that neither grows nor decays
-APART = 1e-6  # distance of two rest points, in standard deviations
+# Distance of two rest points, in standard deviations: Newton's method ends short of multiple roots.
+APART = 1e-2
 STD, WIDEST = " standard deviations", len("distribution error  ")
+LEFT = 100.0  # times a record's size, from which a run's is not told
 N_SHOWN = 4  # most states, and most rest points, that the table shows one by one
 
 
@@ -198,21 +200,32 @@ class Evaluation:
     def rest_points(self) -> tuple[RestPoint, ...]:
         """Rest points that Newton's method reaches from samples of the record and their mean.
 
-        Empty for a model with inputs. No density is negative there.
+        They lie within its range or one more on either side, for which alone the model was made. Of
+        a line of rest points there is one. Empty for a model with inputs. No density is negative.
         """
         if self.model.inputs:
             return ()
         states, std = self.compared.states, self.compared.std
-        anywhere = np.zeros(len(std), dtype=np.bool_)
+        anywhere, width = np.zeros(len(std), dtype=np.bool_), np.ptp(states, axis=0)
+        low, high = states.min(axis=0) - width, states.max(axis=0) + width
+        low[list(self.compared.densities)] = 0.0
         starts = (states.mean(axis=0), *states[:: max(1, len(states) // N_REST)])
         found: list[RestPoint] = []
         for near in starts:
             point = rest_point(self.model, near, std, anywhere)
-            if point is None or (point.state[list(self.compared.densities)] < 0.0).any():
+            if point is None or not ((low <= point.state) & (point.state <= high)).all():
+                continue
+            lines = [p for p in (point, *found) if self._stays(p)]
+            if len(lines) == 2 and lines[0] is point:
                 continue
             if all(np.abs((point.state - p.state) / std).max() > APART for p in found):
                 found.append(point)
         return tuple(found)
+
+    def _stays(self, rest: RestPoint) -> bool:
+        """Whether nothing moves beside a rest point, in one direction at least."""
+        length_s = float(self.record.t[-1] - self.record.t[0])
+        return not rest.frequency_Hz and abs(rest.growth_per_s) * length_s < NEUTRAL
 
     @cached_property
     def forecast(self) -> ForecastSkill | None:
@@ -244,10 +257,9 @@ class Evaluation:
         return text if self.rest is None else f"{text} It rests at {self._rest_text(self.rest)}."
 
     @property
-    def rest_text(self) -> str:
-        """The rest points near the record, in a line; empty without any."""
-        places = [self._rest_text(rest) for rest in self.rest_points[:N_SHOWN]]
-        return f"rests at {'; and at '.join(places)}" if places else ""
+    def rest_texts(self) -> list[str]:
+        """The rest points near the record, each in a line."""
+        return [f"rests at {self._rest_text(rest)}" for rest in self.rest_points[:N_SHOWN]]
 
     def _rest_text(self, rest: RestPoint) -> str:
         """Where the model rests, and what becomes of a small departure."""
@@ -256,14 +268,14 @@ class Evaluation:
             f"{state} = {value:.3g}{'' if units[state] == '1' else f' {units[state]}'}"
             for state, value in zip(self.model.states, rest.state.tolist(), strict=True)
         )
-        change = "grows" if rest.growth_per_s > 0.0 else "decays"
+        kind, change = ("unstable", "grows") if rest.growth_per_s > 0.0 else ("stable", "decays")
         rate = f" by {clock.seconds * abs(rest.growth_per_s):.3g} {clock.rate_unit('1')}"
-        if abs(rest.growth_per_s) <= NEUTRAL * rest.frequency_Hz:
-            change, rate = "neither grows nor decays", ""
+        if abs(rest.growth_per_s) <= NEUTRAL * rest.frequency_Hz or self._stays(rest):
+            kind, change, rate = "neutral", "neither grows nor decays", ""
         turns = (
             f" and turns at {clock.frequency_text(rest.frequency_Hz)}" if rest.frequency_Hz else ""
         )
-        return f"{place}, where a departure {change}{rate}{turns}"
+        return f"{place}, {kind}: a departure {change}{rate}{turns}"
 
     @property
     def rows(self) -> list[tuple[str, str]]:
@@ -280,7 +292,7 @@ class Evaluation:
             ("forecasts", "" if self.forecast is None else self.forecast.text),
             ("status", self.text),
             ("frequency", _listed(frequencies) + error),
-            ("amplitude ratio", _listed(_texts(self.amplitude_ratio))),
+            ("amplitude ratio", _listed(_sizes(self.amplitude_ratio))),
             ("waveform error", _listed(_texts(self.waveform_error), STD)),
             ("distribution error", _listed(_texts(self.distribution), STD)),
             ("phase", phase if np.isfinite(self.phase_end) else ""),
@@ -360,6 +372,15 @@ def evaluate(
 
 def _texts(values: Mapping[str, float]) -> dict[str, str]:
     return {state: f"{value:.3g}" for state, value in values.items() if np.isfinite(value)}
+
+
+def _sizes(ratios: Mapping[str, float]) -> dict[str, str]:
+    return {state: size_text(ratio) for state, ratio in ratios.items() if np.isfinite(ratio)}
+
+
+def size_text(ratio: float, form: str = ".3g") -> str:
+    """A ratio of sizes; of a run that has left the record's, that it is far over it."""
+    return f"{ratio:{form}}" if ratio <= LEFT else f"over {LEFT:.0f}"
 
 
 def _listed(texts: Mapping[str, str], unit: str = "") -> str:

@@ -12,7 +12,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
-from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.forecasting.evaluation import Evaluation, size_text
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.comparison import Status
@@ -156,7 +156,7 @@ def found_model(
         [
             *equations(model, clock, held=held),
             Text(f"run freely from one sample over {where}: {free}"),
-            *([Text(run.rest_text)] if run.rest_text else []),
+            *map(Text, run.rest_texts),
             *([Text(misfit, warning=True)] if misfit else []),
             *more,
         ],
@@ -201,7 +201,7 @@ def run_words(run: Evaluation) -> str:
         found.append(f"frequency {frequency}")
     ratios = [value for value in run.amplitude_ratio.values() if np.isfinite(value)]
     if ratios:
-        ends = dict.fromkeys(f"{value:.3g}" for value in (min(ratios), max(ratios)))
+        ends = dict.fromkeys(size_text(value) for value in (min(ratios), max(ratios)))
         found.append(f"amplitude {' to '.join(ends)} times the data's")
     waveforms = [value for value in run.waveform_error.values() if np.isfinite(value)]
     if waveforms:
@@ -209,8 +209,13 @@ def run_words(run: Evaluation) -> str:
     if np.isfinite(run.periods):
         found.append(f"in phase for {round(run.periods)} periods")
     if not found and np.isfinite(run.nrmse):
-        found.append(f"{run.nrmse:.2g} standard deviations off")
+        found.append(f"{size_text(run.nrmse, '.2g')} standard deviations off")
     return "; ".join(found) or run.text
+
+
+def _size(ratio: float) -> str:
+    """A ratio of sizes in a table; a dash if it is not known."""
+    return size_text(ratio, ".3f") if ratio == ratio else "-"
 
 
 COMPARED = View.FILES | View.HEADLINE
@@ -223,9 +228,9 @@ EVALUATION: Metrics[Evaluation] = [
     Metric("frequency_Hz", lambda run: run.frequency_Hz),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.HEADLINE),
     Metric("f_error", lambda run: run.f_error, COMPARED),
-    Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.ALL, "amplitude {}", "{:.3f}"),
+    Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.ALL, "amplitude {}", _size),
     Metric("waveform_error", lambda run: run.waveform_error, View.ALL, "waveform {}", "{:.3f}"),
-    Metric("nrmse", lambda run: run.nrmse, View.ALL, format="{:.3f}"),
+    Metric("nrmse", lambda run: run.nrmse, View.ALL, format=_size),
     Metric("periods", lambda run: run.periods, View.SHOWN, "periods in phase", "{:.0f}"),
     Metric("status", lambda run: run.text, View.SHOWN),
 ]

@@ -220,7 +220,8 @@ class _Walk:
         share = np.nan_to_num(share)
         change = share[:, None] * change
         self.scaling[active] += change
-        self.nodes[active] += share[:, None, None, None] * moved
+        with np.errstate(invalid="ignore"):  # a step without bounds is undone
+            self.nodes[active] += share[:, None, None, None] * moved
         raw = step_maps(problem, self.step, self.scaling, self.nodes, active, by_scaling=not hold)
         ahead = self.pull(raw, active, memory)
         size, defect = gap_sizes(maps, nodes)
