@@ -9,10 +9,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import OmegaConf
 
 from ep2sindy.data.inspection import STEP, Inspection, compare_files, unlike
-from ep2sindy.data.mapping import Variable
+from ep2sindy.data.mapping import Variable, read_array
 from ep2sindy.data.open import inspect_file
 from ep2sindy.data.quantities import COORDINATE_UNITS
 from ep2sindy.data.run_files import FilePattern, propose_pattern
@@ -20,6 +21,7 @@ from ep2sindy.data.steps import records_of
 from ep2sindy.data.trajectory import point_label
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.screen import in_line, say
+from ep2sindy.signals.driving import propose_inputs
 
 ABOUT = """Says what files hold: variables, shapes, units, ranges, what looks like time, z and r,
 and what is missing for which experiment. Several files, or a pattern in quotes, are several
@@ -42,6 +44,8 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
 
 WITH_INFLOW = ("inflow", "conserving", "leaving")  # models of +exp=predict that need mdot_mg_s
 NOT_STATES = ("R_ion", "V_d")  # what drives a model
+# Columns and samples that are looked at for inputs: bounds of their number.
+MAX_LOOKED_AT, MIN_LOOKED_AT, MAX_SAMPLES = 20, 50, 50_000
 
 
 def main(arguments: Sequence[str], conf: Path) -> None:
@@ -65,7 +69,9 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     given = parser.parse_args(arguments)
     paths = records_of(given.path[0] if len(given.path) == 1 else given.path)
     found = [inspect_file(path, plasma=given.plasma) for path in paths]
-    say("\n".join(found[0].lines(experiments(found[0]))) + "\n")
+    drives = inputs_of(found[0])
+    notes = [f"{name} looks set ({how}): an input, if it drives the rest" for name, how in drives]
+    say("\n".join(found[0].lines([*experiments(found[0]), *notes])) + "\n")
     if len(found) > 1:
         say("\n".join(compare_files(found[0], found[1:])) + "\n")
     names = [path for path in paths if isinstance(path, str)]
@@ -80,12 +86,13 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         lines, end = [], differing
     elif given.write is None:
         more = ["data.plasma=true"] if given.plasma else []
-        lines = commands(found, "recognised", pattern, path=_hydra(given.path), more=more)
+        path = _hydra(given.path)
+        lines = commands(found, "recognised", pattern, path=path, more=more, drives=drives)
         end = f"--write makes conf/data/{name}.yaml of it, for data={name}"
     else:
-        path = own_config(name, conf)
-        write_text(path, config_text(found, paths))
-        lines, end = commands(found, name, pattern), f"written: {path}"
+        file = own_config(name, conf)
+        write_text(file, config_text(found, paths))
+        lines, end = commands(found, name, pattern, drives=drives), f"written: {file}"
     header = ["next, for example:"] if lines else []
     say("\n".join([*header, *(f"  {line}" for line in lines), end]))
 
@@ -110,12 +117,13 @@ def commands(
     *,
     path: str = "",
     more: Sequence[str] = (),
+    drives: Sequence[tuple[str, str]] = (),
 ) -> list[str]:
     """Commands that can be run with the data; placeholders in capitals are for the user.
 
     group: name in the data group. pattern: of files that are operating points, which are studied as
     such where an experiment has all that it needs. path: for the group `recognised`, which
-    names no file, and in which `more` and units are given too.
+    names no file, and in which `more` and units are given too. drives: see `inputs_of`.
     """
     first = found[0]
     units = ",".join(f"{name}:UNIT" for name in first.no_unit)
@@ -128,7 +136,8 @@ def commands(
         lines = point_commands(first, data, n_enough=len(pattern.names) + 2, n_points=len(found))
     if not lines:
         data = [f"data={group}", *([f"data.path={path}"] if path else []), *step]
-        lines = record_commands(first, data, are_several=len(found) > 1)
+        inputs = [name for name, _ in drives]
+        lines = record_commands(first, data, inputs, are_several=len(found) > 1)
     if not lines and path:
         lines = [line] if (line := point_command(first, path)) else []
     return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]
@@ -149,22 +158,37 @@ def point_commands(
     return lines
 
 
-def record_commands(found: Inspection, data: list[str], *, are_several: bool) -> list[list[str]]:
-    """Commands that study one record, or several of one system."""
+def inputs_of(found: Inspection) -> list[tuple[str, str]]:
+    """Columns that look set by somebody, and how: proposals, of which the user decides."""
+    names = found.traces
+    if not 1 < len(names) <= MAX_LOOKED_AT or (found.n_samples or 0) < MIN_LOOKED_AT:
+        return []
+    places = {name: str(found.variables[name].name) for name in names}
+    columns = {n: read_array(found.source, n, p).values for n, p in places.items()}
+    columns = {n: values[:MAX_SAMPLES].astype(float) for n, values in columns.items()}
+    t = np.arange(len(next(iter(columns.values()))), dtype=float)
+    return [*propose_inputs(t, columns).items()]
+
+
+def record_commands(
+    found: Inspection, data: list[str], inputs: Sequence[str], *, are_several: bool
+) -> list[list[str]]:
+    """Commands that study one record, or several of one system. inputs: proposed ones."""
+    given = [f"inputs=[{','.join(inputs)}]"] * bool(inputs)
     lines = []
     if not found.lacking(NEEDS["breathing"]):
         lines.append(["+exp=breathing", *data, *channel(found), *preparation(found)])
-    traces = found.traces
+    traces = [name for name in found.traces if name not in inputs]
     if traces and not are_several:
         signal = "I_d" if "I_d" in traces else traces[0]
-        lines.append(["+exp=trace", *data, f"signal={signal}"])
+        lines.append(["+exp=trace", *data, f"signal={signal}", *given])
     # One state alone cannot oscillate.
     for names in (traces, ["n_i", "n_n"], found.signals):
-        states = [n for n in names if n in found.signals and n not in NOT_STATES]
-        if len(states) > 1:
+        states = [n for n in names if n in found.signals and n not in (*NOT_STATES, *inputs)]
+        if len(states) > 1 or given:
             break
-    if len(states) > 1:
-        lines.append(["+exp=discover", *data, f"trajectory.states=[{','.join(states)}]"])
+    if len(states) > 1 or given:
+        lines.append(["+exp=discover", *data, f"trajectory.states=[{','.join(states)}]", *given])
     return lines
 
 

@@ -27,10 +27,10 @@ def is_linear(signal: Trace) -> bool:
     The second half of the signal is forecast from its own past, by neighbours in the first. They
     end within a quarter of a turn, and are no nearer there than the autoregression. No exact
     trajectory of a few states goes on like that, unless noise drowns it. False for signals that
-    repeat themselves or have under twenty turns, which are not looked at.
+    repeat themselves, are driven by inputs, or have under twenty turns: they are not looked at.
     """
     repeats = signal.cycle is not None and signal.cycle.share >= REPEATS
-    if repeats or signal.n_periods < ENOUGH_TURNS:
+    if repeats or signal.run.input_names or signal.n_periods < ENOUGH_TURNS:
         return False
     n, turn = len(signal.t), max(1, round(TURN * signal.per_period))
     longest = min(max(1, round(AHEAD * signal.per_period)), n // 4)

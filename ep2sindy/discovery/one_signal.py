@@ -121,10 +121,10 @@ class Preparation:
             states = make(self.how)
         run, functions = states.run, self.functions
         if any(FITTED in text for text in functions):
-            smoothed = make() if states.hidden else states
+            smoothed = make() if states.unsmoothed else states
             off = partial(self._misfit, smoothed, method, told)
             functions = fit_functions(functions, smoothed.run, off)
-        if states.hidden:
+        if states.unsmoothed:
             run, method = end_of(run), by_trajectories(method)
         elif not states.known:
             method = replace(method, depth=min(method.depth, DEPTH_OF_BOTH))
@@ -179,7 +179,7 @@ class Attempt:
     ) -> Attempt:
         past, run, share = states.signal, states.run, float("nan")
         with progress.stage(None, "", "forecasts where it was fitted"):
-            if states.hidden:
+            if states.unsmoothed:
                 run = estimate_states(found.model, run)
             else:
                 share = unexplained(states)
@@ -196,7 +196,7 @@ class Attempt:
     @property
     def searched(self) -> list[str]:
         """States whose equations were not known."""
-        known = self.states.known or (self.states.hidden and [self.states.signal.name])
+        known = self.states.known or (list(self.states.hidden) and [self.states.signal.name])
         return [state for state in self.found.model.states if state not in known]
 
     @property
@@ -219,7 +219,7 @@ class Attempt:
     @property
     def noise_std(self) -> float:
         """Standard deviation of the noise in the signal, in its unit."""
-        if not self.states.hidden:
+        if not self.states.unsmoothed:
             return self.states.noise_std
         assert self.found.estimate is not None  # a search of trajectories has one
         return float(self.found.estimate.noise_std[0])
@@ -235,18 +235,23 @@ def try_in_turn(
     Hidden states end the list if their model explains the signal to its noise, and stays with it
     when it is run freely where it was fitted. They are left out otherwise, unless nothing else is
     tried. A law of all samples is one of a part of them, so a part is searched first. More than two
-    states are tried only of a signal that does not repeat itself: one of two states either repeats
-    itself or spirals. Of a linear signal, linear equations of the first smoothed states alone are
-    tried. method: of the search in smoothed states; a rule that runs models judges them by the
-    signal. told: of the equations. linear: whether the signal is (`is_linear`); None finds out.
-    once: does each search, or takes it from a run that was broken off.
+    states are tried only of a signal that does not repeat itself, and that no input drives: one of
+    two states either repeats itself or spirals. The signal alone is tried only with inputs. Of a
+    linear signal, linear equations of the first smoothed states alone are tried. method: of the
+    search in smoothed states; a rule that runs models judges them by the signal. told: of the
+    equations. linear: whether the signal is (`is_linear`); None finds out. once: does each search,
+    or takes it from a run that was broken off.
     """
     told, linear = told or ToldFacts(), is_linear(past) if linear is None else linear
     smoothed = [each for each in tried if each.how != "hidden"]
-    if past.cycle is not None and past.cycle.share >= REPEATS:
-        tried = [each for each in tried if each.n_states == 2] or tried
-    elif linear and smoothed:
-        tried = [replace(smoothed[0], degree=1, functions=())]
+    if past.run.input_names:  # then they make what is more than a cycle
+        tried = [each for each in tried if each.n_states <= 2] or tried
+    else:
+        tried = [each for each in tried if each.n_states > 1] or tried
+        if past.cycle is not None and past.cycle.share >= REPEATS:
+            tried = [each for each in tried if each.n_states == 2] or tried
+        elif linear and smoothed:
+            tried = [replace(smoothed[0], degree=1, functions=())]
     method, part = judged_by(method, past.name), end_of_periods(past)
     attempts, left_out = [], []
     for each in tried:
@@ -256,7 +261,7 @@ def try_in_turn(
         if each.how == "hidden" and smoothed and part is not past and search(part)[1].misfit:
             continue
         states, found = search(past)
-        if not states.hidden:
+        if not states.unsmoothed:
             attempts.append(Attempt.of(each, states, found, progress))
         elif explains(found, past.name):
             states = replace(states, reason=EXPLAINED)
@@ -328,7 +333,7 @@ def run_on_rest(
     """
     past, estimator, states_of = best.states.signal, best.estimator, best.states.along
     run, n, n_fitted, forecasts = signal.run, len(signal.t), len(past.t), None
-    known = estimator.smooth(run) if best.states.hidden else states_of(run)
+    known = estimator.smooth(run) if best.states.unsmoothed else states_of(run)
     whole = complete_states(signal, known)
     if n_fitted == n:
         first, start = int(np.searchsorted(signal.t, best.run.t[0])), best.run.states[0]
@@ -353,7 +358,7 @@ def complete_states(signal: Trace, known: Trajectory) -> Trajectory:
     nearest = np.clip(np.searchsorted(known.t, signal.t), 0, known.n_samples - 1)
     states = known.states[nearest].copy()
     states[:, 0] = signal.x
-    return replace(known, t=signal.t, states=states, inputs=np.empty((len(signal.t), 0)))
+    return replace(known, t=signal.t, states=states, inputs=signal.run.inputs)
 
 
 def end_of(run: Trajectory) -> Trajectory:

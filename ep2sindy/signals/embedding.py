@@ -10,11 +10,13 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.gaps import between_gaps
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.runs import Run
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.values import check_count
+from ep2sindy.signals.driving import drop_repeats
 from ep2sindy.signals.log_smoother import LogSmoother
 from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import signal_memory_s
@@ -57,9 +59,10 @@ class Embedding:
     period before, for which no derivative is needed; no equation is known. "hidden": x alone is
     given, and `discover` finds the other states with their equations.
     n_states: in all; of more than two, the others are derivatives, g' = h and v' = w, or values two
-    delays before, and so on. harmonics: of the period, which the smoother follows.
-    Raises ValueError for another `how`, fewer than two states, more than five, or harmonics below
-    one.
+    delays before, and so on. One state, the signal alone, is "hidden" without hidden ones; it
+    oscillates only if inputs drive it. harmonics: of the period, which the smoother follows.
+    Raises ValueError for another `how`, fewer than two states (one, if they are "hidden"), more
+    than five, or harmonics below one.
     """
 
     how: str
@@ -71,15 +74,18 @@ class Embedding:
             raise ValueError(f"how must be auto, {', '.join(SAYS)}: {self.how!r} came")
         if not self.harmonics >= 1.0:
             raise ValueError(f"harmonics must be one or more: {self.harmonics} came")
-        if not 2 <= check_count("n_states", self.n_states) <= MAX_STATES:
+        least = 1 if self.how == "hidden" else 2
+        if not least <= check_count("n_states", self.n_states) <= MAX_STATES:
             raise ValueError(
-                f"n_states must be 2 to {MAX_STATES}: {self.n_states} came; an oscillation needs "
-                "two, and higher derivatives are noise"
+                f"n_states must be {least} to {MAX_STATES}: {self.n_states} came; an oscillation "
+                "that nothing drives needs two, and higher derivatives are noise"
             )
 
     @property
     def says(self) -> str:
         n = self.n_states - 1
+        if not n:
+            return "the signal alone"
         more = f", with {n - 1} more derivative{'s'[: n - 2]}" if n > 1 else ""
         return SAYS[self.how].format(n=n, more=more, times=f", {n} times" if n > 1 else "")
 
@@ -113,8 +119,8 @@ class Embedding:
             t=t,
             states=np.column_stack(states),
             state_names=own,
-            units=dict(zip(own, units, strict=False)),
-            inputs=np.empty((len(t), 0)),
+            units={**signal.run.units, **dict(zip(own, units, strict=False))},
+            inputs=signal.run.inputs[np.searchsorted(signal.t, t)],
         )
         return Embedded(self, signal, run, names, known, noise_std, reason)
 
@@ -167,6 +173,11 @@ class Embedded:
         return self.names[len(self.run.state_names) :]
 
     @property
+    def unsmoothed(self) -> bool:
+        """Whether the search takes the samples as they are, and finds all other states itself."""
+        return self.embedding.how == "hidden"
+
+    @property
     def relations(self) -> list[str]:
         return [f"{state}: {term} == 1" for state, term in self.known.items()]
 
@@ -177,18 +188,19 @@ class Embedded:
     def library(
         self, degree: int = 3, functions: Sequence[str] = (), function_degree: int = 1
     ) -> Library:
-        """Products of the states up to a degree, and functions, with what is known.
+        """Products of states and inputs up to a degree, and functions, with what is known.
 
         degree, functions, function_degree: see `polynomial`.
         """
+        names = [*self.names, *self.run.input_names]
         library = polynomial(
-            self.names, degree=degree, functions=functions, function_degree=function_degree
+            names, degree=degree, functions=functions, function_degree=function_degree
         )
-        return library.relate(*self.relations).only(self.terms)
+        return drop_repeats(library).relate(*self.relations).only(self.terms)
 
     def along(self, run: Trajectory) -> Trajectory:
         """The states along other samples of the signal, which are the first column of a run."""
-        own = replace(self.signal.run, t=run.t, states=run.states[:, :1], inputs=run.inputs[:, :0])
+        own = replace(self.signal.run, t=run.t, states=run.states[:, :1], inputs=run.inputs)
         return self.embedding.embed(replace(self.signal, run=own)).run
 
 
@@ -283,9 +295,10 @@ def _differentiate(t: np.ndarray, x: np.ndarray, n: int) -> list[np.ndarray]:
 def unexplained(states: Embedded) -> float:
     """Share of the next state's variance that neighbours in the given states do not explain.
 
-    The next state, such as a further derivative, is a function of the given ones if these are
-    enough; then neighbours agree in it. Otherwise some neighbours are false ones, which are close
-    only because a state is missing. Neighbours within half a period in time do not count.
+    The next state, such as a further derivative, is a function of the given ones and of the inputs
+    if these are enough; then neighbours agree in it. Otherwise some neighbours are false ones,
+    which are close only because a state is missing. Neighbours within half a period in time do not
+    count.
     Source: after Kennel, Brown & Abarbanel 1992, doi:10.1103/PhysRevA.45.3403.
     """
     from scipy.spatial import cKDTree  # imported only to count states
@@ -293,8 +306,8 @@ def unexplained(states: Embedded) -> float:
     signal, own = states.signal, states.embedding
     run = replace(own, n_states=own.n_states + 1).embed(signal).run
     inner = slice(EDGE, run.n_samples - EDGE)  # derivatives are poor at the ends
-    values = run.states[inner] - run.states[inner].mean(axis=0)
-    values = values / values.std(axis=0)
+    values = np.column_stack([run.inputs, run.states])[inner]
+    values = (values - values.mean(axis=0)) / zero_to_one(values.std(axis=0))
     values = values[np.linspace(0, len(values) - 1, min(len(values), MAX_POINTS)).astype(int)]
     apart = 0.5 * signal.period_s / (run.dt_s * run.n_samples) * len(values)
     known, following = values[:, :-1], values[:, -1]

@@ -51,10 +51,10 @@ NOISE_BELOW, SHARE_BELOW = 6.0, 0.05
 class Trace:
     """An oscillating signal of at least six periods.
 
-    run: the signal as a run of one state. frequency_Hz: of its cycle, or the mean rate at which it
-    rises through its mean. cycle: None for a signal that oscillates without repeating itself, such
-    as chaos. done: processing already applied to the samples, in words. advice: processing that is
-    recommended.
+    run: the signal as a run of one state, with the inputs that drive it. frequency_Hz: of its
+    cycle, or the mean rate at which it rises through its mean. cycle: None for a signal that
+    oscillates without repeating itself, such as chaos. done: processing already applied to the
+    samples, in words. advice: processing that is recommended.
     """
 
     run: Trajectory
@@ -115,11 +115,11 @@ def prepare_signal(
 ) -> Trace:
     """Make a trace of one variable of a run.
 
-    run: as `discover` takes it. signal: None takes the only state. decimate: number of samples that
-    are replaced by their mean; "auto" leaves a hundred per period, None leaves all. detrend:
-    whether to subtract the straight line that the signal follows beside its cycle, and keep the
-    mean; "auto" does so if the line is certain, and large beside the troughs of a positive signal
-    or beside the standard deviation of any other.
+    run: as `discover` takes it; its inputs stay beside the signal. signal: None takes the only
+    state. decimate: number of samples that are replaced by their mean; "auto" leaves a hundred per
+    period, None leaves all. detrend: whether to subtract the straight line that the signal follows
+    beside its cycle, and keep the mean; "auto" does so if the line is certain, and large beside the
+    troughs of a positive signal or beside the standard deviation of any other.
     Raises ValueError for a signal that does not oscillate, under six periods or under six samples a
     period, or a wrong setting.
 
@@ -138,7 +138,9 @@ def prepare_signal(
         t=t,
         states=run.columns([name]),
         state_names=(name,),
-        units={name: run.units[name]},
+        inputs=run.inputs,
+        input_names=run.input_names,
+        units=run.units,
         label=name,
         clock=run.clock,
         parameters=run.parameters,

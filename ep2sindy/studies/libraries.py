@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -27,6 +28,8 @@ from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.averaging import average_long
+from ep2sindy.signals.driving import DRIVE, add_drive, ask_whether_driven, drop_repeats
+from ep2sindy.signals.trace import prepare_signal
 from ep2sindy.studies.balance import add_balance, model_balance
 from ep2sindy.studies.candidates import (
     add_candidates,
@@ -43,7 +46,14 @@ from ep2sindy.studies.library_result import (
 )
 from ep2sindy.studies.living import LivingSearch, add_living, living_model
 from ep2sindy.studies.processes import NO_ZONES, Zones
-from ep2sindy.studies.source import Sampling, Source, n_before, split_in_time, zones_of
+from ep2sindy.studies.source import (
+    Sampling,
+    Source,
+    columns_beside,
+    n_before,
+    split_in_time,
+    zones_of,
+)
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Terms, ZeroOrMore
 from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module
@@ -71,17 +81,18 @@ class LibraryCase:
     function_degree: int = 1
     n_norm: str | None = None
 
-    def library(self, data: xr.Dataset, sampling: Sampling, hidden: Sequence[str] = ()) -> Library:
-        """The library over the data's variables, and over states that the data lack."""
+    def library(self, data: xr.Dataset, sampling: Sampling, more: Sequence[str] = ()) -> Library:
+        """The library over the data's variables, and over more, which the data lack."""
         optional = [name for name in self.variables_if_present if name in data]
-        names = [*sampling.columns([*self.variables, *optional]), *hidden]
-        return polynomial(
+        names = [*sampling.columns([*self.variables, *optional]), *more]
+        library = polynomial(
             names,
             degree=self.degree,
             products=list(self.products),
             functions=[registered(str(name)) for name in self.functions],
             function_degree=self.function_degree,
         )
+        return drop_repeats(library)
 
     def method(self, method: AnyMethod) -> AnyMethod:
         """The shared method, with this library's norm if the selection rule has one."""
@@ -101,9 +112,11 @@ class Study:
     without inputs are searched for a model that lives; None leaves that out. held_out: the last
     share of the record, on which such a model is tested; None means a quarter. forecasts: number of
     starts of forecasts, over the held-out part of a living model, or else over the last quarter of
-    the record; zero leaves them out. hidden: states that nobody measured, relations between
-    coefficients, terms that an equation may not have (exclude), roles, and means over
-    samples (decimate), as for `discover`.
+    the record; zero leaves them out. inputs: variables of every library that are no states.
+    period_s: of a drive that is known by its period, which becomes the inputs `cos_drive` and
+    `sin_drive` of every library. hidden: states that nobody measured, relations between
+    coefficients, terms that an equation may not have (exclude), roles, and means over samples
+    (decimate), as for `discover`.
     Raises ValueError for hidden states with several libraries or with living, which need samples of
     all states.
     """
@@ -119,6 +132,8 @@ class Study:
     living: LivingSearch | None = None
     held_out: ShareOrNone = None
     forecasts: ZeroOrMore = 0
+    inputs: Sequence[str] = ()
+    period_s: PositiveOrAll = None
     hidden: Sequence[str] = ()
     relations: Sequence[str] = ()
     exclude: Terms | None = None
@@ -151,7 +166,9 @@ class Study:
         zones = NO_ZONES if self.living is None else zones_of(self.source, fields[0], report)
         results = {}
         for (name, case), rng in count_pieces(report.watch, pairs, "library"):
-            library = case.library(fields[0], self.source.trajectory, self.hidden)
+            drive = () if self.period_s is None else DRIVE
+            more = [*self.hidden, *drive]
+            library = case.library(fields[0], self.source.trajectory, more)
             results[name] = self._result(
                 runs, library, case.method(method), self.thesis.get(name, {}), zones,
                 rng=rng, progress=report.watch,
@@ -166,17 +183,21 @@ class Study:
 
         A name that is no known quantity stays, to be refused.
         """
-        lacking = {
-            name: [each for each in case.variables if each in KNOWN_UNITS and each not in field]
+        cases = {
+            name: replace(case, variables=list(dict.fromkeys([*case.variables, *self.inputs])))
             for name, case in self.libraries.items()
         }
+        lacking = {
+            name: [each for each in case.variables if each in KNOWN_UNITS and each not in field]
+            for name, case in cases.items()
+        }
         if all(lacking.values()):
-            return dict(self.libraries)
+            return cases
         for name, variables in lacking.items():
             if variables:
                 words = f"the library {name} is left out: the data have no {', '.join(variables)}"
                 report.say(words)
-        return {name: case for name, case in self.libraries.items() if not lacking[name]}
+        return {name: case for name, case in cases.items() if not lacking[name]}
 
     def _records(
         self, fields: Sequence[xr.Dataset], cases: Mapping[str, LibraryCase], report: Report
@@ -184,13 +205,26 @@ class Study:
         """The trajectory of every record, with what is to be said of them."""
         seen = [case.library(fields[0], self.source.trajectory) for case in cases.values()]
         runs = [self.source.sampled(field, seen, report) for field in fields]
+        if self.period_s is not None:
+            runs = [add_drive(run, self.period_s) for run in runs]
         if len(runs) > 1:
             report.say(f"{len(runs)} records in one search; figures show the first")
         if not self.hidden and (hint := alone(runs[0])):
             report.warn(hint)
+        if question := self._ask_whether_driven(runs[0], fields[0]):
+            report.warn(question)
         if self.forecasts and (reason := why_none(runs[0], self._n_fitted(runs[0]))):
             report.say(reason)
         return runs
+
+    def _ask_whether_driven(self, run: Trajectory, field: xr.Dataset) -> str | None:
+        """The question for the first state that looks driven; None for none, or with inputs."""
+        beside = {} if run.input_names else columns_beside(self.source.data, field, run.names)
+        for name in run.state_names:
+            with suppress(ValueError):  # a state that does not oscillate
+                if question := ask_whether_driven(prepare_signal(run, name), beside):
+                    return question
+        return None
 
     def _n_fitted(self, run: Trajectory) -> int:
         """Samples before the part that forecasts are tested on."""

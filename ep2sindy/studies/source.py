@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -13,6 +14,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.fields import clock_of, grid_points
 from ep2sindy.data.gaps import describe_breaks, describe_gaps, usual_step
+from ep2sindy.data.open import open_field
 from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit, to_si
 from ep2sindy.data.sampling import ZoneAverage
 from ep2sindy.data.steps import records_of
@@ -28,6 +30,8 @@ from ep2sindy.studies.study import Deferred
 from ep2sindy.thruster.balance import zone_balance
 
 Step = Callable[[xr.Dataset], xr.Dataset]
+# Columns by name, each as times in s and samples.
+Beside = dict[str, tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]]
 
 
 def open_prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
@@ -209,8 +213,15 @@ def data_summary(data: Trajectory) -> dict[str, Any]:
     }
 
 
-def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str] = ()) -> Deferred:
-    """Data read from a file with this variable alone, whatever other variables a config expects.
+def only(
+    data: Deferred,
+    signal: str,
+    unit: str | None,
+    *,
+    inputs: Sequence[str] = (),
+    without: Sequence[str] = (),
+) -> Deferred:
+    """Data read from a file with this variable and inputs alone, whatever else a config expects.
 
     without: axes that are not required. Data that are not read from a file are unchanged.
     """
@@ -218,15 +229,35 @@ def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str
     if variables is None:
         return data
     places: dict[str, Any] = {
-        f"variables.{name}.name": None for name in variables if name != signal
+        f"variables.{name}.name": None for name in variables if name not in (signal, *inputs)
     }
     places |= {f"{axis}.name": None for axis in without if data.settings.get(axis)}
-    if signal not in variables:
-        new = {"name": signal, "unit": unit or "1", "dims": None}
-        return data.changed(places, {"variables": {signal: new}})
-    if unit is not None:
+    if unit is not None and signal in variables:
         places[f"variables.{signal}.unit"] = unit
-    return data.changed(places)
+    units = {signal: unit or "1", **dict.fromkeys(inputs, "1")}
+    new = {n: {"name": n, "unit": u, "dims": None} for n, u in units.items() if n not in variables}
+    return data.changed(places, {"variables": new} if new else None)
+
+
+def columns_beside(data: Deferred, field: xr.Dataset, names: Sequence[str]) -> Beside:
+    """Other columns of the file that a field is read from, none of these: times in s and samples.
+
+    If the field has none, those that the file itself leaves no doubt of are taken.
+    """
+    path, time = data.settings.get("path"), data.settings.get("time")
+    found = _columns(field, names)
+    if found or not isinstance(path, str):
+        return found
+    with suppress(ValueError), warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulUnit)
+        return _columns(open_field(path, time=time, dt_s=data.settings.get("dt_s")), names)
+    return {}
+
+
+def _columns(field: xr.Dataset, names: Sequence[str]) -> Beside:
+    t = grid_points(field, "time")
+    own = {str(name): one for name, one in field.data_vars.items() if one.dims == ("time",)}
+    return {name: (t, one.values) for name, one in own.items() if name not in names}
 
 
 def in_unit(field: xr.Dataset, *, signal: str, unit: str) -> xr.Dataset:

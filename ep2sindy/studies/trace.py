@@ -14,6 +14,7 @@ from typing import Annotated
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
@@ -33,18 +34,27 @@ from ep2sindy.figures.living import free_run_figure
 from ep2sindy.forecasting.baselines import AUTOREGRESSION
 from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.forecasting.skill import MODEL, ForecastSkill
+from ep2sindy.library.library import polynomial
 from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
 from ep2sindy.runtime.parallel import Once
+from ep2sindy.signals.driving import add_drive, ask_whether_driven, say_what_is_not_told
 from ep2sindy.signals.trace import Trace, prepare_signal
 from ep2sindy.studies.candidates import add_candidates, add_estimate
 from ep2sindy.studies.forecasts import add_forecasts
 from ep2sindy.studies.living import CAPTIONS, add_cycle
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.source import Source, data_summary, in_unit, only, zone_of
-from ep2sindy.studies.study import A_LIST, Share, Terms
+from ep2sindy.studies.source import (
+    Source,
+    columns_beside,
+    data_summary,
+    in_unit,
+    only,
+    zone_of,
+)
+from ep2sindy.studies.study import A_LIST, PositiveOrAll, Share, Terms
 from ep2sindy.studies.views import CYCLE, EVALUATED, EVALUATION, add_samples, found_model
 
 NAME = "trace"  # of the model, in files
@@ -78,6 +88,8 @@ class Study:
     signal: the variable. unit: needed if the data group does not describe the signal, or to
     override its unit; None takes the described unit, or none. offset: added to the samples, in
     SI; fit finds it, for a positive signal that lost its mean.
+    inputs: columns beside the signal that drive it. period_s: of a drive that is known by its
+    period, which becomes the inputs `cos_drive` and `sin_drive`.
     tried: preparations into states with their libraries, in turn (`Preparation`). Hidden states,
     found along with their equations, end the list if an exact trajectory of these explains the
     signal to its noise, and lives. Of the others, those that forecast best where they were fitted
@@ -100,6 +112,8 @@ class Study:
     exclude: Terms | None = None
     relations: Sequence[str] = ()
     rests_at_zero: bool = False
+    inputs: Sequence[str] = ()
+    period_s: PositiveOrAll = None
 
     def __post_init__(self) -> None:
         if isinstance(self.offset, str) and self.offset != "fit":
@@ -114,13 +128,16 @@ class Study:
         return ToldFacts(barred, self.relations, self.rests_at_zero)
 
     def run(self, report: Report) -> None:
-        data = self._sampled(report)
+        field, data = self._sampled(report)
         with resumed(self.keep, report) as keeping:
             signal = self._prepared(data, keeping.once, report)
             past = fitted_part(signal, self.held_out)
             linear = is_linear(past)
             if linear:
                 report.say(LINEAR)
+            beside = columns_beside(self.source.data, field, [self.signal])
+            if question := ask_whether_driven(signal, beside):
+                report.warn(question)
             attempts = try_in_turn(
                 past, self.tried, self.method, told=self.told, linear=linear,
                 seed=report.seed, progress=report.watch, once=keeping.once,
@@ -135,7 +152,12 @@ class Study:
         skill = free.forecast
         if best.is_damped_line and skill is not None and _equals_linear(skill):
             report.say(AR_2)
-        where = "its end, which was not fitted" if skill else "all of it, too short to hold out"
+        seen = len(best.states.signal.t) == len(signal.t)
+        where = "all of it, too short to hold out" if seen else "its end, which was not fitted"
+        remarks = [Text(free.caution, warning=True)] if free.caution else []
+        lives = free.status is Status.SUSTAINED and not question
+        if lives and (remark := say_what_is_not_told(signal)):
+            remarks.append(Text(remark, page_only=True))
         report.found(
             found_model(
                 f"Found from {signal.name}",
@@ -143,9 +165,9 @@ class Study:
                 file=NAME,
                 picture=f"free_run_{NAME}",
                 skill=skill,
-                more=[Text(free.caution, warning=True)] if free.caution else [],
+                more=remarks,
                 where=where,
-                seen=skill is None,
+                seen=seen,
                 misfit=best.found.misfit,
             )
         )
@@ -178,17 +200,19 @@ class Study:
             report.warn(text)
         return signal
 
-    def _sampled(self, report: Report) -> Trajectory:
+    def _sampled(self, report: Report) -> tuple[xr.Dataset, Trajectory]:
         zone = zone_of(self.source) or Zone()
         space = [axis for axis, bounds in (("z", zone.z), ("r", zone.r)) if bounds is None]
-        data = only(self.source.data, self.signal, self.unit, without=space)
+        data = only(self.source.data, self.signal, self.unit, inputs=self.inputs, without=space)
         source = replace(self.source, data=data)
         if self.unit is not None and data.settings.get("variables") is None:
             step = partial(in_unit, signal=self.signal, unit=self.unit)
             source = replace(source, prepare=[step, *source.prepare])
-        _, sampled = source.opened([], report)
+        drives = [polynomial([self.signal, *self.inputs], degree=1)]
+        field, sampled = source.opened(drives, report)
+        sampled = sampled if self.period_s is None else add_drive(sampled, self.period_s)
         known = 0.0 if isinstance(self.offset, str) else self.offset
-        return replace(sampled, states=sampled.states + known)
+        return field, replace(sampled, states=sampled.states + known)
 
 
 def _equals_linear(skill: ForecastSkill) -> bool:
