@@ -64,8 +64,8 @@ def brusselators() -> None:
         run, began = brusselator(a, b, step_s, seed), time.process_time()
         first = ep.discover(run)
         named = re.search(r"degree=(\d)", first.misfit)
-        late += " late (" in first.misfit
-        silent += not first.misfit
+        late += int(" late (" in first.misfit)
+        silent += int(not first.misfit)
         if named:
             then = ep.discover(run, ep.polynomial(["x", "y"], degree=int(named[1])))
             right += not then.misfit and [set(then.model.terms(s)) for s in "xy"] == LAW
