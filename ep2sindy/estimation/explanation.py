@@ -290,9 +290,10 @@ def _lacks_terms(found: Solution) -> str:
 
 def _wider(problem: EstimationProblem, most: int) -> EstimationProblem | None:
     """The problem with products of one degree more, if it has no more terms; None without any."""
-    given = problem.widen is None or problem.candidates.required.all()
-    wider = None if given else problem.widen()
-    if wider is None or len(wider.library) > most or not wider.enough_samples:
+    if problem.widen is None or problem.candidates.required.all():  # all terms are given
+        return None
+    wider = problem.widen()
+    if len(wider.library) > most or not wider.enough_samples:
         return None
     return wider.on_courses(problem.courses)
 
