@@ -91,10 +91,8 @@ class TrajectoryFit:
     @property
     def has_law(self) -> StateMask:
         """Mask of the states whose rates depend on a state or an input."""
-        found: StateMask = self.problem.coef(self.free)[self.problem.library.degrees > 0].any(
-            axis=0
-        )
-        return found
+        varies = self.problem.library.degrees > 0
+        return np.asarray((self.problem.coef(self.free)[varies] != 0.0).any(axis=0))
 
     @property
     def paths(self) -> list[BySample]:
