@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import product
 
@@ -17,6 +18,7 @@ from ep2sindy.estimation import explanation
 from ep2sindy.estimation.likelihood import TrajectoryFit
 from ep2sindy.estimation.noise import ALIKE_SAMPLES, Noise, noise_beside
 from ep2sindy.estimation.observation import LackOfFit
+from ep2sindy.estimation.open_loop import try_open_loop
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.systems.systems import System
@@ -49,8 +51,10 @@ def test_the_deviance_of_noise_with_a_memory_is_that_of_an_ar1_process() -> None
     noise = np.zeros((n, 2))
     for k in range(n):
         noise[k] = memory * noise[k - 1] + white[k]
-    run = ep.Trajectory(np.arange(float(n)), noise, ["x", "y"])
-    found = noise_of([run], [np.zeros((n, 2))])
+    t = np.arange(float(n))
+    moves = 5.0 * np.cos(np.stack([t, t + 1.0], axis=1))  # what rests has no noise that lasts
+    run = ep.Trajectory(t, moves + noise, ["x", "y"])
+    found = noise_of([run], [moves])
     assert found.memory == pytest.approx(memory, abs=0.1)
     variance = np.square(found.std)
     alike = variance + ALIKE_SAMPLES / n * variance.mean()
@@ -102,6 +106,37 @@ def test_a_function_of_the_states_is_no_noise_that_lasts() -> None:
 
 def lacking(duration_s: float) -> tuple[ep.Trajectory, System]:
     return chemical(0, noise=0.02, duration_s=duration_s), noisy("brusselator", 0.0, 0)[0]
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.8])
+def test_what_lasts_about_a_rest_has_a_law(memory: float) -> None:
+    """White samples about a rest are noise but for one record in 200; AR(1) ones have x' = -k x."""
+    rng, called = np.random.default_rng(0), 0
+    for _ in range(200):
+        white = rng.standard_normal((60, 2))
+        for k in range(1, len(white)):
+            white[k] += memory * white[k - 1]
+        run = ep.Trajectory(np.arange(60.0), white, ["x", "y"])
+        called += int(noise_of([run], [at_rest(run)]).is_error.any())
+    # Two states, two tests of each: four in 200 at most, and three standard errors.
+    assert called <= 10 if memory == 0.0 else called >= 190
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.7])
+def test_a_line_in_what_is_left_beside_a_path_is_a_misfit(memory: float) -> None:
+    """Beside noise of the same size, white or AR(1), in 200 records: Fisher's chance is 1e-5."""
+    rng, n, called = np.random.default_rng(1), 300, np.zeros(2, dtype=np.int64)
+    t = np.arange(float(n))
+    path = 5.0 * np.cos(0.31 * t + np.array([[0.0], [1.0]])).T
+    for _ in range(200):
+        noise = rng.standard_normal((n, 2))
+        for k in range(1, n):
+            noise[k] = memory * noise[k - 1] + np.sqrt(1.0 - memory**2) * noise[k]
+        noise[:, 1] += np.cos(1.7 * t + rng.uniform(0.0, 6.0))
+        found = noise_of([ep.Trajectory(t, path + noise, ["x", "y"])], [path])
+        called += found.is_error
+    assert called[0] <= 1
+    assert called[1] == 200
 
 
 @pytest.mark.slow
@@ -163,3 +198,61 @@ def test_what_explains_more_comes_first_then_the_simpler() -> None:
     assert replace(right, tests=(fails, half)).signs == [
         "x is off by 2", "y is off by nan", "both are off",
     ]  # fmt: skip
+
+
+def on_a_circle(law: dict[str, dict[str, float]]) -> TrajectoryFit:
+    """The fit on the path of a run of the oscillator x' = y, y' = -x, with another law."""
+    t = 0.3 * np.arange(200.0)
+    run = ep.Trajectory(t, np.stack([np.cos(t), -np.sin(t)], axis=1), ["x", "y"])
+    problem = scale_problem([run], ep.polynomial(["x", "y"], degree=1))
+    coef = [
+        law[problem.states[k]].get(problem.term_names[j], 0.0)
+        for k, j in zip(problem.equation, problem.column, strict=True)
+    ]
+    free = np.array(coef) / problem.to_SI
+    path = problem.all_records.samples
+    return TrajectoryFit(problem, np.full(path.shape, 0.01), 1e-4, path, free, free != 0.0, 4)
+
+
+@pytest.mark.parametrize(
+    ("law", "keeps"),
+    [
+        ({"x": {"y": 1.0}, "y": {"x": -1.0}}, True),
+        ({"x": {"y": 1.0}, "y": {"x": -1.0, "y": 0.2}}, False),  # grows, by e^6
+        ({"x": {"y": 1.0}, "y": {"x": -1.0, "y": -0.2}}, False),  # dies out
+        ({"x": {"y": 2.0}, "y": {"x": -2.0}}, False),  # turns twice as often
+    ],
+)
+def test_a_model_that_the_samples_steer_is_run_by_itself(
+    law: dict[str, dict[str, float]], keeps: bool
+) -> None:
+    fit, small = on_a_circle(law), np.full(2, 1e-5)
+    test = try_open_loop(fit, np.full(2, 0.01), np.zeros(2), start=small)
+    assert test.passes.all() == keeps
+    assert test.passes.any() == keeps
+
+
+def test_process_noise_may_keep_up_what_would_die_out() -> None:
+    law = {"x": {"y": 1.0}, "y": {"x": -1.0, "y": -0.2}}
+    fit, small = on_a_circle(law), np.full(2, 1e-5)
+    # The variance of a damped oscillator under noise: q^2 / (2 * 0.1) per unit of time, about one.
+    pushed = np.full(2, np.sqrt(0.2 * 0.3))
+    assert try_open_loop(fit, np.full(2, 0.01), pushed, start=small).passes.all()
+
+
+def test_a_delay_is_told_with_its_error() -> None:
+    run = spoilt("lotka_volterra", "lag 2", 0, 0.02)[1]
+    found = ep.estimate([run], ep.polynomial(["x", "y"], degree=2))
+    told = re.search(r"y comes \S+ s late \((\S+) ± (\S+) samples\)", found.misfit)
+    assert told is not None
+    assert abs(float(told[1]) - 2.0) < 2.0 * float(told[2])
+
+
+@pytest.mark.slow
+def test_samples_that_one_degree_more_explains_name_the_next_command() -> None:
+    """Coarse samples of the Brusselator: false terms and a little process noise follow them."""
+    run = chemical(0, n=120)
+    found = ep.discover(run)
+    assert "ep.polynomial(['x', 'y'], degree=3)" in found.misfit
+    assert "libraries.model.degree=3" in found.misfit
+    assert found.model.covariance is None

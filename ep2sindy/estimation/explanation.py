@@ -15,7 +15,7 @@ from math import log
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.estimation.cost import OutOfTimeError
+from ep2sindy.estimation.cost import SMALL, OutOfTimeError
 from ep2sindy.estimation.likelihood import TrajectoryFit
 from ep2sindy.estimation.observation import (
     PAYS,
@@ -137,18 +137,34 @@ def _explain(problem: EstimationProblem, align: bool, *, wider: bool) -> Explana
     first = _search_by_size(on_likeliest_courses(problem), wider=wider)
     exact, best = _compare(first)
     observed = best.observation
+    if observed.delays.any() and (other := _on_other_courses(problem, exact)):
+        exact = best = other
+    if best is exact and best.fits:
+        return _explanation(best)
+    if words := _lacks_terms(best):
+        return _explanation(exact if observed.delays.any() else best, words)
     if observed.delays.any():
-        if words := _lacks_terms(best):
-            return _explanation(exact, words)
         if not align:
-            words = delay_misfit(problem, observed.delays)
+            words = delay_misfit(problem, observed)
             return replace(_explanation(exact, words), delays=observed.delays)
-        words = f"{delay_words(problem, observed.delays)}: brought together with the others"
+        words = f"{delay_words(problem, observed)}: brought together with the others"
         return _explanation(best, remarks=(words,))
     if not best.fits:
         return _explanation(best, _misfit(best))
-    remarks = (process_noise_words(best),) if observed.process.any() else ()
-    return _explanation(best, remarks=remarks)
+    return _explanation(best, remarks=(process_noise_words(best),))
+
+
+def _on_other_courses(problem: EstimationProblem, late: Solution) -> Solution | None:
+    """A solution in which no state is late, with another course of an input; None without any."""
+    taken = late.problem.courses
+    for j, options in enumerate(problem.allowed_courses):
+        for course in options:
+            if course != taken[j]:
+                courses = (*taken[:j], course, *taken[j + 1 :])
+                found = search_within(late.problem.candidates.on_courses(courses))
+                if found.fits:
+                    return found
+    return None
 
 
 def _compare(first: Solution) -> tuple[Solution, Solution]:
@@ -234,46 +250,80 @@ def _align(found: Solution) -> Solution | None:
     # Samples at the ends are left out: scale the likelihood to the full number of samples.
     deviance = now.deviance * problem.n_samples / here.n_samples
     price = late.sum() * delay_price(problem) + PAYS
-    observation = replace(now.observation, delays=delays, price=price)
+    observation = replace(now.observation, delays=delays, price=price, delay_errors=errors)
     now = replace(now, observation=observation, deviance=deviance)
     sure = (np.abs(delays) >= SURE * errors).all()
     return now if sure and now.fits and now.score < found.score else None
 
 
-def _lacks_terms(late: Solution) -> str:
-    """Why terms are missing rather than a sensor late; empty unless one degree more is as good.
+def _lacks_terms(found: Solution) -> str:
+    """Why terms are missing: one degree more explains the samples as they are; else empty.
 
     With a channel that is moved, wrong equations may stand in for terms that the library lacks. But
-    higher products also stand in for a delay: they count if there are no more terms of them.
+    higher products also stand in for a delay: they count if there are no more terms of them. A
+    solution that explains the samples by anything else has to be likelier.
     """
-    wider = late.problem.widen and late.problem.widen()
-    if wider is None or len(wider.library) > MAX_WIDER or not wider.enough_samples:
+    problem, late = found.problem, bool(found.observation.delays.any())
+    wider = _wider(problem, MAX_WIDER if late else SMALL)
+    if wider is None:
         return ""
-    found = search_within(replace(wider, most_terms=late.problem.most_terms))
-    n_more = found.fit.support.sum() - late.fit.support.sum()
-    if not found.fits or found.score > late.score or n_more > 0:
+    wider = replace(wider, most_terms=problem.most_terms)
+    with problem.monitor.stage("products of one degree more"):
+        try:
+            better = search_within(wider)
+            for log10_ratio in OTHER_STARTS if len(wider.library) <= SMALL else ():
+                if better.fits or problem.n_samples >= ENOUGH_SAMPLES:
+                    break
+                better = _best(better, from_smooth(wider, log10_ratio))
+        finally:
+            problem.monitor.best = found  # whose library is the one asked for
+    n_more = better.fit.support.sum() - found.fit.support.sum()
+    if not better.fits or (found.fits and better.score > found.score) or (late and n_more > 0):
         return ""
+    degree = int(wider.library.degrees.max())
     return (
-        f"this library lacks terms: with products up to degree {wider.library.degrees.max()} the "
-        "samples are explained, and with no channel late; add these products. The equations are "
-        "the nearest found"
+        f"this library lacks terms: with products up to degree {degree} the samples are explained"
+        f"{', and with no channel late' if late else ''}: take {_next_library(problem)}. The "
+        "equations are the nearest found"
+    )
+
+
+def _wider(problem: EstimationProblem, most: int) -> EstimationProblem | None:
+    """The problem with products of one degree more, if it has no more terms; None without any."""
+    if problem.widen is None or problem.candidates.required.all():  # all terms are given
+        return None
+    wider = problem.widen()
+    if len(wider.library) > most or not wider.enough_samples:
+        return None
+    return wider.on_courses(problem.courses)
+
+
+def _next_library(problem: EstimationProblem) -> str:
+    """How to ask for a library of one degree more, in Python and on the command line."""
+    degree = int(problem.candidates.library.degrees.max()) + 1
+    names = [*problem.states, *problem.inputs]
+    return (
+        f"ep.polynomial({names}, degree={degree}), with +exp=discover "
+        f"libraries.model.degree={degree}"
     )
 
 
 def _misfit(found: Solution) -> str:
     """Why a solution does not explain the samples, and what to do."""
     states, explained = found.problem.states, found.explained
+    tried = _wider(found.problem, SMALL) is not None
+    more = "those of one degree more do not do" if tried else f"try {_next_library(found.problem)}"
     if explained.any():
         lacking, known = (" and ".join(compress(states, each)) for each in (~explained, explained))
         words = (
-            f"no law of this library explains {lacking}: a term or a state is missing there. What "
-            f"was measured of {known} is explained, with process noise of the size given"
+            f"no law of this library explains {lacking}: a term or a state is missing there ({more}"
+            f"). What was measured of {known} is explained, with process noise of the size given"
         )
     else:
         words = (
             "no model of this library fits these data as far as their noise: "
-            f"{'; '.join(found.signs)}. The equations are the nearest found; add terms or states, "
-            "or judge them by free run"
+            f"{'; '.join(found.signs)}. The equations are the nearest found; add terms ({more}) or "
+            "states, or judge them by free run"
         )
     sign = unobserved_state(found.problem)
     return f"{words}. A state is missing for certain: {sign}. {ADVICE}" if sign else words

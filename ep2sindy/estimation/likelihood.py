@@ -38,6 +38,7 @@ from ep2sindy.estimation.problem import (
     ByState,
     EstimationProblem,
     ScaledRecord,
+    StateMask,
     Support,
 )
 from ep2sindy.model.flow import Flow, flow
@@ -86,6 +87,12 @@ class TrajectoryFit:
         """The same states under other errors, alike at all samples."""
         noise = np.tile(noise, (len(self.path), 1))
         return replace(self, noise=noise, n_substeps=1, process_noise=process_noise)
+
+    @property
+    def has_law(self) -> StateMask:
+        """Mask of the states whose rates depend on a state or an input."""
+        varies = self.problem.library.degrees > 0
+        return np.asarray((self.problem.coef(self.free)[varies] != 0.0).any(axis=0))
 
     @property
     def paths(self) -> list[BySample]:

@@ -29,6 +29,10 @@ LONGER = 6.0  # tolerance of autocorrelations, which scatter by up to 1.7/sqrt(n
 NOISE_SHARES = 2.0 ** np.arange(-6.0, 1.1, 0.25)  # of the residuals' RMS, tried for limits
 LAGS = (2, 3, 4, 5, 6)
 CHANCE = 1e-5  # that noise holds a line as clean as one that is called the model's error
+# A state that lasts about its rest has a law: x' = -k x under process noise is AR(1), too. So what
+# is left of one that a model leaves at rest must be white, to a level of one record in 200: nobody
+# measures what does not move. A path that explains less of the samples' variance leaves it there.
+CHANCE_AT_REST, EXPLAINS = 5e-3, 0.1
 # Degrees above the library's, and number, of the products of states that residuals are compared
 # with; and standard errors by which these may explain more of random residuals than their number.
 MORE_DEGREES, MAX_POWERS, FOLLOWS = 2, 60, 6.0
@@ -116,14 +120,17 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
         left = _expected_residuals(fit, std)
     unit = problem.split(left / shape)
     memory = _memory(unit)
+    rests = _rests(fit, left)
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
     new = [np.concatenate([e[:1], e[1:] - memory * e[:-1]]) for e in unit]
-    patterned = (_hold_line(problem, new) | _follow_states(fit, new)) & (std > FLOOR)
+    holds = _hold_line(problem, new, np.where(rests, CHANCE_AT_REST, CHANCE))
+    patterned = holds | _follow_states(fit, new) | (rests & _foretold(problem, left))
+    patterned &= std > FLOOR
     samples, off = (problem.split(each) for each in (record.values, record.values - fit.path))
     # Slow residuals of a signal's size tell that the model ignores the signal.
     ignored = (memory > SLOW) & (std > LARGE * record.samples.std(axis=0))
     lasts = _lasts_as_noise(unit, samples, off, std, memory, float(problem.n_samples))
-    believed = shows & lasts & ~ignored & ~patterned
+    believed = shows & lasts & ~ignored & ~patterned & ~rests
     std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std[~hidden]).mean()
@@ -142,6 +149,34 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
         outliers=outliers,
         deviance=float((logs + n * np.log1p(-np.square(lasting)))[~hidden].sum()),
     )
+
+
+def _rests(fit: TrajectoryFit, left: BySample) -> StateMask:
+    """True for measured states of which a path says next to no more than a steady drift does."""
+    record = fit.problem.all_records
+    line = np.column_stack([np.ones(len(left)), record.times])
+    beside_line = record.samples - line @ np.linalg.lstsq(line, record.samples, rcond=None)[0]
+    squares = np.square(beside_line).sum(axis=0)
+    found: StateMask = np.square(left).sum(axis=0) > (1.0 - EXPLAINS) * squares
+    return found & fit.problem.measured
+
+
+def _foretold(problem: EstimationProblem, left: BySample) -> StateMask:
+    """True for residuals that the samples of all states one step before foretell (F test)."""
+    from scipy.special import fdtrc  # imported only where it is needed
+
+    record = problem.all_records
+    kept = np.delete(np.arange(len(left) - 1), record.breaks)
+    before = record.samples[kept][:, problem.measured]
+    n, p = before.shape
+    if n < p + 3:
+        return np.zeros(left.shape[1], dtype=np.bool_)
+    own = left[kept + 1] - left[kept + 1].mean(axis=0)
+    basis = np.linalg.qr(before - before.mean(axis=0))[0]
+    share = np.square(basis.T @ own).sum(axis=0) / np.maximum(np.square(own).sum(axis=0), TINY)
+    ratio = share / p / np.maximum(1.0 - share, TINY) * (n - p - 1)
+    found: StateMask = fdtrc(p, n - p - 1, ratio) < CHANCE_AT_REST
+    return found
 
 
 def are_noise(samples: Pieces, left: Pieces, n: float) -> StateMask:
@@ -260,11 +295,12 @@ def _deviance(fit: TrajectoryFit) -> float:
     return spread + n * np.log(max(least, TINY) / n)
 
 
-def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray]) -> StateMask:
+def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray], chance: ByState) -> StateMask:
     """True if whitened residuals hold a cleaner line than noise: the model ignores an oscillation.
 
-    Of white residuals the m ordinates of a periodogram are alike: the largest has more than a share
-    g of their sum with a probability of at most m (1 - g)^(m - 1).
+    chance: for each state, that noise holds one in any of the records. Of white residuals the m
+    ordinates of a periodogram are alike: the largest has more than a share g of their sum with a
+    probability of at most m (1 - g)^(m - 1).
     Source: Fisher 1929, doi:10.1098/rspa.1929.0151.
     """
     held = np.zeros(len(problem.states), dtype=np.bool_)
@@ -275,7 +311,7 @@ def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray]) -> StateMa
         np.add.at(placed, place, each)
         power = np.square(np.abs(np.fft.rfft(placed, axis=0)[1 : (len(placed) + 1) // 2]))
         share = power.max(axis=0, initial=0.0) / np.maximum(power.sum(axis=0), TINY)
-        held |= len(power) * (1.0 - share) ** (len(power) - 1) < CHANCE / len(new)
+        held |= len(power) * (1.0 - share) ** (len(power) - 1) < chance / len(new)
     return held
 
 

@@ -34,6 +34,7 @@ from ep2sindy.regression.gram_kernels import invert_gram
 IGNORED = 0.5  # residual, as a share of a state's spread, if the model ignores the state
 PAYS = 1.0  # least fall of squares plus prices, beyond the delays' own price
 SURE = 6.0  # standard errors of every delay: true ones of a sample show ten and more
+HALF_WIDTH = 1.96  # standard errors of an interval of 95 %
 MAX_SAMPLES = 10.0  # largest delay that is believed: more is no small clock error
 
 
@@ -45,13 +46,15 @@ class Observation:
 
     Of y a record has the value, a pair of limits, or nothing (`ScaledRecord`), whatever the other
     parts are. delays: (d,), in mean steps. process: (d,), scaled; zero for an exact trajectory.
-    price: of the parameters that are not zero, on the scale of -2 log likelihood.
+    price: of the parameters that are not zero, on the scale of -2 log likelihood. delay_errors:
+    (d,), standard errors of the delays; zero without any.
     """
 
     noise: Noise
     delays: ByState
     process: ByState
     price: float = 0.0
+    delay_errors: ByState | float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,21 +250,22 @@ def shift_channels(
     return replace(problem, records=tuple(records))
 
 
-def delay_words(problem: EstimationProblem, delays: ByState) -> str:
-    """Delays in words, `z comes 0.00333 s late (0.99 samples)`, for every delayed state."""
+def delay_words(problem: EstimationProblem, observed: Observation) -> str:
+    """Delays in words, `z comes 0.0033 s late (0.99 ± 0.02 samples)`, for every delayed state."""
+    errors = HALF_WIDTH * (observed.delay_errors + np.zeros(len(problem.states)))
     parts = [
         f"{state} comes {abs(delay) * problem.step_s:.3g} s {'late' if delay > 0.0 else 'early'} "
-        f"({abs(delay):.2f} samples)"
-        for state, delay in zip(problem.states, delays, strict=True)
+        f"({abs(delay):.2f} ± {error:.1g} samples)"
+        for state, delay, error in zip(problem.states, observed.delays, errors, strict=True)
         if delay
     ]
     return " and ".join(parts)
 
 
-def delay_misfit(problem: EstimationProblem, delays: ByState) -> str:
+def delay_misfit(problem: EstimationProblem, observed: Observation) -> str:
     """Explanation why samples with a late channel are a misfit, and what to do about it."""
     return (
-        f"{delay_words(problem, delays)}: brought together, the samples are better explained "
+        f"{delay_words(problem, observed)}: brought together, the samples are better explained "
         "by other equations; ask for those by ep.TrajectorySearch(align=True), in configs "
         "search.align=true. These are of the samples as they are"
     )

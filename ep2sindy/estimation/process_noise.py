@@ -33,6 +33,7 @@ from ep2sindy.estimation.solver import (
     exchange_terms,
     refit,
     start_from_smooth,
+    with_open_loop,
 )
 from ep2sindy.estimation.supports import term_prices
 
@@ -95,24 +96,25 @@ def solve_with_process_noise(problem: EstimationProblem) -> Solution:
     fit = refit(fit)
     noise, none = noise_beside(fit), np.zeros(len(problem.states))
     explained = replace(noise, std=std, memory=none, unexplained=none, patterned=none > 0.0)
-    return Solution(
+    solution = Solution(
         fit=fit,
         observation=Observation(explained, none, process),
         prices=prices,
-        deviance=deviance,
+        # Squares of innovations, scaled to their best size, are as many as samples.
+        deviance=deviance - problem.n_squares,
         tests=(_test_defects(fit), *_test_innovations(fit)),
     )
+    return with_open_loop(solution) if solution.fits else solution
 
 
 def _test_defects(fit: TrajectoryFit) -> LackOfFit:
     """RMS of the defects of a path, in what process noise and noise allow.
 
-    Infinite for a state without a law: one whose equation has no term, which noise alone moves.
+    Infinite for a state without a law, which noise alone moves: of a constant rate at most.
     """
     defects = fit.squared_defects / len(fit.path)
     allowed = MAX_DEFECT**2 * fit.process[0] + np.square(EXACT * fit.noise[0])
-    moves = fit.problem.coef(fit.free).any(axis=0)
-    return LackOfFit(np.where(moves, np.sqrt(defects / allowed), np.inf), 1.0)
+    return LackOfFit(np.where(fit.has_law, np.sqrt(defects / allowed), np.inf), 1.0)
 
 
 def process_noise_words(solution: Solution) -> str:
