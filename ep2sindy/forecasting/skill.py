@@ -47,6 +47,7 @@ from ep2sindy.signals.spectrum import is_uniform
 
 PERIODS_AHEAD = 4.0  # longest horizon
 NEARER = 0.9  # share of the model's error below which a baseline is clearly nearer
+CLOSE = 0.5  # error, in standard deviations, halfway to the mean, whose error is one
 MODEL = "model"
 WORDS = {
     PERSISTENCE: "the last sample",
@@ -171,11 +172,29 @@ class ForecastSkill:
         return f"better than {rival} for {until}{self._beside_others()}"
 
     @property
+    def n_follows(self) -> int:
+        """Number of horizons, from the first on, at which the model errs by less than `CLOSE`."""
+        far = self.nrmse[MODEL] >= CLOSE
+        return int(np.argmax(far)) if far.any() else len(far)
+
+    @property
     def headline(self) -> str:
-        """What was found, by what it foresees: `a model that forecasts better than ...`."""
-        return f"a model that forecasts {self.text}" if self.is_better else (
-            f"nothing that forecasts {self.text.removeprefix('no ')}"
-        )  # fmt: skip
+        """What was found, by what it foresees: `a model that forecasts better than ...`.
+
+        A model that is no better, but close for a period or more, is told with how long it is: a
+        record without noise that repeats itself is foreseen by anything linear as well.
+        """
+        if self.is_better:
+            return f"a model that forecasts {self.text}"
+        least_s = self.period_s if self.unit == "periods" else float(self.horizons_s[-1])
+        if not self.n_follows or self.horizons_s[self.n_follows - 1] < least_s:
+            return f"nothing that forecasts {self.text.removeprefix('no ')}"
+        more = " and more" if self.n_follows == len(self.horizons_s) else ""
+        until = self.horizons_s[self.n_follows - 1] / self.unit_s
+        return (
+            f"a model that forecasts to {CLOSE:g} standard deviations for {until:.2g} "
+            f"{self.unit}{more}, {self.text}"
+        )
 
     def _beside_others(self) -> str:
         """A remark if the mean cycle or neighbours are nearer than the model at most horizons."""

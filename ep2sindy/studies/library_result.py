@@ -124,7 +124,11 @@ def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
 
 
 def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
-    """The living model, or the best of those that were run; and what its rows leave over."""
+    """The living model, or the best of those that were run; and what its rows leave over.
+
+    A living model was asked to sustain its oscillation, so its free run heads the result; any other
+    model, its forecasts.
+    """
     living = {name: each.living for name, each in results.items() if each.living is not None}
     if not living:
         runs = {name: worst_run(each.runs) for name, each in results.items()}
@@ -142,6 +146,8 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
         )
     best = best_run({name: each.run for name, each in living.items()})
     run = living[best].run
+    skill = results[best].skill
+    words = [Text(f"forecasts of held-out time: {skill.text}")] if skill is not None else []
     caution = [Text(run.caution, warning=True)] if run.caution else []
     tests = [result.discovery.noise_test for result in results.values()]
     return found_model(
@@ -149,8 +155,7 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
         run,
         file=f"{best}_living",
         picture="trajectories" if run.cycle is None else f"free_run_{best}",
-        skill=results[best].skill,
-        more=[*caution, *left_over_of_all(tests)],
+        more=[*words, *caution, *left_over_of_all(tests)],
         where="held-out time",
         held=living[best].discovery.constraint,
     )

@@ -168,7 +168,9 @@ def found_model(
 def _fate(run: Evaluation, *, seen: bool, misfit: str) -> str:
     """`sustains the oscillation`, `has the wrong cycle`, `diverges after 12 us`."""
     words = {
-        Status.SUSTAINED: "sustains the oscillation",
+        Status.SUSTAINED: "keeps the oscillation under its inputs"
+        if run.model.inputs
+        else "sustains the oscillation",
         Status.WRONG_FREQUENCY: "has the wrong frequency",
         Status.WRONG_CYCLE: "has the wrong cycle",
         Status.NO_CYCLE: "is unlike the data",
