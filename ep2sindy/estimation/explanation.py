@@ -312,7 +312,8 @@ def _misfit(found: Solution) -> str:
     """Why a solution does not explain the samples, and what to do."""
     states, explained = found.problem.states, found.explained
     tried = _wider(found.problem, SMALL) is not None
-    more = "those of one degree more do not do" if tried else f"try {_next_library(found.problem)}"
+    next_one = f"try {_next_library(found.problem)}"
+    more = "products of one degree more do not help" if tried else next_one
     if explained.any():
         lacking, known = (" and ".join(compress(states, each)) for each in (~explained, explained))
         words = (

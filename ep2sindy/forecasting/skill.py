@@ -192,7 +192,7 @@ class ForecastSkill:
         more = " and more" if self.n_follows == len(self.horizons_s) else ""
         until = self.horizons_s[self.n_follows - 1] / self.unit_s
         return (
-            f"a model that forecasts to {CLOSE:g} standard deviations for {until:.2g} "
+            f"a model that forecasts within half a standard deviation for {until:.2g} "
             f"{self.unit}{more}, {self.text}"
         )
 

@@ -143,15 +143,9 @@ class Study:
                 seed=report.seed, progress=report.watch, once=keeping.once,
             )  # fmt: skip
         best = best_of(attempts)
-        how = best.states.embedding.how
-        if how != "hidden" and not linear and any(each.how == "hidden" for each in self.tried):
-            report.say(NOT_EXPLAINED)
-        if how in ("derivative", "delays") and (hint := lost_mean(signal)):
-            report.warn(hint)
         states, free = run_on_rest(signal, best, progress=report.watch)
         skill = free.forecast
-        if best.is_damped_line and skill is not None and _equals_linear(skill):
-            report.say(AR_2)
+        self._say_of_choice(signal, best, skill, report, linear=linear)
         seen = len(best.states.signal.t) == len(signal.t)
         where = "all of it, too short to hold out" if seen else "its end, which was not fitted"
         remarks = [Text(free.caution, warning=True)] if free.caution else []
@@ -179,6 +173,19 @@ class Study:
         add_candidates(report, NAME, replace(best.found, fronts=fronts))
         if best.found.estimate is not None:
             add_estimate(report, signal.name, best.found)
+
+    def _say_of_choice(
+        self, signal: Trace, best: Attempt, skill: ForecastSkill | None, report: Report, *,
+        linear: bool,
+    ) -> None:  # fmt: skip
+        """Tell what the chosen states and model mean. linear: whether the signal is."""
+        how = best.states.embedding.how
+        if how != "hidden" and not linear and any(each.how == "hidden" for each in self.tried):
+            report.say(NOT_EXPLAINED)
+        if how in ("derivative", "delays") and (hint := lost_mean(signal)):
+            report.warn(hint)
+        if best.is_damped_line and skill is not None and _equals_linear(skill):
+            report.say(AR_2)
 
     def _prepared(self, data: Trajectory, once: Once, report: Report) -> Trace:
         """The signal, with its fitted offset if one is asked for."""
