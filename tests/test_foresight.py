@@ -51,6 +51,14 @@ def test_of_a_linear_signal_linear_equations_alone_are_tried() -> None:
     assert attempt.process_noise_std["v"] > 0.0
 
 
+def test_a_positive_signal_that_is_linear_has_a_derivative_and_no_rate() -> None:
+    x = line_in_noise()
+    positive = trace_of(x + 1.5 * np.abs(x).max())
+    (attempt,) = try_in_turn(positive, [Preparation("auto")], QUICK)
+    assert attempt.preparation == Preparation("derivative", degree=1)
+    assert attempt.is_damped_line
+
+
 def test_what_is_told_holds_in_the_library_of_every_preparation_that_has_it() -> None:
     states = ep.embed(trace_of(np.sin(np.arange(600) / 6.0)), "derivative")
     told = ToldFacts(

@@ -111,6 +111,11 @@ class Preparation:
         own = "derivative" if self.how == "auto" else self.how
         Embedding(own, self.n_states, self.harmonics)  # refuses settings that no embedding has
 
+    def linear(self, signal: Trace) -> Preparation:
+        """The same with linear equations, of a derivative: x' = x g is not linear in the states."""
+        is_rate = self.how == "rate" or (self.how == "auto" and signal.is_positive)
+        return replace(self, how="derivative" if is_rate else self.how, degree=1, functions=())
+
     def search(
         self, past: Trace, method: AnyMethod, told: ToldFacts, *, seed: int, progress: Progress,
         once: Once,
@@ -251,7 +256,7 @@ def try_in_turn(
         if past.cycle is not None and past.cycle.share >= REPEATS:
             tried = [each for each in tried if each.n_states == 2] or tried
         elif linear and smoothed:
-            tried = [replace(smoothed[0], degree=1, functions=())]
+            tried = [smoothed[0].linear(past)]
     method, part = judged_by(method, past.name), end_of_periods(past)
     attempts, left_out = [], []
     for each in tried:

@@ -235,7 +235,7 @@ def lost_mean(signal: Trace) -> str | None:
     """A message if the signal is one-sided pulses about a mean of zero; otherwise None."""
     away = signal.x - np.median(signal.x)
     one_way = float(np.mean(away**3) / np.mean(away**2) ** 1.5)
-    if not one_way > PULSES:
+    if signal.is_positive or not one_way > PULSES:
         return None
     return (
         f"{signal.name} is pulses that take either sign, as a positive signal does that lost its "
