@@ -67,7 +67,7 @@ def trace(t: np.ndarray, x: np.ndarray, *more: str) -> Traced | str:
         if done.returncode:
             return (done.stderr or done.stdout).strip().splitlines()[-1]
         result = Path(done.stdout.split()[-1]).parent  # of the page
-        tables, errors = result / "tables", result / "tables" / "forecasts.csv"
+        tables, errors = result / "tables", result / "tables" / "forecast_trace.csv"
         return Traced(
             json.loads((result / "summary.json").read_text()),
             pd.read_csv(errors) if errors.exists() else pd.DataFrame(),
