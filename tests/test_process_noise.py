@@ -33,13 +33,15 @@ def moved(system: System, share: float, seed: int, *, noise: float = 0.01) -> Tr
 
 
 def counted(system: System, degree: int, seeds: range) -> tuple[int, int, int]:
-    """Right supports without a misfit, and intervals of them that hold the truth, of how many."""
+    """Right supports without a misfit, and intervals of them that hold, of how many."""
     right = held = n = 0
     for seed in seeds:
         run = moved(system, 0.02, seed)
         found = ep.discover(run, ep.polynomial(run.state_names, degree=degree))
         truth = system.model
-        if found.misfit or any(set(found.model.terms(s)) != set(truth.terms(s)) for s in truth.states):
+        if found.misfit or any(
+            set(found.model.terms(s)) != set(truth.terms(s)) for s in truth.states
+        ):
             continue
         assert "process noise moves the states" in found.remarks[0]
         right += 1
