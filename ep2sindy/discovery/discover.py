@@ -89,18 +89,12 @@ def discover(
     task = Task(trajectories, library, hidden)
     rng, watch = np.random.default_rng(seed), as_progress(progress)
     together = shared or law is not None
-    if not together and all(run.parameters == task.runs[0].parameters for run in task.runs):
-        found = _discover_point((task, rng), method=method, progress=watch)
-        return replace(found, remarks=(*found.remarks, *averaged))
-    points = group_by_point(task.runs, [v for v in library.variables if v not in hidden])
     if together:
-        found = _discover_together(task, points, method, law, rng, watch)
-        return replace(found, remarks=(*found.remarks, *averaged))
-    tasks = [replace(task, runs=own) for own in points.values()]
-    pieces = list(zip(tasks, rng.spawn(len(tasks)), strict=True))
-    stage = watch.stage(len(pieces), "point", "discovery")
-    each = collect(workers or Serial(), partial(_discover_point, method=method), pieces, stage)
-    found = join_points(dict(zip(points, each, strict=True)), values_of(points))
+        found = _discover_together(task, method, law, rng, watch)
+    elif all(run.parameters == task.runs[0].parameters for run in task.runs):
+        found = _discover_point((task, rng), method=method, progress=watch)
+    else:
+        found = _discover_apart(task, method, workers or Serial(), rng, watch)
     return replace(found, remarks=(*found.remarks, *averaged))
 
 
@@ -113,9 +107,29 @@ def _hidden_names(hidden: Sequence[str] | int, taken: Sequence[str]) -> Sequence
     return list(islice((name for name in names if name not in taken), n))
 
 
+def _points_of(task: Task) -> Mapping[str, Sequence[Trajectory]]:
+    """The runs of every operating point, by its label."""
+    return group_by_point(task.runs, [v for v in task.library.variables if v not in task.hidden])
+
+
+def _discover_apart(
+    task: Task,
+    method: DiscoveryMethod,
+    workers: Workers,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> Discovery:
+    """Each operating point alone, by the workers."""
+    points = _points_of(task)
+    tasks = [replace(task, runs=own) for own in points.values()]
+    pieces = list(zip(tasks, rng.spawn(len(tasks)), strict=True))
+    stage = progress.stage(len(pieces), "point", "discovery")
+    found = collect(workers, partial(_discover_point, method=method), pieces, stage)
+    return join_points(dict(zip(points, found, strict=True)), values_of(points))
+
+
 def _discover_together(
     task: Task,
-    points: Mapping[str, Sequence[Trajectory]],
     method: DiscoveryMethod,
     law: LawFunctions | Sequence[LawFunctions] | None,
     rng: np.random.Generator,
@@ -125,7 +139,7 @@ def _discover_together(
     # This loads torch, only for a law or a support of several operating points.
     from ep2sindy.discovery.several_points import PointsTask
 
-    structure = None
+    points, structure = _points_of(task), None
     if task.facts.roles is not None:
         middle = list(points.values())[most_central(values_of(points))]
         one = replace(task, runs=middle)

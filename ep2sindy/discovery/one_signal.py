@@ -62,13 +62,26 @@ class ToldFacts:
 
     exclude: state -> terms that its equation does not have. relations: between coefficients, as
     for `Library.relate`. rests_at_zero: whether a signal that is zero and does not change stays so:
-    no equation of its derivatives then has a term that is not zero there. States and terms that a
-    preparation lacks are passed over.
+    no equation of its derivatives then has a term that is not zero there. States and terms that one
+    preparation lacks are passed over there.
     """
 
     exclude: Mapping[str, Sequence[str]] = field(default_factory=dict)
     relations: Sequence[str] = ()
     rests_at_zero: bool = False
+
+    def check(self, tried: Sequence[Preparation], signal: Trace) -> None:
+        """Raise ValueError for facts of states that no preparation makes of the signal."""
+        names = {name for each in tried for name in each.names(signal)}
+        if lost := set(self.exclude) - names:
+            raise ValueError(
+                f"exclude must name states that are tried, {sorted(names)}: got {sorted(lost)}"
+            )
+        if self.rests_at_zero and all(each.how not in ("auto", "derivative") for each in tried):
+            raise ValueError(
+                "rests_at_zero says something of a signal and its derivatives: add "
+                "{how: derivative} to tried, or leave it out"
+            )
 
     def add_to(self, library: Library, states: Embedded) -> Library:
         """The library of some states, with what is known of them."""
@@ -110,6 +123,12 @@ class Preparation:
     def __post_init__(self) -> None:
         own = "derivative" if self.how == "auto" else self.how
         Embedding(own, self.n_states, self.harmonics)  # refuses settings that no embedding has
+
+    def names(self, signal: Trace) -> set[str]:
+        """States that it makes of a signal, or may make."""
+        ways = ("rate", "derivative", "delays") if self.how == "auto" else (self.how,)
+        made = (Embedding(how, self.n_states, self.harmonics).names(signal) for how in ways)
+        return {name for names in made for name in names}
 
     def linear(self, signal: Trace) -> Preparation:
         """The same with linear equations, of a derivative: x' = x g is not linear in the states."""

@@ -131,6 +131,7 @@ class Study:
         field, data = self._sampled(report)
         with resumed(self.keep, report) as keeping:
             signal = self._prepared(data, keeping.once, report)
+            self.told.check(self.tried, signal)
             past = fitted_part(signal, self.held_out)
             linear = is_linear(past)
             if linear:
