@@ -11,9 +11,7 @@ from ep2sindy.signals.attractor import (
     _fourier_columns,
     _moving_average,
     best_shift,
-    distribution_distances,
     find_cycle,
-    spectrum_distance,
     waveform_errors,
     white_variance,
 )
@@ -121,19 +119,6 @@ def test_waveforms_are_compared_at_their_best_shift():
     np.testing.assert_allclose(waveform_errors(data, find_cycle(t, off)), [0.5, 0.0], atol=5e-3)
     lag = np.column_stack([spiky(t)[:, 0], spiky(t, shift=0.3)[:, 1]])  # a lag between states too
     assert np.max(waveform_errors(data, find_cycle(t, lag))) > 0.1
-
-
-def test_distances_of_distributions_and_spectra():
-    rng = np.random.default_rng(4)
-    x = rng.normal(size=(20000, 2))
-    moved = distribution_distances(x, x * [1.0, 2.0] + [0.5, 0.0])
-    # A shift of half a deviation; twice the deviation: E|z| = sqrt(2/pi).
-    np.testing.assert_allclose(moved, [0.5, np.sqrt(2.0 / np.pi)], rtol=0.03)
-    t = times(60.0)
-    one, other = spiky(t), spiky(t, f_Hz=2.0 * F_HZ)
-    assert spectrum_distance(t, one, one) == 0.0
-    assert spectrum_distance(t, one, other) > 0.6
-    assert spectrum_distance(t, one, 7.0 * one) == pytest.approx(0.0, abs=1e-12)
 
 
 def noisy_wave(share: float, *, n_periods: int = 50) -> tuple[ep.Trajectory, np.ndarray]:

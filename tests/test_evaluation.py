@@ -99,13 +99,13 @@ def test_units_change_nothing() -> None:
     assert found.waveform_error["y"] == pytest.approx(plain.waveform_error["y"], abs=1e-5)
 
 
-def test_chaos_is_judged_by_its_distribution() -> None:
+def test_chaos_is_judged_by_means_and_amplitudes() -> None:
     system = replace(lorenz(), duration_s=60.0, rate_Hz=100.0)
     run = system.trajectory()
     truth = evaluate(system.model, run)
     assert truth.status is Status.NO_CYCLE
     assert truth.is_similar
-    assert truth.text == "no cycle to compare; its statistics are the record's"
+    assert truth.text == "no cycle to compare; its means and amplitudes are the record's"
     assert np.isnan(truth.f_error)
     still = replace(system.model, coef=system.model.coef.copy())
     coef = still.coef.copy()
@@ -115,7 +115,7 @@ def test_chaos_is_judged_by_its_distribution() -> None:
     wide[list(still.library.names).index("x"), 1] = 60.0
     other = evaluate(replace(still, coef=wide), run)
     assert other.status is Status.NO_CYCLE
-    assert other.text == "no cycle to compare; its statistics are not the record's"
+    assert other.text == "no cycle to compare; its means and amplitudes are not the record's"
     assert sorted([other, truth], key=lambda found: found.rank)[0] is truth
 
 
@@ -181,7 +181,7 @@ def test_the_title_of_a_result_says_where_a_model_was_fitted_and_what_it_does_no
         title(run, seen=True) == "Found: a model that sustains the oscillation where it was fitted"
     )
     similar = replace(run, status=Status.NO_CYCLE)
-    assert title(similar) == "Found: a model that has the statistics of the data"
+    assert title(similar) == "Found: a model that has the means and amplitudes of the data"
     assert title(similar, misfit="no law") == "Found: a model that does not explain the data"
 
 
@@ -284,7 +284,7 @@ def test_the_table_fits_a_screen_and_tells_what_a_discovery_does_not_explain() -
     assert found.lack_of_fit == "x < its noise"
     lines = repr(found).splitlines()
     assert lines[1].split() == ["status", "sustained"]
-    assert lines[-1].split(maxsplit=2)[2] == "fit         x < its noise"
+    assert lines[-1].split(maxsplit=2)[2] == "fit      x < its noise"
     assert len(lines) <= 25
     assert max(map(len, lines)) <= 100
     assert "x &lt; its noise" in found._repr_html_()

@@ -38,7 +38,7 @@ N_REST = 16  # samples of a record from which rest points are looked for
 NEUTRAL = 1e-6  # growth per turn of a departure from a rest point that neither grows nor decays
 # Distance of two rest points, in standard deviations: Newton's method ends short of multiple roots.
 APART = 1e-2
-STD, WIDEST = " standard deviations", len("distribution error  ")
+STD, WIDEST = " standard deviations", len("amplitude ratio  ")
 LEFT = 100.0  # times a record's size, from which a run's is not told
 N_SHOWN = 4  # most states, and most rest points, that the table shows one by one
 
@@ -62,13 +62,12 @@ class Evaluation:
     forecasts are computed when they are first asked for.
 
     record: the samples that it was run over. status: how the run goes. is_similar: whether it is
-    like the record: sustained, or, without a cycle to compare, with its envelope or statistics.
-    f_error: relative error of the frequency. amplitude_ratio, waveform_error, distribution: by
-    state, the last two in standard deviations. They are NaN for a run that diverged; frequency and
-    waveform errors are also NaN if the record or the run has no period. spectrum: share of the
-    power in other bands. lack_of_fit: why the model does not explain the data it was found from;
-    empty if it does, or if that is not known. forecasts: makes `forecast`; None without held-out
-    samples.
+    like the record: sustained, or, without a cycle to compare, with its envelope, or with its means
+    and amplitudes. f_error: relative error of the frequency. amplitude_ratio, waveform_error: by
+    state, the last in standard deviations. They are NaN for a run that diverged; frequency and
+    waveform errors are also NaN if the record or the run has no period. lack_of_fit: why the model
+    does not explain the data it was found from; empty if it does, or if that is not known.
+    forecasts: makes `forecast`; None without held-out samples.
     """
 
     model: SparseModel
@@ -80,8 +79,6 @@ class Evaluation:
     f_error: float
     amplitude_ratio: Mapping[str, float]
     waveform_error: Mapping[str, float]
-    distribution: Mapping[str, float]
-    spectrum: float
     lack_of_fit: str = ""
     forecasts: Callable[[], ForecastSkill] | None = field(default=None, repr=False)
 
@@ -90,7 +87,7 @@ class Evaluation:
         """The status, and after which time a run diverged or left a domain."""
         if self.status is Status.NO_CYCLE:
             are = "are" if self.is_similar else "are not"
-            return f"{self.status}; its statistics {are} the record's"
+            return f"{self.status}; its means and amplitudes {are} the record's"
         of = f" of {self.rollout.outside}" if self.rollout.outside else ""
         lasted = self.rollout.lasted_text if self.rollout.diverged else ""
         return f"{self.status}{of} after {lasted}" if lasted else str(self.status)
@@ -294,7 +291,6 @@ class Evaluation:
             ("frequency", _listed(frequencies) + error),
             ("amplitude ratio", _listed(_sizes(self.amplitude_ratio))),
             ("waveform error", _listed(_texts(self.waveform_error), STD)),
-            ("distribution error", _listed(_texts(self.distribution), STD)),
             ("phase", phase if np.isfinite(self.phase_end) else ""),
             ("cycle", cycle or ""),
             *(("rests at", self._rest_text(rest)) for rest in self.rest_points[:N_SHOWN]),
@@ -363,7 +359,6 @@ def evaluate(
         status=Status.LEAVES_DOMAIN if rollout.outside else ours.status,
         is_similar=ours.is_similar,
         f_error=ours.f_error,
-        spectrum=likeness.spectrum,
         lack_of_fit=misfit,
         forecasts=forecasts,
         **by_state,

@@ -1,4 +1,4 @@
-"""Comparison of a model run with a record: by the cycle, or by statistics if nothing repeats."""
+"""Comparison of a model run with a record: by the cycle, or by means and amplitudes without one."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.signals.attractor import (
     Cycle,
-    distribution_distances,
     find_cycle,
-    quarter_distances,
-    spectrum_distance,
     waveform_errors,
     white_variance,
 )
@@ -24,10 +21,6 @@ from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency, has_decayed,
 
 LONG = 8.0  # fewest periods in a record whose first half may be left out as a transient
 REPEATS = 0.9  # least share of the variance that the waveform of a cycle explains; chaos: 0.5-0.75
-# Factor on the distance between the spectra of quarters: quarters lack the slow bands, in which a
-# record that does not repeat itself varies most.
-SPECTRUM_WANDERS = 2.0
-
 
 # Depth below zero, in standard deviations of the data, from which a density counts as negative.
 BELOW_ZERO = 1e-3
@@ -49,8 +42,8 @@ class Status(StrEnum):
     sustained: it stays on the record's cycle. wrong frequency: amplitudes and waveform are the
     record's, and the frequency is not, or the run misses the record in the first period already.
     no cycle to compare: the record grows, decays or does not repeat itself; `is_similar` says
-    whether the run has its envelope or its statistics. How far it forecasts such a record is not
-    said (`Evaluation.forecast`).
+    whether the run has its envelope, or its means and amplitudes. How far it forecasts such a
+    record, `Evaluation.forecast` says.
     """
 
     SUSTAINED = "sustained"
@@ -68,19 +61,15 @@ class FreeRunBounds:
     """Largest deviations from the data at which a run still counts as sustained.
 
     frequency, amplitude: relative error of the frequency and of each state's standard deviation.
-    waveform: RMS difference of the waveforms, in standard deviations.
+    waveform: RMS difference of the waveforms, in standard deviations; of records that do not repeat
+    themselves, the difference of the means.
 
-    Two bounds apply to records that do not repeat themselves. distribution: Wasserstein distance
-    of each state's distribution, in standard deviations. spectrum: share of the power that lies in
-    different bands. If quarters of the record are farther apart than this, their distance is the
-    bound instead; for the spectrum, twice their distance.
+    If a third of such a record is farther from the whole, that distance is the bound instead.
     """
 
     frequency: float = 0.01
     amplitude: float = 0.1
     waveform: float = 0.2
-    distribution: float = 0.2
-    spectrum: float = 0.3
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -95,7 +84,6 @@ class Comparison:
     status: Status
     is_similar: bool
     f_error: float
-    spectrum: float
     by_state: Mapping[str, Float[np.ndarray, " n_states"]]
 
 
@@ -153,30 +141,26 @@ class ComparedRecord:
     ) -> Comparison:
         """Compare a run at the times t with this record; a run with fewer samples has diverged."""
         nothing = np.full(states.shape[1], np.nan)
-        by_state = dict.fromkeys(("amplitude_ratio", "waveform_error", "distribution"), nothing)
+        by_state = dict.fromkeys(("amplitude_ratio", "waveform_error"), nothing)
         if len(states) < len(self.t) or not np.isfinite(states).all():
-            return Comparison(Status.DIVERGES, False, np.nan, np.nan, by_state)
+            return Comparison(Status.DIVERGES, False, np.nan, by_state)
         half = len(states) // 2 if self._is_long else 0
         late = states[half:]
-        by_state["distribution"] = distribution_distances(self.states[half:], late)
-        by_state["amplitude_ratio"] = late.std(axis=0) / self.std
-        spectrum = spectrum_distance(self.t[half:], self.states[half:], late)
+        by_state["amplitude_ratio"] = late.std(axis=0) / zero_to_one(self.states[half:].std(axis=0))
         if turns_negative(late, self.densities, self.std):
-            return Comparison(Status.NEGATIVE, False, np.nan, spectrum, by_state)
+            return Comparison(Status.NEGATIVE, False, np.nan, by_state)
         middle = len(states) // 2
         if has_decayed(states[middle:], self.states[middle:], DIED_OUT).all():
-            return Comparison(Status.DECAYS, False, np.nan, spectrum, by_state)
+            return Comparison(Status.DECAYS, False, np.nan, by_state)
         if self._spirals:
             is_similar = self._is_followed(states, bounds)
-            return Comparison(Status.NO_CYCLE, is_similar, np.nan, spectrum, by_state)
-        is_similar = not self._repeats and self._is_alike(
-            by_state["distribution"], spectrum, bounds
-        )
+            return Comparison(Status.NO_CYCLE, is_similar, np.nan, by_state)
+        is_similar = not self._repeats and self._is_alike(states, bounds)
         if is_similar or self.cycle is None:
-            return Comparison(Status.NO_CYCLE, is_similar, np.nan, spectrum, by_state)
+            return Comparison(Status.NO_CYCLE, is_similar, np.nan, by_state)
         f_error, amplitude, waveform = compare_cycles(self.cycle, self.t[half:], late)
         if np.isnan(f_error):
-            return Comparison(Status.WRONG_CYCLE, False, f_error, spectrum, by_state)
+            return Comparison(Status.WRONG_CYCLE, False, f_error, by_state)
         by_state |= {"amplitude_ratio": amplitude, "waveform_error": waveform}
         if deviation(0.0, amplitude, waveform, bounds) > 1.0:
             status = Status.WRONG_CYCLE
@@ -184,7 +168,7 @@ class ComparedRecord:
             status = Status.WRONG_FREQUENCY
         else:
             status = Status.SUSTAINED
-        return Comparison(status, status is Status.SUSTAINED, f_error, spectrum, by_state)
+        return Comparison(status, status is Status.SUSTAINED, f_error, by_state)
 
     def _begins_apart(self, states: np.ndarray) -> bool:
         """True if a run begins on the record, and misses it by much in its first period already."""
@@ -225,12 +209,16 @@ class ComparedRecord:
         """True if half of the record holds enough periods to compare."""
         return self._repeats and self.cycle is not None and self.cycle.n_periods >= LONG
 
-    def _is_alike(self, distribution: np.ndarray, spectrum: float, bounds: FreeRunBounds) -> bool:
-        """True if the run is about as close to the record as its quarters are to each other."""
-        apart, apart_spectrum = quarter_distances(self.t, self.states)
-        near = (distribution <= np.maximum(bounds.distribution, apart)).all()
-        alike = spectrum <= max(bounds.spectrum, SPECTRUM_WANDERS * apart_spectrum)
-        return bool(near and alike)
+    def _is_alike(self, states: np.ndarray, bounds: FreeRunBounds) -> bool:
+        """True if means and amplitudes are as near to the record's as those of its thirds are."""
+        mean, thirds = self.states.mean(axis=0), np.array_split(self.states, 3)
+        drift = np.abs([part.mean(axis=0) - mean for part in thirds]).max(axis=0)
+        off = np.abs(states.mean(axis=0) - mean)
+        near = off <= np.maximum(bounds.waveform * self.std, drift)
+        std = zero_to_one(self.states.std(axis=0))
+        wander = np.abs(_sizes(self.states) / std - 1.0).max(axis=0)
+        alike = np.abs(states.std(axis=0) / std - 1.0) <= np.maximum(bounds.amplitude, wander)
+        return bool((near & alike).all())
 
 
 def _sizes(states: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -13,7 +12,6 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.spectrum import (
-    dominant_frequency,
     is_uniform,
     noise_floor,
     peak,
@@ -37,13 +35,6 @@ SAMPLES_PER_HARMONIC = 2.5  # fewest samples per period of a harmonic; the Nyqui
 PERIODS_TRACKED = 8.0
 
 N_SHIFTS = 720  # trial shifts of one waveform over another, before the best one is refined
-
-N_QUANTILES = 256
-
-BANDS_PER_OCTAVE = 3
-
-# Number of parts of a record, and periods that each part must hold; otherwise there are two parts.
-N_PARTS, TURNS = 4, 2.0
 
 # Least ratio of the diagonal elements of a triangular factor that products of columns give to
 # twelve digits or more.
@@ -353,49 +344,3 @@ def _pad_harmonics(data: Cycle, other: Cycle) -> tuple[np.ndarray, np.ndarray, n
     n = max(len(data.harmonics), len(other.harmonics))
     ours, theirs = (np.pad(c.harmonics, ((0, n - len(c.harmonics)), (0, 0))) for c in (data, other))
     return ours, theirs, np.arange(1, n + 1)
-
-
-def distribution_distances(
-    data: Float[np.ndarray, "samples n_states"], other: Float[np.ndarray, "_ n_states"]
-) -> Float[np.ndarray, " n_states"]:
-    """Wasserstein distance of each state's distribution from the data's, in standard deviations."""
-    levels = (np.arange(N_QUANTILES) + 0.5) / N_QUANTILES
-    apart = np.quantile(other, levels, axis=0) - np.quantile(data, levels, axis=0)
-    return np.abs(apart).mean(axis=0) / zero_to_one(data.std(axis=0))
-
-
-def spectrum_distance(
-    t: Float[np.ndarray, " samples"],
-    data: Float[np.ndarray, "samples n_states"],
-    other: Float[np.ndarray, "samples n_states"],
-) -> float:
-    """Fraction of the power that lies in different frequency bands in two records, 0 to 1.
-
-    Both records have the same times. Bands are thirds of octaves. Returns the mean over the states.
-    """
-    ours, theirs = ([_power_by_band(t, x) for x in states.T] for states in (data, other))
-    return float(0.5 * np.abs(np.subtract(ours, theirs)).sum(axis=1).mean())
-
-
-def quarter_distances(
-    t: Float[np.ndarray, " samples"], states: Float[np.ndarray, "samples n_states"]
-) -> tuple[Float[np.ndarray, " n_states"], float]:
-    """Mean distances between quarters of a record: of distributions, by state, and of spectra.
-
-    If the quarters are independent, the distance is twice that between two whole records of the
-    same motion. Halves are compared if a quarter holds less than two periods of the fastest state.
-    """
-    fastest_Hz = max(dominant_frequency(t, column) for column in states.T)
-    n_parts = N_PARTS if fastest_Hz * (t[-1] - t[0]) >= N_PARTS * TURNS else 2
-    n = len(t) // n_parts
-    pairs = list(combinations([states[k * n : (k + 1) * n] for k in range(n_parts)], 2))
-    distributions = [distribution_distances(*pair) for pair in pairs]
-    spectra = [spectrum_distance(t[:n], *pair) for pair in pairs]
-    return np.mean(distributions, axis=0), float(np.mean(spectra))
-
-
-def _power_by_band(t: np.ndarray, column: np.ndarray) -> np.ndarray:
-    frequency, power = power_spectrum(t, column)
-    band = np.floor(BANDS_PER_OCTAVE * np.log2(frequency[1:] / frequency[1])).astype(np.int64)
-    shares = np.bincount(band, weights=power[1:])
-    return shares / zero_to_one(np.array(shares.sum()))

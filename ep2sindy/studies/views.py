@@ -180,7 +180,7 @@ def _fate(run: Evaluation, *, seen: bool, misfit: str) -> str:
     if run.status is Status.NO_CYCLE:
         if misfit:
             return "does not explain the data"
-        words[Status.NO_CYCLE] = "has the statistics of the data"
+        words[Status.NO_CYCLE] = "has the means and amplitudes of the data"
     return f"{words[run.status]}{' where it was fitted' if seen else ''}"
 
 
