@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -37,6 +37,8 @@ BREATHING_HZ = 19.15e3
 SHARE = 0.05
 N_PARTS = 4
 STATES = ("n_i", "n_n")
+
+
 def driven(frequency_Hz: float, *, duration_s: float = 6e-3) -> ep.Trajectory:
     """Channel averages of a discharge whose voltage is modulated, the voltage as an input."""
     supply = ep.thruster.ModulatedVoltage(SHARE, frequency_Hz)
@@ -261,16 +263,17 @@ DRIVEN = {
     "Duffing": Oscillator(pushed_duffing, (0.5, 0.2), 4.137),
 }
 ROUND_HZ = 500.0
+PUSHES, LENGTHS = (0.0, 0.05, 0.15), (40, 150)
 
 # Period in s, share of it at the upper level, rise time and relaxation time in periods, noise.
 SQUARES = [
-    (2e-3, 0.5, 0.0, 0.1, 0.02),
-    (0.02, 0.5, 0.0, 0.1, 0.1),
+    (2e-3, 0.5, 1e-9, 0.1, 0.02),
+    (0.02, 0.5, 1e-9, 0.1, 0.1),
     (86400.0, 0.3, 0.1, 0.2, 0.05),
     (0.1, 0.2, 0.05, 0.3, 0.02),
     (4.0, 0.5, 0.2, 0.05, 0.1),
-    (2.1137e-3, 0.5, 0.0, 0.1, 0.02),
-    (0.01783, 0.5, 0.0, 0.1, 0.1),
+    (2.1137e-3, 0.5, 1e-9, 0.1, 0.02),
+    (0.01783, 0.5, 1e-9, 0.1, 0.1),
     (7319.0, 0.3, 0.1, 0.2, 0.05),
     (0.1273, 0.2, 0.05, 0.3, 0.02),
     (4.371, 0.5, 0.2, 0.05, 0.1),
@@ -297,56 +300,81 @@ def lagging(u: np.ndarray, lag: float) -> np.ndarray:
 
 
 def square(turns: np.ndarray, duty: float, rise: float) -> np.ndarray:
-    return np.interp(turns % 1.0, [0.0, max(rise, 1e-9), duty, duty + max(rise, 1e-9), 1.0], [0.0, 1.0, 1.0, 0.0, 0.0])
+    corners = [0.0, rise, duty, duty + rise, 1.0]
+    return np.interp(turns % 1.0, corners, [0.0, 1.0, 1.0, 0.0, 0.0])
 
 
-def followed(u: np.ndarray, x: np.ndarray, period_s: float, noise: float, rng: np.random.Generator) -> ep.Trajectory:
+def followed(
+    u: np.ndarray, x: np.ndarray, period_s: float, noise: float, rng: np.random.Generator
+) -> ep.Trajectory:
     t = np.arange(len(u)) * period_s / PER_PERIOD
     return ep.Trajectory(t, noisy(x[:, None], noise, rng), ["x"], u[:, None], ["u"])
 
 
 def tell(words: str, runs: Sequence[ep.Trajectory]) -> None:
     """Print how often it is asked with the other columns beside x, and without."""
-    beside = [
-        {n: c for n, c in zip(run.names, np.column_stack([run.states, run.inputs]).T, strict=True) if n != "x"}
+    tables = [
+        dict(zip(run.names, np.column_stack([run.states, run.inputs]).T, strict=True))
         for run in runs
     ]
-    with_all = sum(is_asked(run, columns) for run, columns in zip(runs, beside, strict=True))
-    print(f"{words} | {with_all} | {sum(is_asked(run, {}) for run in runs)}", flush=True)
+    beside = [{name: u for name, u in table.items() if name != "x"} for table in tables]
+    among = sum(is_asked(run, columns) for run, columns in zip(runs, beside, strict=True))
+    print(f"{words} | {among} | {sum(is_asked(run, {}) for run in runs)}", flush=True)
+
+
+def generators() -> list[np.random.Generator]:
+    return [np.random.default_rng(seed) for seed in range(N_DRAWS)]
+
+
+def probe(rng: np.random.Generator, lag: float, f_Hz: float, noise: float) -> ep.Trajectory:
+    """The current of a probe behind its supply's triangle, whose voltage has noise of 0.3 V."""
+    turns = np.arange(N_PERIODS * PER_PERIOD) / PER_PERIOD
+    V = 30.0 * triangle(turns + rng.uniform(), rng) + 0.3 * rng.standard_normal(len(turns))
+    current = np.tanh((V - 5.0) / 8.0) + 0.01 * V
+    return followed(V, lagging(current, lag), 1.0 / f_Hz, noise, rng)
+
+
+def relaxation(
+    rng: np.random.Generator, *, period_s: float, duty: float, rise: float, lag: float, noise: float
+) -> ep.Trajectory:
+    """What relaxes to a square wave."""
+    u = square(np.arange(N_PERIODS * PER_PERIOD) / PER_PERIOD + rng.uniform(), duty, rise)
+    return followed(u, lagging(u, lag), period_s, noise, rng)
 
 
 def questions() -> None:
     """Print how often it is asked of driven and of self-sustained signals."""
-    turns = np.arange(N_PERIODS * PER_PERIOD) / PER_PERIOD
     print(f"driven, asked of {N_DRAWS} | column beside | none")
     for lag, round_, noise in product((0.0, 0.05), (True, False), (0.02, 0.1)):
-        runs = []
-        for seed in range(N_DRAWS):
-            rng = np.random.default_rng(seed)
-            V = 30.0 * triangle(turns + rng.uniform(), rng) + 0.3 * rng.standard_normal(len(turns))
-            current = np.tanh((V - 5.0) / 8.0) + 0.01 * V
-            f_Hz = ROUND_HZ if round_ else any_frequency(rng)
-            runs.append(followed(V, lagging(current, lag), 1.0 / f_Hz, noise, rng))
         how = f"{'lagging' if lag else 'static'}, {'500 Hz' if round_ else 'any frequency'}"
+        runs = [
+            probe(rng, lag, ROUND_HZ if round_ else any_frequency(rng), noise)
+            for rng in generators()
+        ]
         tell(f"probe, {how}, {100 * noise:.0f} % noise", runs)
-    for (name, case), pushes, n in product(DRIVEN.items(), (0.0, 0.05, 0.15), (40, 150)):
-        runs = case.runs(pushes, 0.02, n, seed=0)
-        rngs = [np.random.default_rng(seed) for seed in range(N_DRAWS)]
-        scaled = [replace(r, t=r.t / case.period / any_frequency(g)) for r, g in zip(runs, rngs, strict=True)]
-        tell(f"{name}, any frequency, pushes of {100 * pushes:.0f} %, {n} periods", [replace(r, states=r.states[:, :1], state_names=("x",)) for r in scaled])
     for period_s, duty, rise, lag, noise in SQUARES:
-        runs = []
-        for seed in range(N_DRAWS):
-            rng = np.random.default_rng(seed)
-            u = square(turns + rng.uniform(), duty, rise)
-            runs.append(followed(u, lagging(u, lag), period_s, noise, rng))
-        tell(f"square wave, {period_s:g} s, duty {duty}, rise {rise}, relaxation {lag}, {100 * noise:.0f} % noise", runs)
+        runs = [
+            relaxation(rng, period_s=period_s, duty=duty, rise=rise, lag=lag, noise=noise)
+            for rng in generators()
+        ]
+        shape = f"duty {duty}, rise {rise}, relaxation {lag}"
+        tell(f"square wave, {period_s:g} s, {shape}, {100 * noise:.0f} % noise", runs)
+    for (name, case), pushes, n in product(DRIVEN.items(), PUSHES, LENGTHS):
+        runs = [
+            ep.Trajectory(run.t / case.period / any_frequency(rng), run.columns(["x"]), ["x"])
+            for run, rng in zip(case.runs(pushes, 0.02, n, seed=0), generators(), strict=True)
+        ]
+        tell(f"{name}, any frequency, pushes of {100 * pushes:.0f} %, {n} periods", runs)
     print("self-sustained, asked falsely | columns beside | none")
-    for (name, case), pushes, n, round_ in product(SELF_SUSTAINED.items(), (0.0, 0.05, 0.15), (40, 150), (False, True)):
-        rngs = [np.random.default_rng(seed) for seed in range(N_DRAWS)]
+    for (name, case), pushes, n in product(SELF_SUSTAINED.items(), PUSHES, LENGTHS):
         made = case.runs(pushes, 0.02, n, seed=0)
-        runs = [at_frequency(r, ROUND_HZ if round_ else any_frequency(g)) for r, g in zip(made, rngs, strict=True)]
-        tell(f"{name}, pushes of {100 * pushes:.0f} %, {n} periods, {'500 Hz' if round_ else 'any frequency'}", runs)
+        for round_ in (False, True):
+            runs = [
+                at_frequency(run, ROUND_HZ if round_ else any_frequency(rng))
+                for run, rng in zip(made, generators(), strict=True)
+            ]
+            how = f"{'500 Hz' if round_ else 'any frequency'}, pushes of {100 * pushes:.0f} %"
+            tell(f"{name}, {how}, {n} periods", runs)
 
 
 def main() -> None:
