@@ -186,10 +186,7 @@ Rates = Callable[[np.ndarray, float], Sequence[np.ndarray]]
 
 @dataclass(frozen=True)
 class Oscillator:
-    """rates: of states (n_states, draws) at a time. period: about, of a cycle, in its own time.
-
-    shown: names of the states that a file has, x among them.
-    """
+    """rates: of states (n_states, draws) at a time. period: about, of a cycle, in its own time."""
 
     rates: Rates
     start: tuple[float, ...]
