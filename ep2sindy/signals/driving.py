@@ -2,12 +2,12 @@
 
 A record of a driven signal alone looks like that of a self-sustained oscillation, and equations are
 found for either. Three signs tell them apart: a column beside it that looks set, a frequency that
-somebody chose, and a phase that keeps time although the amplitude does not.
+somebody chose, and a phase that is pushed from period to period and returns, as to a clock.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,43 +20,36 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import Clock, seconds_in
 from ep2sindy.runtime.values import check_positive
-from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
-from ep2sindy.signals.spectrum import power_spectrum
+from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.trace import Trace
 
 DRIVE = ("cos_drive", "sin_drive")  # inputs that stand for a drive of known period
 
-# Probability, at most, that a frequency which nobody chose is round by chance.
-BY_CHANCE = 0.01
+BY_CHANCE = 0.01  # most probability that a frequency which nobody chose is round to its error
 CLOCK = 2e-5  # relative error of a quartz clock, in the record's times or in the drive's
 N_ERRORS = 2.0  # standard errors of a frequency within which it counts as another
-# Frequencies of the mains, their wander, harmonics, and the largest error at which they are told.
-MAINS_Hz, MAINS_ERROR, N_MAINS, MAINS_TOLD = (50.0, 60.0), 1e-3, 4, 3e-3
+# A grid wanders by 1e-3. Larger errors than three times that would meet one frequency in a hundred.
+MAINS_Hz, MAINS_ERROR, MAINS_TOLD = (50.0, 60.0, 100.0, 120.0), 1e-3, 3e-3
 # A year has 365 to 365.25 days. Two decades hold three periods: an error of 0.02 is rarely met.
-CALENDAR, CALENDAR_ERROR, CALENDAR_TOLD = ("day", "week", "year"), 1e-3, 0.02
+CALENDAR, CALENDAR_ERROR, CALENDAR_TOLD = ("day", "year"), 1e-3, 0.02
 
-REPEATS = (
-    0.9  # least share of the variance that the waveform explains where a phase is told from it
-)
-MIN_TOLD = 20  # fewest periods in which a phase that keeps time is told from one that walks
+REPEATS = 0.9  # least share of the variance of the waveform: some chaos keeps time nearly as well
+MIN_TOLD = 20  # fewest periods in which a phase that returns is told from one that walks
 # Mean square of a random walk of n unit steps about its best line, over n: one in a hundred walks
 # of twenty steps is below this, and fewer of longer ones (simulated).
 LEAST_WALK = 0.0147
-# Standard deviations in a median absolute deviation of normal values, and the standard error of its
-# square, as a share, times the root of their number; errors beyond which moves are sure.
-MADS, MAD_ERROR, N_SURE = 1.4826, 2.33, 4.0
-LEAST_MOVE = 0.005  # of an amplitude, as a share: less may come from where samples fall in a period
+PUSHED = 4.0  # least square of a phase's moves over that of noise, of twenty moves: five errors
+MISSED = 1.64  # of white noise: its variance, and that between the other samples, of 0.64
+N_POINTS = 64  # in a period, between samples by cubic splines
+SETTLED = 3  # a phase is looked at after the first of so many parts of a record, a transient
 
-RESTING, LONG_HELD, FEW_LEVELS = 0.5, 5.0, 3  # share of steps, samples, and levels of a held value
-CLEAN = 0.05  # most noise of a wave that somebody sets, in its standard deviations
-SAME = 0.999  # least correlation with a pure wave of the waveform of one that is set
-STRONGLY = 0.5  # least correlation of a column that is named
-PURER = 20.0  # least ratio of what is no sine in a signal to that in one that drives it
-SAME_LINE = 0.5  # most difference of two frequencies that are one, in units of 1 / duration
-FOLLOWS = 0.1  # least share of a signal's variance at the frequency of a wave that it goes with
-MOST_SUBHARMONIC = 3  # periods of a drive in one of the signal, at most
-CUBIC = 3  # degree of the splines between samples
-SETTLED = 3  # a drive is looked for after the first of so many parts of a record, a transient
+HELD, SWEPT, SINE = "held between steps", "a triangle or a sweep", "a sine"
+RESTING = 0.5  # least share of steps in which a held column rests
+LEAP = 0.1  # least median move of a held column, as a share of its range: no coarse scale
+EVEN = 0.05  # most distance of a sweep's values from an even spread; a sine's is 0.1
+PURE, PURER = 2.5e-3, 20.0  # most share that is no sine in one, and least ratio to the others'
+FORETOLD = 0.1  # least share of the error of a forecast that a drive takes away
+N_AHEAD, N_LAGS = 12, 3  # steps in a period, and how many of them, by which a signal is foretold
 
 
 def add_drive(run: Run, period_s: float) -> Trajectory:
@@ -93,74 +86,68 @@ def drop_repeats(library: Library) -> Library:
 
 @dataclass(frozen=True, eq=False)
 class PhaseRecord:
-    """How amplitude and phase of a signal's fundamental go from period to period.
+    """How the phase of a signal's fundamental goes from period to period.
 
-    amplitude: (periods,), less its mean, as a share of it. phase: (periods,) in rad, about its best
-    line. noise: variance of either that white noise in the samples explains. frequency_Hz: by the
-    slope of the phase. error_Hz: its standard error.
+    phase: (periods,) in rad, about its best line. noise: variance of it by noise in the samples and
+    by what falls between them. frequency_Hz: by the slope of the phase.
     """
 
-    amplitude: Float[np.ndarray, " periods"]
     phase: Float[np.ndarray, " periods"]
     noise: float
     frequency_Hz: float
-    error_Hz: float
 
     @staticmethod
     def of(t: np.ndarray, x: np.ndarray, cycle: Cycle) -> PhaseRecord:
-        """From samples at any steps, which are interpolated at a whole number to a period."""
-        n, (t, x) = (
-            max(8, round(len(t) / cycle.n_periods)),
-            (e[len(e) // SETTLED :] for e in (t, x)),
-        )
-        n_periods = int((t[-1] - t[0]) * cycle.frequency_Hz + 1e-6)
-        even = t[0] + np.arange(n * n_periods) / (n * cycle.frequency_Hz)
-        pieces = make_interp_spline(t, x, k=CUBIC)(even).reshape(n_periods, n)
-        line = pieces @ np.exp(-2j * np.pi * np.arange(n) / n) * (2.0 / n)
-        size, phase, k = np.abs(line), np.unwrap(np.angle(line)), np.arange(n_periods)
-        slope, start = np.polyfit(k, phase, 1)
-        rest, mean = phase - start - slope * k, size.mean()
-        # Of a line through n values of variance v: 12 v / n^3, and more if they last.
-        lasting = np.clip((rest[1:] * rest[:-1]).sum() / max((rest**2).sum(), 1e-300), 0.0, 0.95)
-        scatter = (rest @ rest) / max(n_periods - 2, 1)
-        variance = 12.0 * scatter / n_periods**3 * (1.0 + lasting) / (1.0 - lasting)
+        """From samples at any steps, which are interpolated.
+
+        Noise, and what falls between samples, is what a spline through every second one misses.
+        """
+        t, x = t[len(t) // SETTLED :], x[len(x) // SETTLED :]
+        missed = (make_interp_spline(t[::2], x[::2], k=3)(t[1:-1:2]) - x[1:-1:2]).var() / MISSED
+        n = int((t[-1] - t[0]) * cycle.frequency_Hz + 1e-6)
+        even = t[0] + np.arange(N_POINTS * n) / (N_POINTS * cycle.frequency_Hz)
+        turns = np.exp(-2j * np.pi * np.arange(N_POINTS) / N_POINTS) * (2.0 / N_POINTS)
+        lines = make_interp_spline(t, x, k=3)(even).reshape(n, N_POINTS) @ turns
+        phase = np.unwrap(np.angle(lines))
+        line = np.polynomial.Polynomial.fit(np.arange(n), phase, 1)
         return PhaseRecord(
-            amplitude=size / mean - 1.0,
-            phase=rest,
-            noise=2.0 * white_variance(*power_spectrum(t, x)) / n / mean**2,
-            frequency_Hz=cycle.frequency_Hz * (1.0 + slope / (2.0 * np.pi)),
-            error_Hz=cycle.frequency_Hz * float(np.sqrt(variance)) / (2.0 * np.pi),
+            phase=phase - line(np.arange(n)),
+            noise=2.0 * float(missed) * n / len(t) / float(np.abs(lines).mean()) ** 2,
+            frequency_Hz=cycle.frequency_Hz * (1.0 + line.convert().coef[1] / (2.0 * np.pi)),
         )
 
     @property
-    def moves(self) -> float:
-        """Variance of the amplitude's moves from period to period, less noise; 0 if it is not sure.
-
-        They are the residuals of an autoregression, by their median, so that a transient does not
-        count.
-        """
-        n, a = len(self.phase), self.amplitude
-        if n < MIN_TOLD:
-            return 0.0
-        past = np.column_stack([a[1:-1], a[:-2]])
-        coef = np.linalg.lstsq(past, a[2:], rcond=None)[0]
-        size = MADS * float(np.median(np.abs(a[2:] - past @ coef)))
-        white = self.noise * (1.0 + float(coef @ coef))
-        moves = size**2 - white
-        return (
-            float(moves) if moves > max(N_SURE * MAD_ERROR / n**0.5 * white, LEAST_MOVE**2) else 0.0
-        )
+    def moved(self) -> float:
+        """Mean square of the phase's moves from period to period, noise included."""
+        return float(np.square(np.diff(self.phase)).mean())
 
     @property
-    def keeps_time(self) -> bool:
-        """Whether the phase returns, as to a drive, although the amplitude has moves of its own.
+    def error(self) -> float:
+        """Relative standard error of the frequency: by scatter, and by a walk if there is one.
 
-        What moves the amplitude of a self-sustained oscillation moves its phase by as much (in rad,
-        as a share) at least, and nothing brings that back: its squares about the best line grow
-        with the record. They lie below the bound in one of a hundred such records, at most.
+        The slope of a line through n values of variance v has the variance 12 v / n^3. That of a
+        walk of n steps of variance s has 6 s / (5 n), and its squares about the line are n s / 15.
         """
-        least = LEAST_WALK * len(self.phase) * self.moves
-        return bool(np.square(self.phase).mean() < least)
+        n, squares = len(self.phase), float(np.square(self.phase).mean())
+        lasts = max(squares - 0.5 * self.moved, 0.0)
+        return float(np.sqrt(12.0 * squares / n**3 + 18.0 * lasts / n**2)) / (2.0 * np.pi)
+
+    @property
+    def is_pushed(self) -> bool:
+        """Whether the phase moves from period to period by more than noise explains."""
+        return len(self.phase) >= MIN_TOLD and self.moved > 2.0 * PUSHED * self.noise
+
+    @property
+    def returns(self) -> bool:
+        """Whether the phase is pushed and returns, as to a clock.
+
+        Nothing brings back the phase of a self-sustained oscillation that is pushed: it walks, and
+        its squares about the best line grow with the record. They lie below the bound in one of a
+        hundred such records, at most.
+        """
+        steps = self.moved - 2.0 * self.noise
+        least = LEAST_WALK * len(self.phase) * steps
+        return self.is_pushed and bool(np.square(self.phase).mean() < least)
 
 
 def ask_whether_driven(
@@ -168,24 +155,25 @@ def ask_whether_driven(
 ) -> str | None:
     """The question, in one sentence, for a signal without inputs that looks driven; else None.
 
-    beside: other columns of its file, name -> (times in s, samples). A self-sustained oscillation
-    is asked about in two of a hundred records, at most: in one for a round frequency, in one for a
-    phase that keeps time (`PhaseRecord.keeps_time`).
+    beside: other columns of its file, name -> (times in s, samples). Of self-sustained oscillations
+    that are pushed at random, one in a hundred has a phase that returns, at most, and two have a
+    round frequency.
     """
     if signal.run.input_names:
         return None
-    strength = {name: _correlation(signal, *column) for name, column in beside.items()}
-    set_ones = {n: how for n, (t, u) in beside.items() if (how := _sets(signal, t, u))}
-    if set_ones:
-        named = max(set_ones, key=lambda name: strength[name])
-        why, way = f"{named} beside it looks set ({set_ones[named]})", f"inputs=[{named}]"
-    elif (own := _looks_driven(signal)) is not None:
-        why, period_s = own
-        named = max(strength, key=lambda name: strength[name], default="")
-        column = named if named and strength[named] >= STRONGLY else "COLUMN"
-        way = f"inputs=[{column}] if a column is the drive, or period_s={period_s:.6g}"
+    gains = {name: _gain(signal, *column) for name, column in beside.items()}
+    gains = {name: gain for name, gain in gains.items() if gain > FORETOLD}
+    for name in sorted(gains, key=lambda name: -gains[name]):
+        t, u = beside[name]
+        if how := describe_set(t, u, [np.interp(t, signal.t, signal.x)]):
+            why, way = f"{name} beside it looks set ({how})", f"inputs=[{name}]"
+            break
     else:
-        return None
+        if (own := _looks_driven(signal)) is None:
+            return None
+        column = max(gains, key=lambda name: gains[name], default="COLUMN")
+        why, period_s = own
+        way = f"inputs=[{column}] if a column is the drive, or period_s={period_s:.6g}"
     return (
         f"is {signal.name} driven? It may be: {why}. Equations without the drive would be wrong "
         f"then, and their cycle not self-sustained: name it, {way}"
@@ -193,14 +181,14 @@ def ask_whether_driven(
 
 
 def say_what_is_not_told(signal: Trace) -> str | None:
-    """A remark if the record shows neither a walking phase nor one that keeps time; else None."""
+    """A remark if the record shows neither a phase that walks nor one that returns; else None."""
     if signal.cycle is None or signal.run.input_names:
         return None
-    if PhaseRecord.of(signal.t, signal.x, signal.cycle).moves > 0.0:
+    if PhaseRecord.of(signal.t, signal.x, signal.cycle).is_pushed:
         return None
     return (
-        f"this record does not tell whether {signal.name} sustains itself or is driven: neither "
-        "its amplitude nor its phase moves from period to period by more than its noise"
+        f"this record does not tell whether {signal.name} sustains itself or is driven: its phase "
+        "moves from period to period by no more than its noise, as a clean cycle's and a clock's do"
     )
 
 
@@ -209,155 +197,96 @@ def _looks_driven(signal: Trace) -> tuple[str, float] | None:
     if signal.cycle is None:
         return None
     record = PhaseRecord.of(signal.t, signal.x, signal.cycle)
-    error = N_ERRORS * record.error_Hz / record.frequency_Hz
-    found = [
-        (order, *own)
-        for order in range(1, MOST_SUBHARMONIC + 1)
-        for own in _round_numbers(order * record.frequency_Hz, error, signal.clock)
-    ]
-    # If one of them is hardly met by chance, the drive is what is met first.
-    if any(chance <= BY_CHANCE / MOST_SUBHARMONIC for *_, chance in found):
-        order, words, f_Hz, _ = found[0]
-        what = f"{order} times its frequency" if order > 1 else "its frequency"
-        return f"{what} is {words} to its resolution", 1.0 / f_Hz
-    # A phase that hardly diffuses while the amplitude varies much is also that of some chaos.
-    repeats = signal.cycle.share >= REPEATS
-    if not (repeats and len(between_gaps(signal.t)) == 1 and record.keeps_time):
+    if found := _round_number(record.frequency_Hz, N_ERRORS * record.error, signal.clock):
+        words, f_Hz = found
+        return f"its frequency is {words} to its resolution", 1.0 / f_Hz
+    repeats = signal.cycle.share >= REPEATS and len(between_gaps(signal.t)) == 1
+    if not (repeats and record.returns):
         return None
-    varies = 100.0 * float(record.amplitude.std())
     return (
-        f"over {len(record.phase)} periods its phase keeps time, although its amplitude varies by "
-        f"{varies:.2g} %"
+        f"its phase is pushed by {np.sqrt(record.moved):.2g} rad from period to period, and "
+        f"returns over {len(record.phase)} periods, as to a clock"
     ), 1.0 / record.frequency_Hz
 
 
-def _round_numbers(f_Hz: float, error: float, clock: Clock) -> Iterator[tuple[str, float, float]]:
-    """Round frequencies that one of this relative error may be: words, Hz, and chance to be met."""
-    for unit in CALENDAR:
-        own_Hz = 1.0 / seconds_in(unit)
-        if abs(f_Hz / own_Hz - 1.0) < error + CALENDAR_ERROR < CALENDAR_TOLD:
-            yield f"one per {unit}", own_Hz, 0.0
-    if clock.unit != "s":
-        return
-    for own_Hz in (k * each for each in MAINS_Hz for k in range(1, N_MAINS + 1)):
-        if abs(f_Hz / own_Hz - 1.0) < error + MAINS_ERROR < MAINS_TOLD:
-            yield f"{own_Hz:g} Hz, as of the mains,", own_Hz, 0.0
-    error += CLOCK
-    for power in (1.0, 0.1):  # numbers of one digit, then of two
-        spacing = power * 10.0 ** np.floor(np.log10(f_Hz * (1.0 + error)))
+def _round_number(f_Hz: float, error: float, clock: Clock) -> tuple[str, float] | None:
+    """The round frequency that one of this relative error is, in words and Hz; None for none."""
+    known = [(f"one per {unit}", 1.0 / seconds_in(unit)) for unit in CALENDAR]
+    limits = [(CALENDAR_ERROR, CALENDAR_TOLD)] * len(known)
+    if clock.unit == "s":
+        known += [(f"{own_Hz:g} Hz, as of the mains,", own_Hz) for own_Hz in MAINS_Hz]
+        limits += [(MAINS_ERROR, MAINS_TOLD)] * len(MAINS_Hz)
+    for (words, own_Hz), (least, most) in zip(known, limits, strict=True):
+        if abs(f_Hz / own_Hz - 1.0) < error + least < most:
+            return words, own_Hz
+    width_Hz = (error + CLOCK) * f_Hz
+    for digits in (1, 2) if clock.unit == "s" else ():
+        spacing = 10.0 ** (np.floor(np.log10(f_Hz + width_Hz)) - digits + 1)
         nearest = float(spacing * round(f_Hz / spacing))
-        if abs(f_Hz - nearest) < error * f_Hz:
-            # Those within the error of a round one, among all, for either number of digits.
-            yield f"a round {nearest:g} Hz", nearest, 4.0 * error * f_Hz / spacing
+        if abs(f_Hz - nearest) < width_Hz and 2.0 * width_Hz < BY_CHANCE * spacing:
+            return f"a round {nearest:g} Hz", nearest
+    return None
 
 
-def _correlation(signal: Trace, t: np.ndarray, u: np.ndarray) -> float:
-    """Largest correlation of a column with the signal, shifted by up to half a period."""
-    beside = np.interp(signal.t, t, u)
-    if not (beside.std() > 0.0 and np.isfinite(beside).all()):
+def _gain(signal: Trace, t: np.ndarray, u: np.ndarray) -> float:
+    """Share of the squared error of a signal's linear forecasts that a column takes away.
+
+    It enters with its square, for a signal that does not mind its sign.
+    """
+    even = np.arange(signal.t[0], signal.t[-1], signal.period_s / N_AHEAD)
+    x, beside = np.interp(even, signal.t, signal.x), np.interp(even, t, u)
+    if not (np.isfinite(beside).all() and np.ptp(beside) > 0.0):
         return 0.0
-    a, b = (each - each.mean() for each in (beside, signal.x))
-    most = min(round(0.5 * signal.per_period), len(a) // 2)
-    length = 2 * len(a)
-    products = np.fft.irfft(np.fft.rfft(a, length).conj() * np.fft.rfft(b, length), length)
-    near = np.concatenate([products[: most + 1], products[length - most :]])
-    return float(np.abs(near).max() / np.sqrt((a @ a) * (b @ b)))
+    beside = (beside - beside.mean()) / beside.std()
+    ends = range(N_LAGS + 1)
+    past = np.column_stack(
+        [np.ones(len(x) - N_LAGS), *(x[k : len(x) - N_LAGS + k] for k in ends[:-1])]
+    )
+    both = [w[k : len(x) - N_LAGS + k] for w in (beside, beside**2) for k in ends]
+    left = [
+        float(np.square(x[N_LAGS:] - rows @ np.linalg.lstsq(rows, x[N_LAGS:], rcond=None)[0]).sum())
+        for rows in (past, np.column_stack([past, *both]))
+    ]
+    return 1.0 - left[1] / left[0] if left[0] > 0.0 else 0.0
 
 
-def _sets(signal: Trace, t: np.ndarray, u: np.ndarray) -> str:
-    """How a column looks set that goes with a signal; empty if it does not."""
-    how = describe_set(t, u)
-    if how in ("", HELD):
-        return how if how and _correlation(signal, t, u) >= STRONGLY else ""
-    own = find_cycle(t, u[:, None])
-    assert own is not None
-    turns = 2.0 * np.pi * own.frequency_Hz * signal.t
-    line = np.exp(-1j * turns) @ (signal.x - signal.x.mean()) * (2.0 / len(turns))
-    goes = 0.5 * float(np.abs(line)) ** 2 > FOLLOWS * signal.x.var()
-    if signal.cycle is not None:
-        ratio = own.frequency_Hz / signal.cycle.frequency_Hz
-        apart = abs(ratio - max(1, round(ratio))) * signal.n_periods
-        goes |= round(ratio) <= MOST_SUBHARMONIC and apart < SAME_LINE
-        # Near a rest, every state of an oscillator is a sine: that of a drive is purer by far.
-        if how == WAVES[0]:
-            goes &= PURER * _impurity(own, u) < _impurity(signal.cycle, signal.x)
-    return how if goes else ""
+def describe_set(
+    t: Float[np.ndarray, " samples"],
+    u: Float[np.ndarray, " samples"],
+    others: Sequence[Float[np.ndarray, " samples"]],
+) -> str:
+    """How a column looks as if somebody sets it: held, a sweep or a sine; empty if it does not.
 
-
-def _impurity(cycle: Cycle, x: np.ndarray) -> float:
-    """Share of the variance that is not the fundamental's."""
-    rest = x - (cycle.harmonics[0, 0] * np.exp(1j * cycle.phase)).real
-    return float(rest.var() / x.var())
-
-
-HELD = "held between steps"
-WAVES = ("a sine", "a triangle or a sweep")
-
-
-def describe_set(t: Float[np.ndarray, " samples"], u: Float[np.ndarray, " samples"]) -> str:
-    """How a column looks as if somebody sets it: held, or a clean wave; empty if it does not.
-
-    Held: it rests over most steps, in long pieces, and does not merely creep from one number of a
-    coarse scale to the next. A wave: of one pure form, with little noise.
+    Held: it rests over most steps, and leaps. A sweep: periodic, and as long at any value as at any
+    other. A sine: purer by far than all others, which it leads by up to half its period: every
+    state of an oscillator near a rest is a sine, and what follows a wave is smoother than it.
     """
     if not np.isfinite(u).all() or np.ptp(u) == 0.0:
         return ""
     moves = np.abs(np.diff(u))
-    moved = moves[moves > 0.0]
-    if len(moved) < RESTING * len(moves):
-        lasts = len(moves) / len(moved) >= LONG_HELD
-        leaps = np.median(moved) > 1.5 * moved.min() or len(np.unique(u)) <= FEW_LEVELS
-        return HELD if lasts and leaps else ""
-    cycle = find_cycle(t, u[:, None])
-    if cycle is None:
+    if (moves == 0.0).mean() >= RESTING:
+        return HELD if np.median(moves[moves > 0.0]) >= LEAP * np.ptp(u) else ""
+    if (cycle := find_cycle(t, u[:, None])) is None:
         return ""
-    left = float((u - cycle.waveform(cycle.phase)[:, 0]).var() / u.var())
-    if _is_wave(cycle, np.cos, left):
-        return WAVES[0]
-    first, second = np.abs(np.append(cycle.harmonics[:, 0], 0.0))[:2]
-    rise = np.arccos(min(2.0 * second / first, 1.0 - 1e-6)) / np.pi  # share of the period
-
-    def sweep(phase: np.ndarray) -> np.ndarray:
-        share = phase / (2.0 * np.pi) % 1.0
-        return np.where(share < rise, share / rise, (1.0 - share) / (1.0 - rise))
-
-    found = _is_wave(cycle, sweep, left) or _is_wave(cycle, lambda p: sweep(-p), left)
-    return WAVES[1] if found else ""
-
-
-def _is_wave(cycle: Cycle, wave: Callable[[np.ndarray], np.ndarray], left: float) -> bool:
-    """Whether a waveform is a given one, at some phase and of any size.
-
-    left: share of the variance that the waveform leaves; that of harmonics beyond it may be more.
-    """
-    n, n_points = len(cycle.harmonics), 720
-    ideal = np.fft.rfft(wave(2.0 * np.pi * np.arange(n_points) / n_points))[1:]
-    beyond = float(np.square(np.abs(ideal[n:])).sum() / np.square(np.abs(ideal)).sum())
-    own, same = np.zeros((2, n_points // 2 + 1), dtype=np.complex128)
-    own[1 : n + 1], same[1 : n + 1] = cycle.harmonics[:, 0], ideal[:n]
-    size = np.sqrt(np.square(np.abs(own)).sum() * np.square(np.abs(same)).sum())
-    shifted = 0.5 * n_points * np.fft.irfft(own.conj() * same, n_points)
-    return bool(left < CLEAN**2 + beyond and np.abs(shifted).max() > SAME * size)
+    share = np.linspace(0.0, 1.0, len(u))
+    if np.abs((np.sort(u) - u.min()) / np.ptp(u) - share).max() < EVEN:
+        return SWEPT
+    wave = np.column_stack([np.ones(len(t)), np.cos(cycle.phase), np.sin(cycle.phase)])
+    columns = np.column_stack([u, *others])
+    coef = np.linalg.lstsq(wave, columns, rcond=None)[0]
+    impure, lines = (
+        (columns - wave @ coef).var(axis=0) / columns.var(axis=0),
+        coef[1] - 1j * coef[2],
+    )
+    leads = ((lines[1:] * lines[0].conj()).imag < 0.0).all()
+    return SINE if impure[0] < PURE and leads and (PURER * impure[0] < impure[1:]).all() else ""
 
 
 def propose_inputs(
     t: Float[np.ndarray, " samples"], columns: Mapping[str, Float[np.ndarray, " samples"]]
 ) -> dict[str, str]:
-    """Columns of a file that look set, name -> how; none if no other column is left.
-
-    A sine counts only if it leads all others by up to half its period, and is purer by far: near a
-    rest, every state of an oscillator is a sine.
-    """
-    looks = {name: how for name, u in columns.items() if (how := describe_set(t, u))}
-    for name in [name for name, how in looks.items() if how == WAVES[0]]:
-        own, others = columns[name], [x for other, x in columns.items() if other not in looks]
-        cycle = find_cycle(t, own[:, None])
-        assert cycle is not None
-        turn = np.exp(-2j * np.pi * cycle.frequency_Hz * t)
-        lines = np.array([turn @ (x - x.mean()) for x in (own, *others)])
-        leads = ((lines[1:] * lines[0].conj()).imag < 0.0).all()
-        cycles = [find_cycle(t, x[:, None]) for x in others]
-        rest = [1.0 if c is None else _impurity(c, x) for c, x in zip(cycles, others, strict=True)]
-        if not (leads and PURER * _impurity(cycle, own) < min(rest, default=0.0)):
-            del looks[name]
-    return looks if len(looks) < len(columns) else {}
+    """Columns of a file that look set, name -> how; none if no other column is left."""
+    looks = [name for name, u in columns.items() if describe_set(t, u, [])]
+    others = [u for name, u in columns.items() if name not in looks]
+    found = {name: describe_set(t, columns[name], others) for name in looks if others}
+    return {name: how for name, how in found.items() if how}
