@@ -144,7 +144,21 @@ class ForecastSkill:
     @property
     def better_until_periods(self) -> float:
         """How long it does, in periods, or in samples for a record without an oscillation."""
-        return float(self.horizons_s[self.n_better - 1]) / self.unit_s if self.n_better else 0.0
+        return self._until(self.n_better)
+
+    @property
+    def close_until_periods(self) -> float:
+        """How long, from the first horizon on, the model errs by less than `CLOSE`, likewise."""
+        far = self.nrmse[MODEL] >= CLOSE
+        return self._until(int(np.argmax(far)) if far.any() else len(far))
+
+    def _until(self, n: int) -> float:
+        return float(self.horizons_s[n - 1]) / self.unit_s if n else 0.0
+
+    def _span(self, until: float) -> str:
+        """`3.1 periods`, and whether it is all that was asked."""
+        more = " and more" if until * self.unit_s >= self.horizons_s[-1] else ""
+        return f"{until:.2g} {self.unit}{more}"
 
     @property
     def nearest(self) -> str:
@@ -167,15 +181,7 @@ class ForecastSkill:
             return f"no better than {rival}" + f"; {nearest} is nearest" * (
                 nearest != WORDS[self.rival]
             )
-        more = " and more" if self.n_better == len(self.horizons_s) else ""
-        until = f"{self.better_until_periods:.2g} {self.unit}{more}"
-        return f"better than {rival} for {until}{self._beside_others()}"
-
-    @property
-    def n_follows(self) -> int:
-        """Number of horizons, from the first on, at which the model errs by less than `CLOSE`."""
-        far = self.nrmse[MODEL] >= CLOSE
-        return int(np.argmax(far)) if far.any() else len(far)
+        return f"better than {rival} for {self._span(self.better_until_periods)}{self._beside_others()}"
 
     @property
     def headline(self) -> str:
@@ -186,14 +192,13 @@ class ForecastSkill:
         """
         if self.is_better:
             return f"a model that forecasts {self.text}"
-        least_s = self.period_s if self.unit == "periods" else float(self.horizons_s[-1])
-        if not self.n_follows or self.horizons_s[self.n_follows - 1] < least_s:
+        least = 1.0 if self.unit == "periods" else self._until(len(self.horizons_s))
+        until = self.close_until_periods
+        if until < least:
             return f"nothing that forecasts {self.text.removeprefix('no ')}"
-        more = " and more" if self.n_follows == len(self.horizons_s) else ""
-        until = self.horizons_s[self.n_follows - 1] / self.unit_s
         return (
-            f"a model that forecasts within half a standard deviation for {until:.2g} "
-            f"{self.unit}{more}, {self.text}"
+            f"a model that forecasts within half a standard deviation for {self._span(until)}, "
+            f"{self.text}"
         )
 
     def _beside_others(self) -> str:
@@ -217,10 +222,13 @@ class ForecastSkill:
         places = sorted({round(k / 16 * last) for k in (0, 1, 2, 4, 8, 12, 16)})
         return {
             "text": self.text,
+            "headline": self.headline,
             "is_better": self.is_better,
             "horizons_periods": [h / self.unit_s for h in self.horizons_s[places].tolist()],
             "nrmse": {name: values[places].tolist() for name, values in self.nrmse.items()},
             "better_until_periods": self.better_until_periods,
+            "close_until_periods": self.close_until_periods,
+            "unit_s": self.unit_s,
             "coverage_90": self.coverage_90,
             "band_of": self.example.band_of,
         }
