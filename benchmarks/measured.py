@@ -114,8 +114,7 @@ def show(name: str, found: Traced | str, horizons: dict[str, float]) -> None:
     if forecast := found.summary.get("forecasts", {}).get("trace"):
         print(f"  {forecast['text']}: {is_true(forecast)}")
         print(
-            f"  bands of 90 %, the {forecast['band_of']}'s, hold "
-            f"{100 * forecast['coverage_90']:.0f} %",
+            f"  bands of 90 % hold {100 * forecast['coverage_90']:.0f} %",
             flush=True,
         )
 
@@ -160,7 +159,7 @@ def sentences() -> None:
         forecast = found.summary.get("forecasts", {}).get("trace")
         if forecast and forecast["coverage_90"] is not None:
             held.append(100 * forecast["coverage_90"])
-            bands = f"the {forecast['band_of']}'s bands of 90 % hold {held[-1]:.0f} %"
+            bands = f"bands of 90 % hold {held[-1]:.0f} %"
         else:
             bands = "no bands"
         slow.append(found.cpu_s)
@@ -557,8 +556,8 @@ def neutrals(voltage: float, flow: float) -> None:
 
 
 TABLES = {each.__name__: each for each in (
-    sentences, laser, electrochemical, hallthruster, pendulum, populations, current, bands, process_noise,
-    hidden, offset,
+    sentences, laser, electrochemical, hallthruster, pendulum, populations, current, bands,
+    process_noise, hidden, offset,
 )}  # fmt: skip
 
 

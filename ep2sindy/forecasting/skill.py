@@ -29,6 +29,7 @@ from ep2sindy.forecasting.baselines import (
     root_mean,
     spread_starts,
     squared_errors,
+    standard_error,
 )
 from ep2sindy.forecasting.forecast import (
     LEVEL,
@@ -79,8 +80,9 @@ class ForecastSkill:
     squared: by `model` and by the baselines `persistence`, `harmonics`, `autoregression` and
     `neighbours`, (starts, horizons): mean square errors over measured states, in variances of the
     held-out samples. A baseline that the record does not allow is left out. coverage_90: share of
-    the held-out samples that the bands of 90 % hold. example: the forecast from the first start.
-    order: of the autoregression. resampled: whether baselines took samples at other times.
+    the held-out samples that the bands of 90 % hold; NaN without bands.
+    example: the forecast from the first start. order: of the autoregression. resampled: whether
+    baselines took samples at other times.
     """
 
     horizons_s: Float[np.ndarray, " horizons"]
@@ -181,7 +183,8 @@ class ForecastSkill:
             return f"no better than {rival}" + f"; {nearest} is nearest" * (
                 nearest != WORDS[self.rival]
             )
-        return f"better than {rival} for {self._span(self.better_until_periods)}{self._beside_others()}"
+        span = self._span(self.better_until_periods)
+        return f"better than {rival} for {span}{self._beside_others()}"
 
     @property
     def headline(self) -> str:
@@ -230,7 +233,6 @@ class ForecastSkill:
             "close_until_periods": self.close_until_periods,
             "unit_s": self.unit_s,
             "coverage_90": self.coverage_90,
-            "band_of": self.example.band_of,
         }
 
     @property
@@ -241,18 +243,6 @@ class ForecastSkill:
     @property
     def unit(self) -> str:
         return "periods" if np.isfinite(self.period_s) else "samples"
-
-
-def standard_error(gain: Float[np.ndarray, " starts"], n_free: int) -> float:
-    """Standard error of the mean of gains that are correlated from start to start.
-
-    The power of slow variations, which is what a mean is uncertain by, is that of the first
-    `n_free` cosines: the ratio to it has Student's distribution with as many degrees of freedom.
-    Source: Lazarus, Lewis, Stock & Watson 2018, doi:10.1080/07350015.2018.1506926.
-    """
-    n = len(gain)
-    waves = np.cos(np.pi * np.outer(np.arange(1, n_free + 1), (np.arange(n) + 0.5) / n))
-    return float(np.sqrt(2.0 * np.square(waves @ gain).mean()) / n)
 
 
 @one_thread()
@@ -297,7 +287,6 @@ def forecast_skill(
     with watch.stage(len(first), "start", "forecasts") as advance:
         ends = rolling.ends(states_of, advance)
     ahead = rolling.forecast(ends, check_count("n_draws", n_draws), seed)
-    ahead = rolling.with_sound_bands(ahead, linear)
     begins = _bins(longest, period_s / record.dt_s)
     scale = zero_to_one(own.states[n_fitted:].std(axis=0))
     paths = {MODEL: rolling.measured(ahead)}
