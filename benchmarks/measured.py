@@ -113,9 +113,9 @@ def show(name: str, found: Traced | str, horizons: dict[str, float]) -> None:
         print(f"  {words} ahead: {found.at(horizon)}")
     if forecast := found.summary.get("forecasts", {}).get("trace"):
         print(f"  {forecast['text']}: {is_true(forecast)}")
+        held = forecast["coverage_90"]
         print(
-            f"  bands of 90 % hold {100 * forecast['coverage_90']:.0f} %",
-            flush=True,
+            "  no bands" if held is None else f"  bands of 90 % hold {100 * held:.0f} %", flush=True
         )
 
 
@@ -205,14 +205,14 @@ def false_in(forecast: dict[str, Any], errors: pd.DataFrame) -> list[str]:
 
 def measured_records() -> Iterator[Record]:
     """Records in the folder of EP2SINDY_DATA, and those that other packages bring."""
-    for name, column, *facts in (
+    for name, column, lives in (
         ("laser", "I", True), ("electrochemical", "I", False), ("pendulum", "theta", False),
         ("hallthruster_landmark_3", "I_d", True), ("hallthruster_landmark_2", "I_d", False),
         ("hare_lynx", "hare", True), ("hare_lynx", "lynx", True),
         ("gause", "Paramecium aurelia", True), ("gause", "Saccharomyces exiguus", True),
     ):  # fmt: skip
         unit = "year" if name == "hare_lynx" else "day" if name == "gause" else "s"
-        yield Record(f"{name}, {column}", *read(name, column), unit, lives=facts[0])
+        yield Record(f"{name}, {column}", *read(name, column), unit, lives=lives)
     spots = statsmodels.api.datasets.sunspots.load_pandas().data
     yield Record("sunspots", *spots.to_numpy(float).T, "year", lives=False)
     months = statsmodels.api.datasets.elnino.load_pandas().data
@@ -220,7 +220,7 @@ def measured_records() -> Iterator[Record]:
     years = months.iloc[0, 0] + np.arange(len(x)) / 12.0
     yield Record("El Nino, sea temperature", years, x, "year", driven=True)
     try:
-        import pywt
+        import pywt  # type: ignore[import-untyped]
     except ImportError:
         print("\nECG: not judged; install PyWavelets for it")
         return

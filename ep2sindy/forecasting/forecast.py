@@ -291,14 +291,15 @@ def calibrate(
     """The estimator with the widths of bands that hold 90 % of the record that it was tuned on.
 
     Forecasts from its later two thirds, each from its own past, go up to four periods ahead, or
-    half of what is left. Widths are told at horizons of 1, 2 to 3, 4 to 7 samples and so on. None
+    a quarter of these. Widths are told at horizons of 1, 2 to 3, 4 to 7 samples and so on. None
     are told of a record that is too short, or where forecasts diverge. Of one that grows or decays
     throughout, past errors do not tell later ones: the draws' own bands stay if they hold what they
-    should from the last third of the starts, else none is told. run: that record. states_of: as for `forecast_skill`.
+    should from the last third of the starts, else none is told. run: that record. states_of: as for
+    `forecast_skill`.
     Source: Vovk, Gammerman & Shafer 2005, doi:10.1007/b106715, for bands by ranks of past errors.
     """
     begin = max(MIN_SAMPLES, run.n_samples // 3)
-    longest = min(int(PERIODS_AHEAD * estimator.per_period), (run.n_samples - begin) // 2)
+    longest = min(int(PERIODS_AHEAD * estimator.per_period), (run.n_samples - begin) // 4)
     widths = np.full((1, len(estimator.measured)), nan)
     none = replace(estimator, widths=BandWidths(np.ones(1), widths))
     if run.n_samples - begin - longest < LEAST_STARTS:
