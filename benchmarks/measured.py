@@ -212,7 +212,8 @@ def measured_records() -> Iterator[Record]:
         ("gause", "Paramecium aurelia", True), ("gause", "Saccharomyces exiguus", True),
     ):  # fmt: skip
         unit = "year" if name == "hare_lynx" else "day" if name == "gause" else "s"
-        yield Record(f"{name}, {column}", *read(name, column), unit, lives=lives)
+        t, x = read(name, column)
+        yield Record(f"{name}, {column}", t, x, unit, lives=lives)
     spots = statsmodels.api.datasets.sunspots.load_pandas().data
     yield Record("sunspots", *spots.to_numpy(float).T, "year", lives=False)
     months = statsmodels.api.datasets.elnino.load_pandas().data
