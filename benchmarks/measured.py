@@ -16,6 +16,7 @@ said to live without a question, and how much the bands hold.
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
@@ -215,13 +216,14 @@ def measured_records() -> Iterator[Record]:
         t, x = read(name, column)
         yield Record(f"{name}, {column}", t, x, unit, lives=lives)
     spots = statsmodels.api.datasets.sunspots.load_pandas().data
-    yield Record("sunspots", *spots.to_numpy(float).T, "year", lives=False)
+    t, x = spots.to_numpy(float).T
+    yield Record("sunspots", t, x, "year", lives=False)
     months = statsmodels.api.datasets.elnino.load_pandas().data
     x = months.iloc[:, 1:].to_numpy(float).ravel()
     years = months.iloc[0, 0] + np.arange(len(x)) / 12.0
     yield Record("El Nino, sea temperature", years, x, "year", driven=True)
     try:
-        import pywt  # type: ignore[import-untyped]
+        pywt = importlib.import_module("pywt")
     except ImportError:
         print("\nECG: not judged; install PyWavelets for it")
         return
