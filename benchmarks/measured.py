@@ -1,5 +1,6 @@
 """Measured records, by the settings that a user meets: `python -m benchmarks.measured`.
 
+    EP2SINDY_DATA=folder python -m benchmarks.measured sentences
     EP2SINDY_DATA=folder python -m benchmarks.measured laser electrochemical hallthruster
     python -m benchmarks.measured pendulum populations current bands process_noise hidden offset
 
@@ -7,17 +8,24 @@
 root mean squares over starts, in standard deviations of the held-out samples, beside persistence
 and an autoregression by AIC; every start is fitted to the past alone. Records that are not shipped
 lie in the folder of EP2SINDY_DATA. Prints the tables of docs/measured.md.
+
+`sentences` judges what heads the result, over all records and over signals that follow a square
+wave or are noise about a sine: whether the held-out part bears it out, whether a driven signal is
+said to live without a question, and how much the bands hold.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
+import re
+import resource
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -25,6 +33,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import scipy.signal
+import statsmodels.api
 
 import ep2sindy as ep
 from ep2sindy.discovery.one_signal import fit_offset
@@ -41,11 +51,16 @@ NOISE = 0.02  # of the simulator's current, as a share of its mean
 
 @dataclass(frozen=True, eq=False)
 class Traced:
-    """What `+exp=trace` wrote: summary, errors by horizon, and the free run beside the data."""
+    """What `+exp=trace` wrote: summary, errors by horizon, and the free run beside the data.
+
+    screen: what it printed. cpu_s: what it took.
+    """
 
     summary: dict[str, Any]
     errors: pd.DataFrame
     run: pd.DataFrame
+    screen: str
+    cpu_s: float
 
     def at(self, horizon_s: float) -> str:
         """Errors at a horizon, of the model and of the autoregression."""
@@ -63,7 +78,9 @@ def trace(t: np.ndarray, x: np.ndarray, *more: str) -> Traced | str:
         np.savetxt(path, np.column_stack([t, x]), delimiter=",", header="time,x", comments="")
         given = ["+exp=trace", "data=file", f"data.path={path}", "signal=x", f"output={folder}"]
         command = [sys.executable, "-m", "experiments.run", *given, *more]
+        before = cpu_of_children_s()
         done = subprocess.run(command, capture_output=True, text=True, check=False)
+        cpu_s = cpu_of_children_s() - before
         if done.returncode:
             return (done.stderr or done.stdout).strip().splitlines()[-1]
         result = Path(done.stdout.split()[-1]).parent  # of the page
@@ -72,7 +89,14 @@ def trace(t: np.ndarray, x: np.ndarray, *more: str) -> Traced | str:
             json.loads((result / "summary.json").read_text()),
             pd.read_csv(errors) if errors.exists() else pd.DataFrame(),
             pd.read_csv(tables / "rollout_trace.csv"),
+            done.stdout + done.stderr,
+            cpu_s,
         )
+
+
+def cpu_of_children_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def show(name: str, found: Traced | str, horizons: dict[str, float]) -> None:
@@ -90,20 +114,164 @@ def show(name: str, found: Traced | str, horizons: dict[str, float]) -> None:
         print(f"  {words} ahead: {found.at(horizon)}")
     if forecast := found.summary.get("forecasts", {}).get("trace"):
         print(f"  {forecast['text']}: {is_true(forecast)}")
+        held = forecast["coverage_90"]
         print(
-            f"  bands of 90 %, the {forecast['band_of']}'s, hold "
-            f"{100 * forecast['coverage_90']:.0f} %",
-            flush=True,
+            "  no bands" if held is None else f"  bands of 90 % hold {100 * held:.0f} %", flush=True
         )
 
 
 def is_true(forecast: dict[str, Any]) -> str:
     """Whether the held-out part bears a sentence out: errors below one, and below the rival's."""
-    own, rival = (np.array(forecast["nrmse"][name]) for name in ("model", "autoregression"))
+    errors = forecast["nrmse"]
+    rivals = [name for name in ("autoregression", "persistence") if name in errors]
+    own, rival = (np.array(errors[name]) for name in ("model", rivals[0]))
     until = forecast["better_until_periods"]
     told = np.array(forecast["horizons_periods"]) <= until * (1.0 + 1e-9)
     holds = bool(((own < rival) & (own < 1.0))[told].all())
     return "true" if holds and bool(until) == forecast["is_better"] else "not true"
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A record of one signal. unit: of its times. driven: whether something else moves it.
+
+    lives: whether it repeats one cycle, so that a model of it may be said to sustain it.
+    """
+
+    name: str
+    t: np.ndarray
+    x: np.ndarray
+    unit: str = "s"
+    driven: bool = False
+    lives: bool = True
+
+
+def sentences() -> None:
+    """What heads the result of every record, and whether it is true."""
+    false, n, held, slow = 0, 0, [], []
+    for record in (*measured_records(), *made_records()):
+        found = trace(record.t, record.x, f"data.time.unit={record.unit}")
+        print(f"\n{record.name}")
+        if isinstance(found, str):
+            print(f"  refused: {found}", flush=True)
+            continue
+        told, faults = judge(record, found)
+        n, false = n + 1, false + bool(faults)
+        forecast = found.summary.get("forecasts", {}).get("trace")
+        if forecast and forecast["coverage_90"] is not None:
+            held.append(100 * forecast["coverage_90"])
+            bands = f"bands of 90 % hold {held[-1]:.0f} %"
+        else:
+            bands = "no bands"
+        slow.append(found.cpu_s)
+        print(f"  {told}\n  {'; '.join(faults) or 'true'}; {bands}; {found.cpu_s:.1f} CPU-s")
+        print(end="", flush=True)
+    outside = sum(not 80 <= each <= 97 for each in held)
+    print(
+        f"\n{n} records: {false} false, {outside} of {len(held)} bands hold other than 80 to 97 % "
+        f"({min(held):.0f} to {max(held):.0f}), {max(slow):.0f} CPU-s at most"
+    )
+
+
+def judge(record: Record, found: Traced) -> tuple[str, list[str]]:
+    """What is told first of a record, with what follows a question, and what is false in it."""
+    run = found.summary["evaluations"]["trace"]
+    screen = " ".join(found.screen.split())
+    forecast = found.summary.get("forecasts", {}).get("trace")
+    asked, lives = "driven?" in screen, run["status"] == "sustained"
+    told = run["status"] if forecast is None else forecast["headline"]
+    faults = [] if forecast is None else false_in(forecast, found.errors)
+    if lives and not record.lives:
+        faults.append("no such record lives")
+    if lives and record.driven and not asked:
+        faults.append("driven, and not asked about")
+    if "RuntimeWarning" in screen or re.search(r"e\+\d+ (times|standard)", screen):
+        faults.append("a warning, or a size that nobody can read")
+    return f"{told}; {run['status']}{', asked whether it is driven' * asked}", faults
+
+
+def false_in(forecast: dict[str, Any], errors: pd.DataFrame) -> list[str]:
+    """What the held-out part does not bear out of a sentence about forecasts, at any horizon."""
+    faults = [] if is_true(forecast) == "true" else ["better in sentence or span alone"]
+    ahead = errors["horizon_s"].to_numpy() / forecast["unit_s"]
+    rival = errors["autoregression" if "autoregression" in errors else "persistence"]
+    better = ahead <= forecast["better_until_periods"] * (1.0 + 1e-9)
+    if not ((errors["model"] < rival) & (errors["model"] < 1.0))[better].all():
+        faults.append("not better over its span")
+    close = ahead <= forecast["close_until_periods"] * (1.0 + 1e-9)
+    if not (errors["model"] < 0.5)[close].all():
+        faults.append("not close over its span")
+    return faults
+
+
+def measured_records() -> Iterator[Record]:
+    """Records in the folder of EP2SINDY_DATA, and those that other packages bring."""
+    for name, column, lives in (
+        ("laser", "I", True), ("electrochemical", "I", False), ("pendulum", "theta", False),
+        ("hallthruster_landmark_3", "I_d", True), ("hallthruster_landmark_2", "I_d", False),
+        ("hare_lynx", "hare", True), ("hare_lynx", "lynx", True),
+        ("gause", "Paramecium aurelia", True), ("gause", "Saccharomyces exiguus", True),
+    ):  # fmt: skip
+        unit = "year" if name == "hare_lynx" else "day" if name == "gause" else "s"
+        t, x = read(name, column)
+        yield Record(f"{name}, {column}", t, x, unit, lives=lives)
+    spots = statsmodels.api.datasets.sunspots.load_pandas().data
+    t, x = spots.to_numpy(float).T
+    yield Record("sunspots", t, x, "year", lives=False)
+    months = statsmodels.api.datasets.elnino.load_pandas().data
+    x = months.iloc[:, 1:].to_numpy(float).ravel()
+    years = months.iloc[0, 0] + np.arange(len(x)) / 12.0
+    yield Record("El Nino, sea temperature", years, x, "year", driven=True)
+    try:
+        pywt = importlib.import_module("pywt")
+    except ImportError:
+        print("\nECG: not judged; install PyWavelets for it")
+        return
+    ecg = pywt.data.ecg().astype(float)
+    yield Record("ECG, 360 Hz", np.arange(len(ecg)) / 360.0, ecg, lives=False)
+
+
+# What follows a square wave: its period and the lag in s, the share of a period at which it is
+# high, the time in which it rises in periods, and noise.
+SQUARES = (
+    (1.37, 0.1, 0.5, 0.0, 0.01), (1.37, 0.3, 0.5, 0.0, 0.05), (1.37, 1.0, 0.5, 0.0, 0.02),
+    (7.3e-3, 1e-3, 0.3, 0.0, 0.02), (7.3e-3, 3e-3, 0.2, 0.0, 0.05), (7.3e-3, 1e-3, 0.7, 0.05, 0.01),
+    (0.02, 5e-3, 0.5, 0.0, 0.02), (0.1, 0.02, 0.4, 0.1, 0.03), (25.0, 8.0, 0.5, 0.2, 0.02),
+    (60.0, 10.0, 0.25, 0.0, 0.05),
+)  # fmt: skip
+PER_PERIOD, N_SQUARES = 40, 40
+
+
+def made_records() -> Iterator[Record]:
+    """Signals that follow a square wave, and a sine in noise that lasts."""
+    rng = np.random.default_rng(0)
+    for period_s, lag_s, high, rise, noise in SQUARES:
+        t = period_s / PER_PERIOD * np.arange(PER_PERIOD * N_SQUARES)
+        x = relaxation(t, period_s, lag_s, high, rise)
+        x = x + noise * x.std() * rng.standard_normal(len(x))
+        words = f"square wave, {period_s:g} s, {100 * high:.0f} % high, {100 * noise:.0f} % noise"
+        yield Record(words, t, x, driven=True)
+    t, lasting = 0.05 * np.arange(2000), np.zeros(2000)
+    for k in range(1, len(t)):
+        lasting[k] = 0.9 * lasting[k - 1] + rng.standard_normal()
+    for share in (0.2, 0.5):
+        x = np.sin(2.0 * np.pi * t / 1.43) + share * lasting / lasting.std()
+        yield Record(f"sine, noise of {share:g} that lasts", t, x, driven=True)
+
+
+def relaxation(
+    t: np.ndarray, period_s: float, lag_s: float, high: float, rise: float
+) -> np.ndarray:
+    """x of lag_s x' = u - x, in fine steps, u being a wave of zero and one with sloped sides."""
+    n = 20
+    fine = np.linspace(t[0], t[-1], n * (len(t) - 1) + 1)
+    place = fine / period_s % 1.0
+    if rise:
+        u = np.interp(place, [0.0, rise, high, high + rise, 1.0], [0.0, 1.0, 1.0, 0.0, 0.0])
+    else:
+        u = (place < high).astype(float)
+    keep = np.exp(-(fine[1] - fine[0]) / lag_s)
+    return scipy.signal.lfilter([1.0 - keep], [1.0, -keep], u)[::n]
 
 
 def read(name: str, column: str) -> tuple[np.ndarray, np.ndarray]:
@@ -391,8 +559,8 @@ def neutrals(voltage: float, flow: float) -> None:
 
 
 TABLES = {each.__name__: each for each in (
-    laser, electrochemical, hallthruster, pendulum, populations, current, bands, process_noise,
-    hidden, offset,
+    sentences, laser, electrochemical, hallthruster, pendulum, populations, current, bands,
+    process_noise, hidden, offset,
 )}  # fmt: skip
 
 

@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ep2sindy.forecasting.baselines import standard_error
 from ep2sindy.forecasting.forecast import Forecast
-from ep2sindy.forecasting.skill import EXCEEDS, SURE, ForecastSkill, standard_error
+from ep2sindy.forecasting.skill import EXCEEDS, SURE, ForecastSkill
 from ep2sindy.library.units import SECONDS
 
 N_HORIZONS = 40
 AHEAD = Forecast(
     t=np.ones(1), states=np.ones((1, 1)), draws=np.ones((1, 1, 1)), noise_std=np.zeros(1),
-    state_names=("x",), units={"x": "1"},
+    width=np.ones((1, 1)), state_names=("x",), units={"x": "1"},
 )  # fmt: skip
 
 

@@ -317,8 +317,7 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
         values, mean = run.columns([name])[shown, 0], ahead.states[:, k]
         ax.plot(since, values, ".", ms=3, color=DATA, label="samples")
         band: dict[str, Any] = {"color": COLOURS[0], "alpha": 0.25, "lw": 0}
-        of = "" if ahead.sound is None else ", the autoregression's"
-        label = f"band of {100.0 * LEVEL:.0f} %{of}"
+        label = f"band of {100.0 * LEVEL:.0f} %"
         ax.fill_between(later, low[:, k], high[:, k], label=label, **band)
         ax.plot(later, mean, color=COLOURS[0], lw=1.2, label="forecast")
         ax.axvline(0.0, color=GREY, lw=0.8, ls="--")

@@ -17,7 +17,6 @@ from jaxtyping import Float, Int
 from ep2sindy.data.gaps import between_gaps, usual_step
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.model.draws import draw_normal
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.spectrum import crossing_frequency, dominant_frequency
 
@@ -82,6 +81,18 @@ def squared_errors(
 def root_mean(squared: Float[np.ndarray, "starts ahead"]) -> Float[np.ndarray, " ahead"]:
     """Root mean square error over starts at every horizon."""
     return np.sqrt(squared.mean(axis=0))
+
+
+def standard_error(gain: Float[np.ndarray, " starts"], n_free: int) -> float:
+    """Standard error of the mean of gains that are correlated from start to start.
+
+    The power of slow variations, which is what a mean is uncertain by, is that of the first
+    `n_free` cosines: the ratio to it has Student's distribution with as many degrees of freedom.
+    Source: Lazarus, Lewis, Stock & Watson 2018, doi:10.1080/07350015.2018.1506926.
+    """
+    n = len(gain)
+    waves = np.cos(np.pi * np.outer(np.arange(1, n_free + 1), (np.arange(n) + 0.5) / n))
+    return float(np.sqrt(2.0 * np.square(waves @ gain).mean()) / n)
 
 
 def measured_part(run: Trajectory, names: Sequence[str], inputs: Sequence[str]) -> Trajectory:
@@ -196,7 +207,7 @@ class Autoregression:
     to the time that is forecast. Of states that are positive throughout, it is one of their
     logarithms if this is likelier, densities being those of the samples in either case.
     step_s: between samples. constant: (n_states,). coef: (order, n_states, n_states). drive:
-    (order + 1, n_states, n_inputs). residual: (n_states, n_states), covariance of what is left.
+    (order + 1, n_states, n_inputs).
     least: (n_states,), the lowest samples, of an autoregression of logarithms; None of others.
     """
 
@@ -204,7 +215,6 @@ class Autoregression:
     constant: Float[np.ndarray, " n_states"]
     coef: Float[np.ndarray, "order n_states n_states"]
     drive: Float[np.ndarray, "_ n_states n_inputs"]
-    residual: Float[np.ndarray, "n_states n_states"]
     least: Float[np.ndarray, " n_states"] | None = None
 
     @staticmethod
@@ -228,42 +238,20 @@ class Autoregression:
         return len(self.coef)
 
     def ahead(self, past: np.ndarray, t: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        return self._paths(past, t, inputs, np.zeros((1, 1, 1)))[0]
-
-    def draws(
-        self, past: np.ndarray, t: np.ndarray, inputs: np.ndarray, n: int, rng: np.random.Generator
-    ) -> Float[np.ndarray, "draws ahead n_states"]:
-        """Forecasts that are moved at every step as much as the residuals say."""
-        n_steps = len(_grid_around(t, len(past), self.step_s, 0))
-        none = np.zeros(len(self.constant))
-        moves = draw_normal(none, self.residual, n * n_steps, rng)
-        return self._paths(past, t, inputs, moves.reshape(n, n_steps, -1))
-
-    def _paths(
-        self,
-        past: np.ndarray,
-        t: np.ndarray,
-        inputs: np.ndarray,
-        moves: Float[np.ndarray, "draws _ _"],
-    ) -> Float[np.ndarray, "draws ahead n_states"]:
-        """Forecasts with these moves at every step."""
         grid = _grid_around(t, len(past), self.step_s, self.order)
-        shape = (len(moves), len(t) - len(past), past.shape[1])
         if grid[0] < t[0] - 0.5 * self.step_s:
-            return np.full(shape, np.nan)
+            return np.full((len(t) - len(past), past.shape[1]), np.nan)
         path, drive = _on_grid(grid, t[: len(past)], past), _on_grid(grid, t, inputs)
         if self.least is not None:
             path = np.log(np.where(path > 0.0, path, self.least))
-        paths = np.repeat(path[None], len(moves), axis=0)
-        moves = np.broadcast_to(moves, (len(moves), len(grid) - self.order, shape[2]))
         for k in range(self.order, len(grid)):
             driven = np.einsum("lij,lj->i", self.drive, drive[k - self.order : k + 1][::-1])
-            own = np.einsum("lij,klj->ki", self.coef, paths[:, k - self.order : k][:, ::-1])
-            paths[:, k] = self.constant + own + driven + moves[:, k - self.order]
+            own = np.einsum("lij,lj->i", self.coef, path[k - self.order : k][::-1])
+            path[k] = self.constant + own + driven
         if self.least is not None:
             with np.errstate(over="ignore"):  # an unstable one grows without bounds
-                paths = np.exp(paths)
-        return np.stack([_on_grid(t[len(past) :], grid, each) for each in paths])
+                path = np.exp(path)
+        return _on_grid(t[len(past) :], grid, path)
 
 
 def _fit_autoregression(
@@ -289,15 +277,14 @@ def _fit_autoregression(
     order = int(np.argmin(costs)) + 1
     rows, targets = _lagged(scaled, d, order)
     solved = np.linalg.lstsq(rows, targets, rcond=None)[0]
-    off, by_lag = targets - rows @ solved, solved[first:].reshape(order, each, d)
+    by_lag = solved[first:].reshape(order, each, d)
     coef = by_lag[:, :d].transpose(0, 2, 1) * scale[:d, None] / scale[:d]
     drive = np.concatenate([solved[1:first][None], by_lag[:, d:]]).transpose(0, 2, 1)
     drive = drive * scale[:d, None] / scale[d:]
     level = mean[:d] - coef.sum(axis=0) @ mean[:d] - drive.sum(axis=0) @ mean[d:]
     constant = scale[:d] * solved[0] + level
-    residual = off.T @ off / len(off) * np.outer(scale[:d], scale[:d])
     density = 2.0 * n * float(np.log(scale[:d]).sum())
-    return Autoregression(1.0, constant, coef, drive, residual), min(costs) + density
+    return Autoregression(1.0, constant, coef, drive), min(costs) + density
 
 
 def _lagged(stretches: Sequence[np.ndarray], d: int, order: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,33 +1,37 @@
 """Forecasts of a model, from the end of a record or from many starts along it, with bands.
 
-Bands are calibrated where they can be seen: the likeliest process noise is that which explains
-single steps. What a model misses lasts, however, over many steps, so its forecasts scatter more
-than such noise says; and where a record is moved hard in a few places alone, less.
+The likeliest process noise is that which explains single steps. What a model misses lasts, however,
+over many steps, so its forecasts scatter more than such noise says; and where a record is moved
+hard in a few places alone, less. So bands are widened by what they missed where it can be seen.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
+from math import nan
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
+from scipy.special import ndtri, stdtrit
 
 from ep2sindy.data.numbers import band_of, quantiles
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.forecasting.baselines import (
-    AUTOREGRESSION,
-    Autoregression,
-    measured_part,
-    spread_starts,
+from ep2sindy.estimation.problem import MIN_SAMPLES
+from ep2sindy.forecasting.baselines import spread_starts, standard_error
+from ep2sindy.forecasting.state_estimation import (
+    BandWidths,
+    FittedState,
+    StateEstimator,
+    tune_estimator,
 )
-from ep2sindy.forecasting.state_estimation import FittedState, StateEstimator, tune_estimator
 from ep2sindy.library.units import SECONDS, Clock
+from ep2sindy.model.comparison import spirals
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
 from ep2sindy.model.inputs import driven
 from ep2sindy.model.model import SparseModel
@@ -37,15 +41,18 @@ from ep2sindy.runtime.values import check_count, read_only
 from ep2sindy.signals.spectrum import is_uniform
 
 LEVEL = 0.9  # share of the samples that a band is to hold
+UPPER = 0.5 + 0.5 * LEVEL  # level of its upper bound
 
 # Makes all states of a past, whose first columns are the measured ones.
 StatesOf = Callable[[Trajectory], Trajectory]
 
 # Starts of the forecasts whose bands are calibrated, draws of each, and how far they go.
-N_STARTS, N_DRAWS, PERIODS_AHEAD = 24, 60, 1.5
-LEAST_HELD = 0.6  # share of fitted samples that bands hold, below which they are not shown
-TOLERANCE = 0.03  # deviation from the level at which a band counts as calibrated
-FACTORS = 10.0 ** np.arange(-2.0, 2.1, 0.25)  # of the likeliest process noise
+N_STARTS, N_DRAWS, PERIODS_AHEAD = 40, 100, 4.0
+# Slow variations from start to start that tell the error of a share, and the least such error; with
+# under twice as many starts, a band is not told.
+N_WAVES, SURELY = 4, 1e-3
+LEAST_STARTS = 2 * N_WAVES
+LEAST_HELD, MOST_HELD = 0.8, 0.97  # share that a band of 90 % holds which is right
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,23 +63,21 @@ class Forecast:
     median of the draws, in SI. draws: (draws, samples, n_states), runs from starts and with
     coefficients drawn by their covariance, under the record's process noise; NaN where a run has
     diverged. noise_std: (n_states,), of the sensor's noise; NaN for states that it does not show.
-    sound: (draws, samples, measured), draws of an autoregression, the sensor's noise included,
-    whose band stands in place of the model's, which did not hold where the model was fitted; None
-    if it did.
+    width: (samples, n_states), of the band in widths of the draws' own; NaN where none is shown.
     """
 
     t: Float[np.ndarray, " samples"]
     states: Float[np.ndarray, "samples n_states"]
     draws: Float[np.ndarray, "draws samples n_states"] = field(repr=False)
     noise_std: Float[np.ndarray, " n_states"]
+    width: Float[np.ndarray, "samples n_states"] = field(repr=False)
     state_names: tuple[str, ...]
     units: Mapping[str, str]
     clock: Clock = SECONDS
     seed: int = field(default=0, repr=False)
-    sound: Float[np.ndarray, "draws samples _"] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        for name in ("t", "states", "draws", "noise_std"):
+        for name in ("t", "states", "draws", "noise_std", "width"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     def band(
@@ -80,20 +85,13 @@ class Forecast:
     ) -> tuple[Float[np.ndarray, "samples n_states"], Float[np.ndarray, "samples n_states"]]:
         """Lower and upper bound that hold this share of the samples, the sensor's noise included.
 
-        Draws that diverged count neither way. Raises ValueError for a level that is no share.
+        Draws that diverged count neither way; NaN where no band is shown. Raises ValueError for a
+        level that is no share.
         """
         rng = np.random.default_rng(self.seed)
         noise = np.nan_to_num(self.noise_std) * rng.standard_normal(self.draws.shape)
-        draws = self.draws + noise
-        if self.sound is not None:
-            draws[..., np.isfinite(self.noise_std)] = self.sound
-        low, high = band_of(draws, level)
+        low, high = self.states + self.width * (band_of(self.draws + noise, level) - self.states)
         return low, high
-
-    @property
-    def band_of(self) -> str:
-        """Whose band it is: `model`, or `autoregression`."""
-        return "model" if self.sound is None else AUTOREGRESSION
 
     @property
     def diverged(self) -> float:
@@ -138,12 +136,13 @@ def draw_forecasts(
             states=quantiles(draws, [0.5])[0],
             draws=draws,
             noise_std=estimator.noise.samples,
+            width=estimator.widths.at(own - begin),
             state_names=tuple(model.states),
             units=model.units,
             clock=clock,
             seed=seed,
         )
-        for own, draws in zip(times, runs, strict=True)
+        for own, begin, draws in zip(times, begins, runs, strict=True)
     ]
 
 
@@ -163,11 +162,10 @@ def forecast(
 
     The model itself is fitted to the samples of the last four periods: nothing but the past enters.
     The noise of the samples, and process noise for what the model does not describe, are the
-    likeliest ones for the record that the model was fitted to; the latter is then scaled until
-    bands hold 90 % of that record, if it is long enough (`calibrate`). The bands follow from the
+    likeliest ones for the record that the model was fitted to. The bands follow from the
     uncertainty of the start, from the covariance of the model's coefficients if it has one, from
-    this process noise, and from the noise. If they hold under 60 % of that record all the same,
-    they are those of an autoregression that is fitted to it.
+    this process noise, and from the noise; they are as many times wider as the errors of
+    forecasts within that record say (`calibrate`).
     history: samples of the measured states and of the inputs; a Trajectory, a table or (t, x).
     States of the model that it lacks are told from the others (`estimate_states`).
     horizon: duration in s, in steps of the history; or the times (samples,) themselves, in s.
@@ -189,31 +187,10 @@ def forecast(
     times = _times(past.t, past.dt_s, horizon)
     known = past if fitted_to is None else trajectory_of(fitted_to)
     estimator = calibrate(tune_estimator(model, known, measured=measured), known, seed=seed)
-    end, grid = estimator.filter(past), np.append(past.t[-1], times)
-    ahead = draw_forecasts(
-        estimator, [end], past.t[-1:], times[None], inputs=inputs,
+    return draw_forecasts(
+        estimator, [estimator.filter(past)], past.t[-1:], times[None], inputs=inputs,
         n_draws=check_count("n_draws", n_draws), seed=seed, clock=past.clock,
     )[0]  # fmt: skip
-    if not estimator.held < LEAST_HELD:
-        return ahead
-    own, known = (measured_part(run, estimator.names, model.inputs) for run in (past, known))
-    later = driven(model.inputs, inputs, grid, model.courses)[1][1:]
-    linear, t = Autoregression.of(known), np.append(own.t, times)
-    return with_band_of(linear, ahead, own.states, t, np.vstack([own.inputs, later]))
-
-
-def with_band_of(
-    linear: Autoregression | None,
-    ahead: Forecast,
-    past: Float[np.ndarray, "samples measured"],
-    t: Float[np.ndarray, " times"],
-    inputs: Float[np.ndarray, "times n_inputs"],
-) -> Forecast:
-    """The forecast with the band of an autoregression. t and inputs: see `Baseline.ahead`."""
-    if linear is None:
-        return ahead
-    draws = linear.draws(past, t, inputs, len(ahead.draws), np.random.default_rng(ahead.seed))
-    return replace(ahead, sound=draws)
 
 
 def _times(t: np.ndarray, step_s: float, horizon: float | ArrayLike) -> np.ndarray:
@@ -280,34 +257,26 @@ class RollingStarts:
             )
         ]
 
-    def with_sound_bands(
-        self, ahead: Sequence[Forecast], linear: Autoregression | None
-    ) -> list[Forecast]:
-        """The forecasts, with an autoregression's bands if the model's did not hold before."""
-        if not self.estimator.held < LEAST_HELD:
-            return list(ahead)
-        own = measured_part(self.record, self.estimator.names, self.estimator.model.inputs)
-        ends = [(k, k + self.longest) for k in self.first.tolist()]
-        return [
-            with_band_of(linear, each, own.states[:k], own.t[:end], own.inputs[:end])
-            for each, (k, end) in zip(ahead, ends, strict=True)
-        ]
-
     def measured(self, ahead: Sequence[Forecast]) -> Float[np.ndarray, "starts ahead measured"]:
         return np.stack([each.states[:, self.estimator.measured] for each in ahead])
 
     def coverage(self, ahead: Sequence[Forecast], level: float) -> float:
-        """Share of the samples that bands hold."""
+        """Share of the samples that bands hold, where there are any; NaN if there are none."""
+        off = self.off(ahead, level)
+        return float((off <= 1.0).sum() / np.isfinite(off).sum()) if np.isfinite(off).any() else nan
+
+    def off(
+        self, ahead: Sequence[Forecast], level: float
+    ) -> Float[np.ndarray, "starts ahead measured"]:
+        """Distances of samples from the medians, in those of the band's bound on their side."""
         low, high = (
             np.stack(side)[:, :, self.estimator.measured]
             for side in zip(*[each.band(level) for each in ahead], strict=True)
         )
-        return float(((low <= self.truth) & (self.truth <= high)).mean())
-
-    def scale_process(self, factor: float) -> RollingStarts:
-        """The same with process noise larger by a factor."""
-        noise = replace(self.estimator.noise, process=factor * self.estimator.noise.process)
-        return replace(self, estimator=replace(self.estimator, noise=noise))
+        middle = self.measured(ahead)
+        side = np.where(self.truth > middle, high, low)
+        with np.errstate(divide="ignore", invalid="ignore"):  # a band without width
+            return (self.truth - middle) / (side - middle)
 
 
 @one_thread()
@@ -319,29 +288,48 @@ def calibrate(
     seed: int = 0,
     progress: Progress = SILENT,
 ) -> StateEstimator:
-    """The estimator with process noise whose bands hold 90 % of the record that it was tuned on.
+    """The estimator with the widths of bands that hold 90 % of the record that it was tuned on.
 
-    run: that record. states_of: as for `forecast_skill`. Forecasts of up to one and a half periods
-    from its later two thirds are counted. Of a record that is too short for these, the estimator
-    comes back unchanged.
+    Forecasts from its later two thirds, each from its own past, go up to four periods ahead, or
+    a quarter of these. Widths are told at horizons of 1, 2 to 3, 4 to 7 samples and so on. None
+    are told of a record that is too short, or where forecasts diverge. Of one that grows or decays
+    throughout, past errors do not tell later ones: the draws' own bands stay if they hold what they
+    should from the last third of the starts, else none is told. run: that record. states_of: as for
+    `forecast_skill`.
+    Source: Vovk, Gammerman & Shafer 2005, doi:10.1007/b106715, for bands by ranks of past errors.
     """
-    ahead = max(2, int(PERIODS_AHEAD * estimator.per_period))
-    begin = max(estimator.memory, run.n_samples // 3)
-    if run.n_samples - ahead - begin < N_STARTS:
-        return estimator
-    first = spread_starts(run.t, begin, ahead, N_STARTS)
-    rolling = RollingStarts(estimator, run, first, ahead)
-
-    def coverage(factor: float) -> float:
-        scaled = rolling.scale_process(factor)
-        return scaled.coverage(scaled.forecast(ends, N_DRAWS, seed), LEVEL)
-
+    begin = max(MIN_SAMPLES, run.n_samples // 3)
+    longest = min(int(PERIODS_AHEAD * estimator.per_period), (run.n_samples - begin) // 4)
+    widths = np.full((1, len(estimator.measured)), nan)
+    none = replace(estimator, widths=BandWidths(np.ones(1), widths))
+    if run.n_samples - begin - longest < LEAST_STARTS:
+        return none
+    first = spread_starts(run.t, begin, longest, N_STARTS)
+    rolling = RollingStarts(estimator, run, first, longest)
     with progress.stage(None, "", "width of the forecasts' bands"):
-        ends, factor = rolling.ends(states_of), 1.0
-        held = coverage(factor)
-        if abs(held - LEVEL) > TOLERANCE:
-            # More process noise makes wider bands.
-            above = bisect_left(FACTORS[1:-1], LEVEL, key=coverage) + 1
-            factor = float(FACTORS[above])
-            held = coverage(factor)
-    return replace(rolling.scale_process(factor).estimator, held=held)
+        off = rolling.off(rolling.forecast(rolling.ends(states_of), N_DRAWS, seed), LEVEL)
+    if spirals(run.columns(estimator.names)):
+        late = (off[2 * len(off) // 3 :] <= 1.0).mean()
+        return estimator if LEAST_HELD <= late <= MOST_HELD else none
+    edges = np.append(2 ** np.arange(int(np.log2(longest)) + 1), longest + 1) - 1
+    widths = np.repeat(widths, len(edges) - 1, axis=0)
+    widths[:, estimator.measured] = [
+        [_width(column) for column in np.moveaxis(off[:, start:stop], 2, 0)]
+        for start, stop in pairwise(edges)
+    ]
+    return replace(estimator, widths=BandWidths(rolling.steps_s[edges[1:] - 1], widths))
+
+
+def _width(off: Float[np.ndarray, "starts ahead"]) -> float:
+    """Width of a band that holds as many samples as it should, in the one of which these are off.
+
+    It is the quantile of the distances. Their shares within it, start by start, tell its standard
+    error, and so how many independent distances there were. A quantile of these is uncertain
+    itself: it is larger by the ratio of Student's quantile, of as many degrees, to the normal one.
+    """
+    off = np.nan_to_num(off, nan=np.inf)
+    quantile = float(np.quantile(off, LEVEL, method="higher"))
+    error = standard_error((off < quantile).mean(axis=1), N_WAVES)
+    n_free = LEVEL * (1.0 - LEVEL) / max(error, SURELY) ** 2
+    width = quantile * float(stdtrit(max(n_free, 1.0), UPPER) / ndtri(UPPER))
+    return width if np.isfinite(width) else nan

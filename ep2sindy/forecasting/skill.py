@@ -29,6 +29,7 @@ from ep2sindy.forecasting.baselines import (
     root_mean,
     spread_starts,
     squared_errors,
+    standard_error,
 )
 from ep2sindy.forecasting.forecast import (
     LEVEL,
@@ -79,8 +80,9 @@ class ForecastSkill:
     squared: by `model` and by the baselines `persistence`, `harmonics`, `autoregression` and
     `neighbours`, (starts, horizons): mean square errors over measured states, in variances of the
     held-out samples. A baseline that the record does not allow is left out. coverage_90: share of
-    the held-out samples that the bands of 90 % hold. example: the forecast from the first start.
-    order: of the autoregression. resampled: whether baselines took samples at other times.
+    the held-out samples that the bands of 90 % hold; NaN without bands.
+    example: the forecast from the first start. order: of the autoregression. resampled: whether
+    baselines took samples at other times.
     """
 
     horizons_s: Float[np.ndarray, " horizons"]
@@ -144,7 +146,21 @@ class ForecastSkill:
     @property
     def better_until_periods(self) -> float:
         """How long it does, in periods, or in samples for a record without an oscillation."""
-        return float(self.horizons_s[self.n_better - 1]) / self.unit_s if self.n_better else 0.0
+        return self._until(self.n_better)
+
+    @property
+    def close_until_periods(self) -> float:
+        """How long, from the first horizon on, the model errs by less than `CLOSE`, likewise."""
+        far = self.nrmse[MODEL] >= CLOSE
+        return self._until(int(np.argmax(far)) if far.any() else len(far))
+
+    def _until(self, n: int) -> float:
+        return float(self.horizons_s[n - 1]) / self.unit_s if n else 0.0
+
+    def _span(self, until: float) -> str:
+        """`3.1 periods`, and whether it is all that was asked."""
+        more = " and more" if until * self.unit_s >= self.horizons_s[-1] else ""
+        return f"{until:.2g} {self.unit}{more}"
 
     @property
     def nearest(self) -> str:
@@ -167,15 +183,8 @@ class ForecastSkill:
             return f"no better than {rival}" + f"; {nearest} is nearest" * (
                 nearest != WORDS[self.rival]
             )
-        more = " and more" if self.n_better == len(self.horizons_s) else ""
-        until = f"{self.better_until_periods:.2g} {self.unit}{more}"
-        return f"better than {rival} for {until}{self._beside_others()}"
-
-    @property
-    def n_follows(self) -> int:
-        """Number of horizons, from the first on, at which the model errs by less than `CLOSE`."""
-        far = self.nrmse[MODEL] >= CLOSE
-        return int(np.argmax(far)) if far.any() else len(far)
+        span = self._span(self.better_until_periods)
+        return f"better than {rival} for {span}{self._beside_others()}"
 
     @property
     def headline(self) -> str:
@@ -186,14 +195,13 @@ class ForecastSkill:
         """
         if self.is_better:
             return f"a model that forecasts {self.text}"
-        least_s = self.period_s if self.unit == "periods" else float(self.horizons_s[-1])
-        if not self.n_follows or self.horizons_s[self.n_follows - 1] < least_s:
+        least = 1.0 if self.unit == "periods" else self._until(len(self.horizons_s))
+        until = self.close_until_periods
+        if until < least:
             return f"nothing that forecasts {self.text.removeprefix('no ')}"
-        more = " and more" if self.n_follows == len(self.horizons_s) else ""
-        until = self.horizons_s[self.n_follows - 1] / self.unit_s
         return (
-            f"a model that forecasts within half a standard deviation for {until:.2g} "
-            f"{self.unit}{more}, {self.text}"
+            f"a model that forecasts within half a standard deviation for {self._span(until)}, "
+            f"{self.text}"
         )
 
     def _beside_others(self) -> str:
@@ -217,12 +225,14 @@ class ForecastSkill:
         places = sorted({round(k / 16 * last) for k in (0, 1, 2, 4, 8, 12, 16)})
         return {
             "text": self.text,
+            "headline": self.headline,
             "is_better": self.is_better,
             "horizons_periods": [h / self.unit_s for h in self.horizons_s[places].tolist()],
             "nrmse": {name: values[places].tolist() for name, values in self.nrmse.items()},
             "better_until_periods": self.better_until_periods,
+            "close_until_periods": self.close_until_periods,
+            "unit_s": self.unit_s,
             "coverage_90": self.coverage_90,
-            "band_of": self.example.band_of,
         }
 
     @property
@@ -233,18 +243,6 @@ class ForecastSkill:
     @property
     def unit(self) -> str:
         return "periods" if np.isfinite(self.period_s) else "samples"
-
-
-def standard_error(gain: Float[np.ndarray, " starts"], n_free: int) -> float:
-    """Standard error of the mean of gains that are correlated from start to start.
-
-    The power of slow variations, which is what a mean is uncertain by, is that of the first
-    `n_free` cosines: the ratio to it has Student's distribution with as many degrees of freedom.
-    Source: Lazarus, Lewis, Stock & Watson 2018, doi:10.1080/07350015.2018.1506926.
-    """
-    n = len(gain)
-    waves = np.cos(np.pi * np.outer(np.arange(1, n_free + 1), (np.arange(n) + 0.5) / n))
-    return float(np.sqrt(2.0 * np.square(waves @ gain).mean()) / n)
 
 
 @one_thread()
@@ -289,7 +287,6 @@ def forecast_skill(
     with watch.stage(len(first), "start", "forecasts") as advance:
         ends = rolling.ends(states_of, advance)
     ahead = rolling.forecast(ends, check_count("n_draws", n_draws), seed)
-    ahead = rolling.with_sound_bands(ahead, linear)
     begins = _bins(longest, period_s / record.dt_s)
     scale = zero_to_one(own.states[n_fitted:].std(axis=0))
     paths = {MODEL: rolling.measured(ahead)}

@@ -71,6 +71,22 @@ class FittedState:
 
 
 @dataclass(frozen=True, eq=False)
+class BandWidths:
+    """Widths of forecasts' bands, in widths of the draws' own, by horizon.
+
+    horizons_s: (horizons,), increasing. widths: (horizons, n_states); NaN where no width is known.
+    """
+
+    horizons_s: Float[np.ndarray, " horizons"]
+    widths: Float[np.ndarray, "horizons n_states"]
+
+    def at(self, ahead_s: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "samples n_states"]:
+        """Between horizons, interpolated in their logarithms; farther, that of the longest."""
+        at, known = np.log(ahead_s), np.log(self.horizons_s)
+        return np.stack([np.interp(at, known, each) for each in self.widths.T], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
 class StateEstimator:
     """A model that can follow records, with the errors that it makes on one.
 
@@ -83,7 +99,7 @@ class StateEstimator:
     white and normal.
     problem: scales and steps of that record, and which states were measured. free: the model's
     coefficients, scaled. n_substeps: Runge-Kutta steps between samples. per_period: samples to a
-    period of the record.
+    period of the record. widths: of the bands of its forecasts.
     Source: Bell 1994, doi:10.1137/0804035.
     """
 
@@ -93,7 +109,7 @@ class StateEstimator:
     n_substeps: int
     per_period: float
     noise: ModelNoise
-    held: float = float("nan")
+    widths: BandWidths
 
     @property
     def measured(self) -> Bool[np.ndarray, " n_states"]:
@@ -199,6 +215,7 @@ def tune_estimator(
         n_substeps=enough_substeps(_fix(problem, problem.records, paths, free, rough)),
         per_period=_count_per_period(own, names),
         noise=_noise_of(problem, rough, 0.1 * rough),
+        widths=BandWidths(np.ones(1), np.ones((1, len(model.states)))),
     )
     watch = as_progress(progress)
     for _ in count_pieces(watch, range(N_PASSES), "pass", "errors of the model, for forecasts"):

@@ -185,11 +185,7 @@ class ComparedRecord:
 
     @property
     def _spirals(self) -> bool:
-        """True if every state grows or decays throughout."""
-        sizes = _sizes(self.states)
-        steps = np.diff(np.log(sizes), axis=0)
-        ratio = np.abs(np.log(sizes[-1] / sizes[0]))
-        return bool((ratio > np.log(SPIRALS)).all() and (steps[0] * steps[1] > 0.0).all())
+        return spirals(self.states)
 
     def _is_followed(self, states: np.ndarray, bounds: FreeRunBounds) -> bool:
         """True if a run has the envelope of the record in each third, and its frequency."""
@@ -219,6 +215,14 @@ class ComparedRecord:
         wander = np.abs(_sizes(self.states) / std - 1.0).max(axis=0)
         alike = np.abs(states.std(axis=0) / std - 1.0) <= np.maximum(bounds.amplitude, wander)
         return bool((near & alike).all())
+
+
+def spirals(states: Float[np.ndarray, "samples n_states"]) -> bool:
+    """Whether every state of a record grows or decays throughout."""
+    sizes = _sizes(states)
+    steps = np.diff(np.log(sizes), axis=0)
+    ratio = np.abs(np.log(sizes[-1] / sizes[0]))
+    return bool((ratio > np.log(SPIRALS)).all() and (steps[0] * steps[1] > 0.0).all())
 
 
 def _sizes(states: np.ndarray) -> np.ndarray:

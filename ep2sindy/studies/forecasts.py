@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
@@ -68,13 +69,14 @@ def _table(skill: ForecastSkill) -> Table:
     units = [skill.unit if each > 1 else skill.unit[:-1] for each in shown]
     ahead = [f"{each:g} {unit} ahead" for each, unit in zip(shown, units, strict=True)]
     rows.insert(0, "horizon", ahead)
-    bands = "the bands"
-    if skill.example.sound is not None:
-        bands = "the model's bands held under 60 % where it was fitted; the autoregression's"
+    held = f"the bands of 90 % hold {100.0 * skill.coverage_90:.0f} % of the samples"
+    if not np.isfinite(skill.coverage_90):
+        held = (
+            "there are no bands: forecasts diverge where the model was fitted, or it is too short"
+        )
     steps = " Baselines take the samples interpolated onto equal steps." if skill.resampled else ""
     return Table(
         rows,
         title="error of forecasts (standard deviations)",
-        note=f"{skill.n_starts} starts, each fitted to the past alone; {bands} of 90 % hold "
-        f"{100.0 * skill.coverage_90:.0f} % of the samples.{steps}",
+        note=f"{skill.n_starts} starts, each fitted to the past alone; {held}.{steps}",
     )

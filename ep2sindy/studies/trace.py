@@ -152,7 +152,7 @@ class Study:
         remarks = [Text(free.caution, warning=True)] if free.caution else []
         lives = free.status is Status.SUSTAINED and not question
         if lives and (remark := say_what_is_not_told(signal)):
-            remarks.append(Text(remark, page_only=True))
+            remarks.append(Text(remark))
         report.found(
             found_model(
                 f"Found from {signal.name}",
