@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
 from ep2sindy.data.coerce import Task
-from ep2sindy.data.gaps import between_gaps, mean_step
+from ep2sindy.data.gaps import mean_step
 from ep2sindy.data.trajectory import Trajectory, spread_blocks
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, NoiseTest
 from ep2sindy.estimation.noise import are_white
@@ -170,10 +170,8 @@ def _judge_rest(model: SparseModel, runs: Sequence[Trajectory]) -> tuple[str, st
     rates, times, samples = [terms[s].get("1", 0.0) for s in rest], [], []
     for run in runs:
         whole = slice(None) if run.missing is None else ~run.missing.any(axis=1)
-        t, states = run.t[whole], run.columns(list(terms))[whole]
-        for start, stop in between_gaps(t):
-            times.append(t[start:stop])
-            samples.append(states[start:stop])
+        times.append(run.t[whole])
+        samples.append(run.columns(list(terms))[whole])
     step, n, own = mean_step(*times), sum(map(len, times)), [list(terms).index(s) for s in rest]
     left = [x[:, own] - np.outer(t, rates) for t, x in zip(times, samples, strict=True)]
     left = [each - each.mean(axis=0) for each in left]

@@ -125,9 +125,7 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
     new = [np.concatenate([e[:1], e[1:] - memory * e[:-1]]) for e in unit]
     times = [each.times for each in problem.records]
-    own, off = (problem.split(each) for each in (record.samples[:, ~hidden], left))
-    moves = _rests(fit, left) & ~are_white(times, own, off)
-    patterned = _hold_line(times, new, CHANCE) | _follow_states(fit, new) | moves
+    patterned = _hold_line(times, new, CHANCE) | _follow_states(fit, new) | _moves(fit, times, left)
     patterned &= std > FLOOR
     samples, off = (problem.split(each) for each in (record.values, record.values - fit.path))
     # Slow residuals of a signal's size tell that the model ignores the signal.
@@ -154,14 +152,20 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     )
 
 
-def _rests(fit: TrajectoryFit, left: BySample) -> StateMask:
-    """True for measured states of which a path says next to no more than a steady drift does."""
-    record = fit.problem.all_records
+def _moves(
+    fit: TrajectoryFit, times: Sequence[Float[np.ndarray, " _"]], left: BySample
+) -> StateMask:
+    """True for measured states that a path leaves at rest, or drifting, though they are not white.
+
+    The path says next to no more of them than a steady drift does.
+    """
+    problem, record = fit.problem, fit.problem.all_records
     line = np.column_stack([np.ones(len(left)), record.times])
     beside_line = record.samples - line @ np.linalg.lstsq(line, record.samples, rcond=None)[0]
     squares = np.square(beside_line).sum(axis=0)
-    found: StateMask = np.square(left).sum(axis=0) > (1.0 - EXPLAINS) * squares
-    return found & fit.problem.measured
+    rests: StateMask = np.square(left).sum(axis=0) > (1.0 - EXPLAINS) * squares
+    samples = problem.split(record.samples[:, problem.measured])
+    return rests & problem.measured & ~are_white(times, samples, problem.split(left))
 
 
 def are_white(times: Sequence[Float[np.ndarray, " _"]], samples: Pieces, left: Pieces) -> StateMask:
