@@ -268,3 +268,49 @@ def test_samples_too_few_for_weak_rows_are_judged_by_none() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     found = discover(run.window(0, 12), polynomial(["x", "y"], degree=1), PLAIN)
     assert found.misfit == ""
+
+
+def noise_in_pieces(n: int, rng: np.random.Generator) -> list[Trajectory]:
+    """White noise about a drift in x and about a rest in y."""
+    t, states = np.arange(float(n)), rng.standard_normal((n, 2))
+    states[:, 0] += 5.0 * t
+    run = Trajectory(t, states, ["x", "y"])
+    return [run.window(0, n // 2), run.window(n // 2, n)]
+
+
+@pytest.mark.parametrize("recipe", [TrajectorySearch(), Regression(Weak()), *RECIPES], ids=repr)
+def test_what_a_model_leaves_at_rest_must_be_white_noise_by_any_method(recipe: AnyMethod) -> None:
+    """A noisy square wave of six samples to a turn, which rows take for noise."""
+    n, rng = 120, np.random.default_rng(0)
+    turns = np.sign(np.sin(np.arange(n))) + 0.1 * rng.standard_normal(n)
+    run = Trajectory(np.arange(float(n)), turns[:, None], ["x"])
+    constant = polynomial(["x"], degree=0)
+    found = discover(run, constant, recipe)
+    assert found.misfit
+    assert found.note == found.misfit
+    assert found.model.covariance is None
+    few = replace(run, states=rng.standard_normal((n, 1))).window(0, 20)
+    still = discover(few, constant, recipe)
+    assert still.misfit == ""
+    assert still.note.startswith("no law of x is found: about a steady course")
+    assert "but 20 are too few to tell" in still.note
+
+
+@pytest.mark.parametrize("recipe", [TrajectorySearch(), RECIPES[0]], ids=["joint", "regression"])
+def test_white_noise_about_a_steady_course_is_no_law(recipe: AnyMethod) -> None:
+    runs = noise_in_pieces(160, np.random.default_rng(1))
+    found = discover(runs, polynomial(["x", "y"], degree=0), recipe)
+    assert found.misfit == ""
+    assert found.noise_test.note in found.note
+    assert "no law of x and y is found" in found.note
+    assert "too few" not in found.note
+
+
+def test_a_rest_is_judged_by_the_instants_at_which_all_was_measured() -> None:
+    t, rng = np.arange(200.0), np.random.default_rng(2)
+    states = np.stack([np.cos(0.7 * t), rng.standard_normal(200)], axis=1)
+    missing = np.zeros((200, 2), dtype=np.bool_)
+    missing[::3, 1] = True
+    run = Trajectory(t, states, ["x", "y"], missing=missing)
+    found = discover(run, polynomial(["x", "y"], degree=0), PLAIN)
+    assert "leaves x at rest" in found.misfit or "noise of x'" in found.misfit

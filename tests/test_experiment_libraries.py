@@ -309,3 +309,19 @@ def test_a_sweep_can_go_to_slurm() -> None:
     launcher = config.hydra.launcher
     assert launcher._target_.endswith("SlurmLauncher")
     assert (launcher.cpus_per_task, launcher.tasks_per_node) == (8, 1)
+
+
+def test_a_state_that_shows_nothing_but_noise_has_no_law(tmp_path: Path) -> None:
+    x = np.random.default_rng(1).standard_normal(60)
+    text = "time,x\n" + "\n".join(f"{k},{value:.6f}" for k, value in enumerate(x))
+    (tmp_path / "noise.csv").write_text(text)
+    found = computed(
+        composed(
+            "+exp=discover", "data=recognised", f"data.path={tmp_path / 'noise.csv'}",
+            "data.units={time: s}", "trajectory.states=[x]", f"output={tmp_path}",
+        )
+    )  # fmt: skip
+    said = " ".join(found.log.split())
+    assert "Found with the library model: no law of any state" in said
+    assert "no law of x is found: about a steady course the samples pass for white noise" in said
+    assert "run freely from one sample over the record" not in said

@@ -9,14 +9,17 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
 from ep2sindy.data.coerce import Task
+from ep2sindy.data.gaps import mean_step
 from ep2sindy.data.trajectory import Trajectory, spread_blocks
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, NoiseTest
+from ep2sindy.estimation.noise import are_white
 from ep2sindy.forecasting.evaluation import size_text
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding, constraint
@@ -41,6 +44,10 @@ MAX_CHI_SQUARED, STANDARD_ERRORS = 1.2, 3.0
 # Samples that are tested, and those of one block. More would say the same: the standard error of
 # chi-squared is 2 % then.
 MOST_TESTED, BLOCK = 20_000, 4_000
+
+# With fewer samples, those of a state that moves may pass for white noise about a rest: one before
+# may foretell a quarter of the next one's variance, at the level of the test.
+TELL_REST = 35
 
 # Steps of weighting and correction of a final fit.
 N_STEPS = 8
@@ -134,17 +141,52 @@ def judge_noise(choice: Discovery, runs: Sequence[Trajectory]) -> NoiseTest:
     its rows are not. A state without such rows, for example for a record of a few samples, is not
     tested. Of long records, blocks of 20,000 samples together are tested.
     An estimate of states and coefficients together has tested whole trajectories already. It counts
-    only if the chosen model is its own.
+    only if the chosen model is its own. By whatever method, a measured state that the model leaves
+    at rest must show nothing but white noise there.
     """
-    estimate = choice.estimate
+    estimate, (moves, still) = choice.estimate, _judge_rest(choice.model, runs)
     if estimate is not None and estimate.model is choice.model:
-        return NoiseTest(misfit=estimate.misfit, tested=True)
+        misfit = estimate.misfit
+        return NoiseTest(misfit=misfit, tested=True, note="" if misfit else still)
     runs = runs if estimate is None else estimate.runs  # with hidden states
     states, tested, n_free = choice.model.states, choice.noise_test.left, choice.noise_test.n_free
     unknown = [state for state in states if state not in tested]
     found = {**tested, **(_test_on_weak_rows(choice, runs, unknown) if unknown else {})}
     ordered = {state: found[state] for state in states if state in found}
-    return NoiseTest(ordered, _describe_misfit(ordered, n_free), bool(ordered), n_free)
+    misfit = _describe_misfit(ordered, n_free) or moves
+    return NoiseTest(ordered, misfit, bool(ordered or misfit), n_free, "" if misfit else still)
+
+
+def _judge_rest(model: SparseModel, runs: Sequence[Trajectory]) -> tuple[str, str]:
+    """What is to be said of measured states that a model leaves at rest, or drifting at a rate.
+
+    If their samples are no white noise about that, why this is a misfit; and a note if they are, or
+    if they are too few to tell. Samples of instants at which all states were measured count.
+    """
+    terms = {s: model.terms(s) for s in model.states if s in runs[0].state_names}
+    rest = [s for s, own in terms.items() if set(own) <= {"1"}]
+    if not rest:
+        return "", ""
+    rates, times, samples = [terms[s].get("1", 0.0) for s in rest], [], []
+    for run in runs:
+        whole = slice(None) if run.missing is None else ~run.missing.any(axis=1)
+        times.append(run.t[whole])
+        samples.append(run.columns(list(terms))[whole])
+    step, n, own = mean_step(*times), sum(map(len, times)), [list(terms).index(s) for s in rest]
+    left = [x[:, own] - np.outer(t, rates) for t, x in zip(times, samples, strict=True)]
+    left = [each - each.mean(axis=0) for each in left]
+    white = are_white([t / step for t in times], samples, left)
+    names, moving = (" and ".join(compress(rest, each)) for each in (white, ~white))
+    few = f", but {n} are too few to tell" if n < TELL_REST else ""
+    return (
+        moving
+        and f"the model leaves {moving} at rest, but what was measured there is no white "
+        "noise: intervals are not given; add terms or states, or make states of one signal "
+        "(ep.embed, +exp=trace)",
+        names
+        and f"no law of {names} is found: about a steady course the samples pass for white "
+        f"noise{few}",
+    )
 
 
 def _test_on_weak_rows(

@@ -163,5 +163,5 @@ def _discover_point(
     # Intervals of a model that does not explain the data would not cover the truth.
     covariance = None if test.misfit else found.model.covariance
     model = replace(found.model, clock=task.runs[0].clock, covariance=covariance)
-    note = found.note or test.misfit
+    note = "; ".join(filter(None, [test.note, found.note or test.misfit]))
     return replace(found, model=model, method=method, noise_test=test, note=note)

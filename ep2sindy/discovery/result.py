@@ -45,13 +45,15 @@ class NoiseTest:
     as after a trajectory search, which tests whole trajectories.
     misfit: the reason why the model does not explain the data; empty if it does, or if nothing was
     tested. tested: False if nothing was tested. n_free: for each state named by a relation that
-    holds in the model, the number of free coefficients of its equation.
+    holds in the model, the number of free coefficients of its equation. note: on states without a
+    law, which rest or drift; empty if there are none.
     """
 
     left: Mapping[str, LeftOver] = field(default_factory=dict)
     misfit: str = ""
     tested: bool = False
     n_free: Mapping[str, int] = field(default_factory=dict)
+    note: str = ""
 
 
 @runtime_checkable

@@ -33,6 +33,8 @@ CHANCE = 1e-5  # that noise holds a line as clean as one that is called the mode
 # is left of one that a model leaves at rest must be white, to a level of one record in 200: nobody
 # measures what does not move. A path that explains less of the samples' variance leaves it there.
 CHANCE_AT_REST, EXPLAINS = 5e-3, 0.1
+# Samples before, from which the next is foretold: a turn shows in two of them, also in few samples.
+BEFORE = (1, 2)
 # Degrees above the library's, and number, of the products of states that residuals are compared
 # with; and standard errors by which these may explain more of random residuals than their number.
 MORE_DEGREES, MAX_POWERS, FOLLOWS = 2, 60, 6.0
@@ -120,17 +122,16 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
         left = _expected_residuals(fit, std)
     unit = problem.split(left / shape)
     memory = _memory(unit)
-    rests = _rests(fit, left)
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
     new = [np.concatenate([e[:1], e[1:] - memory * e[:-1]]) for e in unit]
-    holds = _hold_line(problem, new, np.where(rests, CHANCE_AT_REST, CHANCE))
-    patterned = holds | _follow_states(fit, new) | (rests & _foretold(problem, left))
+    times = [each.times for each in problem.records]
+    patterned = _hold_line(times, new, CHANCE) | _follow_states(fit, new) | _moves(fit, times, left)
     patterned &= std > FLOOR
     samples, off = (problem.split(each) for each in (record.values, record.values - fit.path))
     # Slow residuals of a signal's size tell that the model ignores the signal.
     ignored = (memory > SLOW) & (std > LARGE * record.samples.std(axis=0))
     lasts = _lasts_as_noise(unit, samples, off, std, memory, float(problem.n_samples))
-    believed = shows & lasts & ~ignored & ~patterned & ~rests
+    believed = shows & lasts & ~ignored & ~patterned
     std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std[~hidden]).mean()
@@ -151,32 +152,51 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     )
 
 
-def _rests(fit: TrajectoryFit, left: BySample) -> StateMask:
-    """True for measured states of which a path says next to no more than a steady drift does."""
-    record = fit.problem.all_records
+def _moves(
+    fit: TrajectoryFit, times: Sequence[Float[np.ndarray, " _"]], left: BySample
+) -> StateMask:
+    """True for measured states that a path leaves at rest, or drifting, though they are not white.
+
+    The path says next to no more of them than a steady drift does.
+    """
+    problem, record = fit.problem, fit.problem.all_records
     line = np.column_stack([np.ones(len(left)), record.times])
     beside_line = record.samples - line @ np.linalg.lstsq(line, record.samples, rcond=None)[0]
     squares = np.square(beside_line).sum(axis=0)
-    found: StateMask = np.square(left).sum(axis=0) > (1.0 - EXPLAINS) * squares
-    return found & fit.problem.measured
+    rests: StateMask = np.square(left).sum(axis=0) > (1.0 - EXPLAINS) * squares
+    samples = problem.split(record.samples[:, problem.measured])
+    return rests & problem.measured & ~are_white(times, samples, problem.split(left))
 
 
-def _foretold(problem: EstimationProblem, left: BySample) -> StateMask:
-    """True for residuals that the samples of all states one step before foretell (F test)."""
+def are_white(times: Sequence[Float[np.ndarray, " _"]], samples: Pieces, left: Pieces) -> StateMask:
+    """True for states of which what a model leaves is white; false for one in a hundred that is.
+
+    It holds no line, and the samples of all states, one or two steps before, do not foretell it
+    (F tests). times: of the pieces of records, in mean steps.
+    """
+    found = _hold_line(times, left, CHANCE_AT_REST)
+    for n_before in BEFORE:
+        chance = _chance_foretold(samples, left, n_before)
+        found |= chance < CHANCE_AT_REST / len(BEFORE)
+    return ~found
+
+
+def _chance_foretold(samples: Pieces, left: Pieces, n_before: int) -> ByState:
+    """Chance that samples before foretell white residuals as well as these; 1 for too few."""
     from scipy.special import fdtrc  # imported only where it is needed
 
-    record = problem.all_records
-    kept = np.delete(np.arange(len(left) - 1), record.breaks)
-    before = record.samples[kept][:, problem.measured]
+    before = np.concatenate(
+        [np.hstack([e[k : len(e) - n_before + k] for k in range(n_before)]) for e in samples]
+    )
+    own = np.concatenate([each[n_before:] for each in left])
     n, p = before.shape
     if n < p + 3:
-        return np.zeros(left.shape[1], dtype=np.bool_)
-    own = left[kept + 1] - left[kept + 1].mean(axis=0)
+        return np.ones(own.shape[1])
+    own = own - own.mean(axis=0)
     basis = np.linalg.qr(before - before.mean(axis=0))[0]
     share = np.square(basis.T @ own).sum(axis=0) / np.maximum(np.square(own).sum(axis=0), TINY)
     ratio = share / p / np.maximum(1.0 - share, TINY) * (n - p - 1)
-    found: StateMask = fdtrc(p, n - p - 1, ratio) < CHANCE_AT_REST
-    return found
+    return np.asarray(fdtrc(p, n - p - 1, ratio))
 
 
 def are_noise(samples: Pieces, left: Pieces, n: float) -> StateMask:
@@ -295,18 +315,18 @@ def _deviance(fit: TrajectoryFit) -> float:
     return spread + n * np.log(max(least, TINY) / n)
 
 
-def _hold_line(problem: EstimationProblem, new: Sequence[np.ndarray], chance: ByState) -> StateMask:
+def _hold_line(times: Sequence[Float[np.ndarray, " _"]], new: Pieces, chance: float) -> StateMask:
     """True if whitened residuals hold a cleaner line than noise: the model ignores an oscillation.
 
-    chance: for each state, that noise holds one in any of the records. Of white residuals the m
+    chance: that noise holds one in any of the pieces. Of white residuals the m
     ordinates of a periodogram are alike: the largest has more than a share g of their sum with a
     probability of at most m (1 - g)^(m - 1).
     Source: Fisher 1929, doi:10.1098/rspa.1929.0151.
     """
-    held = np.zeros(len(problem.states), dtype=np.bool_)
-    for record, each in zip(problem.records, new, strict=True):
+    held = np.zeros(new[0].shape[1], dtype=np.bool_)
+    for t, each in zip(times, new, strict=True):
         # Samples at unequal steps go to the nearest of equal ones.
-        place = np.rint(record.times - record.times[0]).astype(np.int64)
+        place = np.rint(t - t[0]).astype(np.int64)
         placed = np.zeros((place[-1] + 1, each.shape[1]))
         np.add.at(placed, place, each)
         power = np.square(np.abs(np.fft.rfft(placed, axis=0)[1 : (len(placed) + 1) // 2]))

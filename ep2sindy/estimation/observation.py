@@ -47,14 +47,14 @@ class Observation:
     Of y a record has the value, a pair of limits, or nothing (`ScaledRecord`), whatever the other
     parts are. delays: (d,), in mean steps. process: (d,), scaled; zero for an exact trajectory.
     price: of the parameters that are not zero, on the scale of -2 log likelihood. delay_errors:
-    (d,), standard errors of the delays; zero without any.
+    (d,), standard errors of the delays; None without any.
     """
 
     noise: Noise
     delays: ByState
     process: ByState
     price: float = 0.0
-    delay_errors: ByState | float = 0.0
+    delay_errors: ByState | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +252,8 @@ def shift_channels(
 
 def delay_words(problem: EstimationProblem, observed: Observation) -> str:
     """Delays in words, `z comes 0.0033 s late (0.99 ± 0.02 samples)`, for every delayed state."""
-    errors = HALF_WIDTH * (observed.delay_errors + np.zeros(len(problem.states)))
+    assert observed.delay_errors is not None  # of states that come late
+    errors = HALF_WIDTH * observed.delay_errors
     parts = [
         f"{state} comes {abs(delay) * problem.step_s:.3g} s {'late' if delay > 0.0 else 'early'} "
         f"({abs(delay):.2f} ± {error:.1g} samples)"

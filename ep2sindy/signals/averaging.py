@@ -36,7 +36,7 @@ def average_alike(
     """Runs with their samples replaced by means over neighbours, and what was done, in words.
 
     decimate: number of samples that a mean is over; "auto" leaves a hundred to a period of the
-    fastest variable, None leaves all. States and inputs are averaged alike: the mean of a state
+    fastest state, None leaves all. States and inputs are averaged alike: the mean of a state
     follows the mean of what drives it. No mean crosses a gap, and an incomplete group at the end of
     a stretch is dropped. Runs with missing samples stay as they are, since those of a slower
     channel would be averaged over other times.

@@ -133,6 +133,7 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
     if not living:
         runs = {name: worst_run(each.runs) for name, each in results.items()}
         best = best_run(runs)
+        test = results[best].discovery.noise_test
         return found_model(
             f"Found with the library {best}",
             runs[best],
@@ -141,7 +142,8 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
             skill=results[best].skill,
             where=f"the worst of {n_records} records" if n_records > 1 else "the record",
             seen=True,
-            misfit=results[best].discovery.misfit,
+            misfit=test.misfit,
+            more=[Text(test.note, warning=True)] if test.note else [],
             held=results[best].discovery.constraint,
         )
     best = best_run({name: each.run for name, each in living.items()})

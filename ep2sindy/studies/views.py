@@ -151,12 +151,15 @@ def found_model(
     clock, model = run.rollout.clock, run.model
     fate = _fate(run, seen=seen, misfit=misfit)
     free = run_words(run) if skill is None else f"{fate}; {run_words(run)}"
+    headline = f"a model that {fate}" if skill is None else skill.headline
+    freely = [f"run freely from one sample over {where}: {free}", *run.rest_texts]
+    if not model.coef.any():
+        headline, freely = "no law of any state", []
     return Result(
-        f"{found}: {f'a model that {fate}' if skill is None else skill.headline}",
+        f"{found}: {headline}",
         [
             *equations(model, clock, held=held),
-            Text(f"run freely from one sample over {where}: {free}"),
-            *map(Text, run.rest_texts),
+            *map(Text, freely),
             *([Text(misfit, warning=True)] if misfit else []),
             *more,
         ],
