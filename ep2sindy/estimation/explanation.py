@@ -328,7 +328,7 @@ def _next_library(problem: EstimationProblem) -> str:
 
 def _misfit(found: Solution) -> str:
     """Why a solution does not explain the samples, and what to do."""
-    states, explained = found.problem.states, found.explained
+    states, explained = found.problem.states, found.explained & found.problem.measured
     tried = _wider(found.problem, SMALL) is not None
     next_one = f"try {_next_library(found.problem)}"
     more = "products of one degree more do not help" if tried else next_one
