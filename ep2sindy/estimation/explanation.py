@@ -2,7 +2,8 @@
 
 Each is a `Solution` under another `Observation`, and the one of least rank is reported. The search
 for an exact trajectory starts from smoothed states. If what it finds does not fit, it starts again
-from states under process noise, and then from other smoothings.
+from states under process noise, and then from other smoothings. Hidden states are first sought
+under process noise: if even that leaves more than one of the states unexplained, the search ends.
 """
 
 from __future__ import annotations
@@ -51,6 +52,10 @@ from ep2sindy.estimation.supports import best_support
 from ep2sindy.estimation.working_set import admit_terms, first_set, search_within
 from ep2sindy.runtime.progress import SILENT
 from ep2sindy.trust.interruption import is_interruption
+
+# States that a search for hidden ones under process noise may leave unexplained, for an exact
+# trajectory to be looked for: one takes whatever the equations of the others lack.
+MOST_LEFT = 1
 
 ADVICE = (
     "Name a hidden state (hidden=[...]), embed one signal (+exp=trace), or measure another state"
@@ -134,8 +139,15 @@ def _explanation(
 
 def _explain(problem: EstimationProblem, align: bool, *, wider: bool) -> Explanation:
     """`explain` without a limit to its time. wider: True allows equations to have more terms."""
-    first = _search_by_size(on_likeliest_courses(problem), wider=wider)
-    exact, best = _compare(first)
+    problem, first, under_noise = on_likeliest_courses(problem), None, None
+    if not problem.measured.all():
+        under_noise = _solve_under_noise(problem)
+        if (~under_noise.explained).sum() > MOST_LEFT:
+            return _explanation(under_noise, _misfit(under_noise))
+        first = settle(under_noise.fit)
+    if first is None or not first.fits:
+        first = _best(_search_by_size(problem, wider=wider), first)
+    exact, best = _compare(first, under_noise)
     observed = best.observation
     if observed.delays.any() and (other := _on_other_courses(problem, exact)):
         exact = best = other
@@ -167,17 +179,20 @@ def _on_other_courses(problem: EstimationProblem, late: Solution) -> Solution | 
     return None
 
 
-def _compare(first: Solution) -> tuple[Solution, Solution]:
+def _solve_under_noise(problem: EstimationProblem) -> Solution:
+    with problem.monitor.stage("process noise"):
+        return solve_with_process_noise(problem)
+
+
+def _compare(first: Solution, under_noise: Solution | None) -> tuple[Solution, Solution]:
     """The best exact solution of the samples as they are, and the best under any observation.
 
-    first: from smoothed states.
+    first: the best so far. under_noise: with process noise, if `first` knows of it.
     """
-    problem, under_noise = first.problem, None
-    exact = first
-    if not first.fits:
-        with problem.monitor.stage("process noise"):
-            under_noise = solve_with_process_noise(problem)
-            exact = _best(first, settle(under_noise.fit))
+    problem, exact = first.problem, first
+    if not first.fits and under_noise is None:
+        under_noise = _solve_under_noise(problem)
+        exact = _best(first, settle(under_noise.fit))
         problem.monitor.best = exact
     best = _best(exact, _align(first))
     if best is not exact:
@@ -289,8 +304,11 @@ def _lacks_terms(found: Solution) -> str:
 
 
 def _wider(problem: EstimationProblem, most: int) -> EstimationProblem | None:
-    """The problem with products of one degree more, if it has no more terms; None without any."""
-    if problem.widen is None or problem.candidates.required.all():  # all terms are given
+    """The problem with products of one degree more, if it has no more terms; None without any.
+
+    Of hidden states they are not tried: every way in which these may enter would be searched again.
+    """
+    if problem.widen is None or not problem.measured.all() or problem.candidates.required.all():
         return None
     wider = problem.widen()
     if len(wider.library) > most or not wider.enough_samples:
@@ -310,7 +328,7 @@ def _next_library(problem: EstimationProblem) -> str:
 
 def _misfit(found: Solution) -> str:
     """Why a solution does not explain the samples, and what to do."""
-    states, explained = found.problem.states, found.explained
+    states, explained = found.problem.states, found.explained & found.problem.measured
     tried = _wider(found.problem, SMALL) is not None
     next_one = f"try {_next_library(found.problem)}"
     more = "products of one degree more do not help" if tried else next_one

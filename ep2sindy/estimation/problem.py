@@ -133,7 +133,9 @@ class ScaledRecord:
     def divided(self, n_substeps: int) -> Steps:
         """The steps, each divided into equal substeps."""
         shares = np.linspace(0.0, 1.0, 2 * n_substeps + 1)
-        inputs = np.array([self.inputs_at(share) for share in shares.tolist()])
+        inputs = np.zeros((len(shares), len(self.steps), 0))
+        if self.inputs.shape[1]:
+            inputs = np.array([self.inputs_at(share) for share in shares.tolist()])
         return Steps(self.steps / n_substeps, inputs)
 
     @cached_property

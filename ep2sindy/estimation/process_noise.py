@@ -45,6 +45,7 @@ LAGS = range(1, 9)  # at which innovations are correlated with themselves
 # Standard errors that random innovations may show: see `_test_innovations`.
 MOST_SHOWN = (5.0, 4.0, 6.0)
 COLLINEAR = 1e-3  # share of a product that is left beside an equation's terms, if it is another
+LASTING = "what pushes {state} at random is not random"
 RUNAWAY = 1e6  # innovations, in RMS of the states, of a model that follows no samples
 # RMS defect of a step, in process noise: the likeliest is smaller than the true one.
 MAX_DEFECT = 3.0
@@ -114,7 +115,8 @@ def _test_defects(fit: TrajectoryFit) -> LackOfFit:
     """
     defects = fit.squared_defects / len(fit.path)
     allowed = MAX_DEFECT**2 * fit.process[0] + np.square(EXACT * fit.noise[0])
-    return LackOfFit(np.where(fit.has_law, np.sqrt(defects / allowed), np.inf), 1.0)
+    size = np.where(fit.has_law, np.sqrt(defects / allowed), np.inf)
+    return LackOfFit(size, 1.0, "{state} does not follow its equation, not even under pushes")
 
 
 def process_noise_words(solution: Solution) -> str:
@@ -139,12 +141,12 @@ def _test_innovations(fit: TrajectoryFit) -> list[LackOfFit]:
     new = [part[SETTLING:] for part in problem.split(found)]
     joined = np.concatenate(new)
     if not (np.abs(joined) < RUNAWAY).all():
-        return [LackOfFit(np.full(joined.shape[1], np.inf), MOST_SHOWN[0])]
+        return [LackOfFit(np.full(joined.shape[1], np.inf), MOST_SHOWN[0], LASTING)]
     lasting = np.sqrt(len(joined)) * np.abs(autocorrelations(new, LAGS)).max(axis=0)
     before = np.concatenate([path[SETTLING - 1 : -1] for path in fit.paths])
     powers = powers_of(before, int(problem.candidates.library.degrees.max()) + MORE_DEGREES)
     shown = lasting, _largest_share(fit, before, powers, joined), excess_explained(powers, joined)
-    return [LackOfFit(each, most) for each, most in zip(shown, MOST_SHOWN, strict=True)]
+    return [LackOfFit(each, most, LASTING) for each, most in zip(shown, MOST_SHOWN, strict=True)]
 
 
 def _largest_share(
