@@ -1,8 +1,9 @@
 """Models selected by free run on the package's own source: `python -m benchmarks.living`.
 
 Equations that conserve what ions and neutrals of the whole channel exchange, as `+exp=breathing`
-finds them: over operating points, splits of the record and seeds, on the default source and on the
-former one; beside free terms, in other zones, in several at once (`several`, `three`), in
+finds them: over operating points, splits of the record and seeds, on the default source, on the
+former one, and on `thruster=lif`, whose ions flow back (`lif`, `lif_law`, `lif_law_told`); beside
+free terms, in other zones, in several at once (`several`, `three`), in
 noise, and from the (z, r) simulator. Every model called living is run again by another
 solver, ten times as long; its processes are compared with the balance of the zone. Prints the
 tables of docs/living.md; name some to print those alone.
@@ -25,6 +26,7 @@ import xarray as xr
 from scipy.integrate import solve_ivp
 
 import ep2sindy as ep
+from benchmarks.source import measured_sets
 from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.roles import shares_of, sum_known
@@ -80,7 +82,8 @@ LAW_TOLD = replace(
     exchange=[("n_n", "n_i", ["n_i*n_n", "n_i^2*n_n", "n_i*n_n^2"]), ("n_i", "n_n", "known")],
     outflow={"n_i": ["n_i", "n_i^2"], "n_n": "known"},
 )
-SETS = {"default": ep.thruster.Thruster(), "former": FORMER}
+LIF, LIF_SPEED = measured_sets()["lif"]
+SETS = {"default": ep.thruster.Thruster(), "former": FORMER, "lif": LIF}
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,17 @@ def field(label: str, name: str = "default") -> xr.Dataset:
     point = POINTS[label]
     if name == "former":
         point = replace(point, neutral_speed=FORMER_SPEED.get(label, 280.0))
+    if name == "lif":
+        point = replace(point, neutral_speed=LIF_SPEED)
     return ep.thruster.simulate(SETS[name], point, cache=True, progress=False)
+
+
+def oscillating(name: str) -> list[str]:
+    """The operating points at which a set oscillates."""
+    steady = [label for label in POINTS if field(label, name).attrs["status"] == "steady"]
+    if steady:
+        print(f"steady: {', '.join(steady)}")
+    return [label for label in POINTS if label not in steady]
 
 
 @cache
@@ -346,7 +359,7 @@ def print_points(
     words = "equations that conserve" if search is conserving else "free terms"
     print(f"\n{name} source, whole channel, {words}: median / worst of {len(draws)} draws")
     everything = []
-    for label in POINTS:
+    for label in oscillating(name):
         whole = record(label, CHANNEL, name)
         cases = [case(*parts(whole.run, s), whole, seed=seed, search=search) for s, seed in draws]
         everything += cases
@@ -354,11 +367,11 @@ def print_points(
     print(line("all", everything))
 
 
-def print_law(search: Callable) -> None:
+def print_law(search: Callable, name: str = "default") -> None:
     """Six operating points, terms that are given: the worst of three splits, and coefficients."""
     print(f"\n{search.__doc__} Coefficients over those of the record: medians of the splits")
-    for label in POINTS:
-        whole, ratios, cases, verdicts = record(label), [], [], []
+    for label in oscillating(name):
+        whole, ratios, cases, verdicts = record(label, CHANNEL, name), [], [], []
         for split, seed in ONCE:
             cases.append(case(*parts(whole.run, split), whole, seed=seed, search=search))
             found = search(parts(whole.run, split)[0], whole, seed=seed)
@@ -485,6 +498,9 @@ def main() -> None:
         "law_told": lambda: print_law(law_told),
         "profiles": print_profiles,
         "former": lambda: print_points("former", draws=ONCE),
+        "lif": lambda: print_points("lif", search=told, draws=ONCE),
+        "lif_law": lambda: print_law(law, "lif"),
+        "lif_law_told": lambda: print_law(law_told, "lif"),
         "free": lambda: print_points(search=free),
         "zones": print_zones,
         "several": lambda: print_several(2, ONCE),

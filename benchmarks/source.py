@@ -1,7 +1,8 @@
 """How far the embedded thruster model can be relied on: `python -m benchmarks.source`.
 
 One cycle at every operating point, from hard and soft starts, on several grids and time steps;
-balances; no alternation of T_e; and the cycles beside the default set.
+balances; no alternation of T_e; the cycles beside the default set; and what is measured of an
+SPT-100 beside what the default set and `thruster=lif` have.
 Prints the tables of docs/thruster.md; tests/test_thruster_reference.py holds them.
 """
 
@@ -9,11 +10,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 import ep2sindy as ep
 from ep2sindy.library.library import named_terms
@@ -38,6 +42,32 @@ VARIANTS: dict[str, dict] = {
 }
 NEIGHBOURS = (90, 80, 74, 69, 64, 58)  # 1/c2; the default is 69
 
+# Mean axial speed of the ions in km/s by laser-induced fluorescence, at distances from the anode in
+# mm, at 300 V, 5.16 mg/s and two pressures of the facility, 1.7e-5 and 3.5e-5 Torr; to 0.5 km/s.
+# Source: MacDonald-Tenenbaum et al. 2019, doi:10.2514/1.B37133, as tabulated in
+# JANUS-Institute/HallThrusterPEM; at 49 mm, the mean of its values at 47 and 51 mm.
+LIF_POINT = (300.0, 5.16)
+LIF: Mapping[float, tuple[float, float]] = {
+    9.0: (-1.02, -1.02), 13.0: (-1.09, -0.90), 17.0: (-1.07, 0.90), 21.0: (-0.11, 7.30),
+    25.0: (6.54, 12.69), 29.0: (12.28, 15.60), 35.0: (14.60, 17.27), 43.0: (17.13, 18.16),
+    49.0: (17.65, 18.30),
+}  # fmt: skip
+# Current in A and the least and largest thrust in mN at a voltage and an anode flow in mg/s.
+# Source: Sankovic, Hamley & Haag 1993, IEPC-93-094, as tabulated in the same place: all rows
+# within 1 % in flow at no more than 2e-5 Torr.
+PERFORMANCE: Mapping[tuple[float, float], tuple[float, tuple[float, float]]] = {
+    (300.0, 5.13): (4.55, (72.6, 85.7)),
+    (300.0, 4.17): (3.67, (64.1, 69.1)),
+    (300.0, 5.62): (5.00, (91.7, 95.4)),
+    (250.0, 5.11): (4.50, (70.0, 76.2)),
+    (250.0, 4.15): (3.50, (57.4, 59.1)),
+    (201.0, 5.05): (4.50, (58.4, 64.1)),
+    (201.0, 4.10): (3.49, (47.1, 50.1)),
+}
+NEAR_KM_S = 2.0
+LIF_SPEED = 225.0  # m/s, of the neutrals
+CHECKED = ("guessed start, N = 100", "hard start", "soft start", "N = 200")
+
 
 @cache
 def full_run(label: str, variant: str, *, warm_up_s: float = 4e-3, duration_s: float = 4e-3):
@@ -46,6 +76,31 @@ def full_run(label: str, variant: str, *, warm_up_s: float = 4e-3, duration_s: f
         ep.thruster.Thruster(), POINTS[label], duration_s=duration_s, warm_up_s=warm_up_s,
         progress=False, **VARIANTS[variant],
     )  # fmt: skip
+
+
+@cache
+def measured_sets() -> dict[str, tuple[ep.thruster.Thruster, float]]:
+    """The default set and `thruster=lif`, each with its speed of the neutrals in m/s."""
+    path = Path(__file__).resolve().parents[1] / "conf" / "thruster" / "lif.yaml"
+    return {
+        "default": (ep.thruster.Thruster(), 338.0),
+        "lif": (instantiate(OmegaConf.load(path)), LIF_SPEED),
+    }
+
+
+def at_point(name: str, voltage: float, flow_mg_s: float, **how: object) -> xr.Dataset:
+    """4 ms of one of the sets, after 4 ms that are not kept."""
+    thruster, speed = measured_sets()[name]
+    point = ep.thruster.OperatingPoint(voltage, flow_mg_s, neutral_speed=speed)
+    return ep.thruster.simulate(
+        thruster, point, duration_s=4e-3, warm_up_s=4e-3, progress=False, **how
+    )
+
+
+def mean_speed_km_s(run: xr.Dataset) -> np.ndarray:
+    """Mean ion flux over mean density at the places of `LIF`, as a laser sees the ions."""
+    speed = (run["n_i"] * run["u_iz"]).mean("time") / run["n_i"].mean("time")
+    return 1e-3 * speed.interp(z=1e-3 * np.array(list(LIF))).values
 
 
 def zone_coefficients(run: xr.Dataset) -> np.ndarray:
@@ -116,6 +171,36 @@ def print_balances() -> None:
         print(f"{label:10s} {residual:.1e}  {share:.5f}  {mass:.7f}  {energy:.7f}  {turns:.1e} eV")
 
 
+def print_measured() -> None:
+    """What is measured of an SPT-100, and what both sets have."""
+    print("\nion speed (km/s) at 300 V, 5.16 mg/s: at two pressures, and simulated")
+    speeds = {name: mean_speed_km_s(at_point(name, *LIF_POINT)) for name in measured_sets()}
+    print("mm from the anode" + "".join(f"{z:8.0f}" for z in LIF))
+    for k in range(2):
+        print(f"measured {k + 1}       " + "".join(f"{pair[k]:8.1f}" for pair in LIF.values()))
+    low, high = np.sort(np.array(list(LIF.values())), axis=1).T
+    for name, speed in speeds.items():
+        off = np.maximum(np.maximum(low - speed, speed - high), 0.0)
+        cells = "".join(f"{value:8.1f}" for value in speed)
+        print(f"{name:17s}{cells}   {(off <= NEAR_KM_S).sum()} of {len(LIF)} within 2 km/s")
+    print("\nI_d (A), off; thrust (mN), off the mean of the two; std over mean; frequency (kHz)")
+    for (voltage, flow), (current_A, thrusts) in PERFORMANCE.items():
+        known = f"{current_A:.2f} A, {thrusts[0]:.1f} to {thrusts[1]:.1f} mN"
+        print(f"{voltage:.0f} V, {flow:.2f} mg/s: measured {known}")
+        for name in measured_sets():
+            a = at_point(name, voltage, flow).attrs
+            mean, thrust = a["I_d_mean"], 1e3 * a["thrust_N"]
+            print(
+                f"    {name:8s} {mean:.2f} ({100.0 * (mean / current_A - 1.0):+.0f} %); "
+                f"{thrust:.1f} ({100.0 * (thrust / np.mean(thrusts) - 1.0):+.0f} %); "
+                f"{a['I_d_std'] / mean:.2f}; {a['f_kHz']:.2f}; {a['status']}"
+            )
+    print("\nI_d mean / std (A) / frequency (kHz) of the set lif")
+    for voltage, flow in (LIF_POINT, (300.0, 4.0), (200.0, 5.0), (400.0, 5.0)):
+        cells = [row(at_point("lif", voltage, flow, **VARIANTS[name])) for name in CHECKED]
+        print(f"{voltage:.0f} V, {flow:g} mg/s" + "".join(f" | {cell}" for cell in cells))
+
+
 def print_neighbours() -> None:
     """Which cycle a guessed and a hard start reach beside the default set."""
     print("\nI_d std (A) / f (kHz) from a guessed | a hard start, 4 to 8 ms, by c2")
@@ -169,10 +254,11 @@ def rms_off_parabola(x: np.ndarray, values: np.ndarray) -> float:
 
 
 def main() -> None:
-    """Print every table, or those that are named: cycles, balances, neighbours, smoothness."""
+    """Print every table, or those that are named: cycles, balances, neighbours, smoothness,
+    measured."""
     parts: dict[str, Callable[[], None]] = {
         "cycles": print_cycles, "balances": print_balances, "neighbours": print_neighbours,
-        "smoothness": print_smoothness,
+        "smoothness": print_smoothness, "measured": print_measured,
     }  # fmt: skip
     for name in sys.argv[1:] or parts:
         began = time.process_time()

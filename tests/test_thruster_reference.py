@@ -5,9 +5,15 @@ import pytest
 
 from benchmarks.source import (
     DOWNSTREAM,
+    LIF,
+    LIF_POINT,
+    NEAR_KM_S,
+    PERFORMANCE,
     POINTS,
     alternation_eV,
+    at_point,
     full_run,
+    mean_speed_km_s,
     zone_coefficients,
 )
 from ep2sindy.thruster.balance import zone_balance
@@ -66,3 +72,18 @@ def test_balances_close(label):
 @pytest.mark.parametrize("label", ["300V_5mgs", "400V_5mgs"])
 def test_the_temperature_does_not_alternate_from_step_to_step(label):
     assert alternation_eV(label) < 0.01
+
+
+def test_the_set_lif_has_the_measured_speeds_of_the_ions():
+    low, high = np.sort(np.array(list(LIF.values())), axis=1).T
+    speed = mean_speed_km_s(at_point("lif", *LIF_POINT))
+    assert (np.maximum(low - speed, speed - high) <= NEAR_KM_S).sum() >= 8
+
+
+@pytest.mark.parametrize(("point", "known"), PERFORMANCE.items())
+def test_the_set_lif_has_the_measured_current_and_thrust(point, known):
+    current_A, thrusts = known
+    run = at_point("lif", *point)
+    assert run.attrs["status"] == "oscillating"
+    assert run.attrs["I_d_mean"] == pytest.approx(current_A, rel=0.15 if point[0] < 250 else 0.08)
+    assert 1e3 * run.attrs["thrust_N"] == pytest.approx(np.mean(thrusts), rel=0.12)
