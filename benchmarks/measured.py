@@ -114,10 +114,14 @@ def show(name: str, found: Traced | str, horizons: dict[str, float]) -> None:
         print(f"  {words} ahead: {found.at(horizon)}")
     if forecast := found.summary.get("forecasts", {}).get("trace"):
         print(f"  {forecast['text']}: {is_true(forecast)}")
-        held = forecast["coverage_90"]
-        print(
-            "  no bands" if held is None else f"  bands of 90 % hold {100 * held:.0f} %", flush=True
-        )
+        print(f"  {told_of_bands(forecast['coverage_90'])}", flush=True)
+
+
+def told_of_bands(held: float | None) -> str:
+    """How much of the samples bands of 90 % hold; None or NaN if none are shown."""
+    if held is None or not np.isfinite(held):
+        return "no bands"
+    return f"bands of 90 % hold {100 * held:.0f} %"
 
 
 def is_true(forecast: dict[str, Any]) -> str:
@@ -160,9 +164,7 @@ def sentences() -> None:
         forecast = found.summary.get("forecasts", {}).get("trace")
         if forecast and forecast["coverage_90"] is not None:
             held.append(100 * forecast["coverage_90"])
-            bands = f"bands of 90 % hold {held[-1]:.0f} %"
-        else:
-            bands = "no bands"
+        bands = told_of_bands(forecast["coverage_90"] if forecast else None)
         slow.append(found.cpu_s)
         print(f"  {told}\n  {'; '.join(faults) or 'true'}; {bands}; {found.cpu_s:.1f} CPU-s")
         print(end="", flush=True)
@@ -343,7 +345,7 @@ def populations() -> None:
                 skill = ep.model.forecast_skill(found.model, run, n_fitted=n_fitted)
                 print(f"  {skill.text}; one step ahead {skill.at(run.dt_s)}")
                 print(f"  {is_true(skill.summary())}")
-                print(f"  bands of 90 % hold {100 * skill.coverage_90:.0f} %", flush=True)
+                print(f"  {told_of_bands(skill.coverage_90)}", flush=True)
 
 
 def current() -> None:
