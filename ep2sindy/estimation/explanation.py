@@ -3,7 +3,7 @@
 Each is a `Solution` under another `Observation`, and the one of least rank is reported. The search
 for an exact trajectory starts from smoothed states. If what it finds does not fit, it starts again
 from states under process noise, and then from other smoothings. Hidden states are first sought
-under process noise: if even that leaves more than one of the states unexplained, the search ends.
+under process noise, since their guesses are far off.
 """
 
 from __future__ import annotations
@@ -52,10 +52,6 @@ from ep2sindy.estimation.supports import best_support
 from ep2sindy.estimation.working_set import admit_terms, first_set, search_within
 from ep2sindy.runtime.progress import SILENT
 from ep2sindy.trust.interruption import is_interruption
-
-# States that a search for hidden ones under process noise may leave unexplained, for an exact
-# trajectory to be looked for: one takes whatever the equations of the others lack.
-MOST_LEFT = 1
 
 ADVICE = (
     "Name a hidden state (hidden=[...]), embed one signal (+exp=trace), or measure another state"
@@ -142,8 +138,6 @@ def _explain(problem: EstimationProblem, align: bool, *, wider: bool) -> Explana
     problem, first, under_noise = on_likeliest_courses(problem), None, None
     if not problem.measured.all():
         under_noise = _solve_under_noise(problem)
-        if (~under_noise.explained).sum() > MOST_LEFT:
-            return _explanation(under_noise, _misfit(under_noise))
         first = settle(under_noise.fit)
     if first is None or not first.fits:
         first = _best(_search_by_size(problem, wider=wider), first)

@@ -19,6 +19,7 @@ from ep2sindy.runtime.screen import joined
 
 # A record in pieces of different lengths, by sample and state.
 Pieces = Sequence[Float[np.ndarray, "_ d"]]
+OtherPieces = Sequence[Float[np.ndarray, "_ _"]]  # of other states than those that are judged
 
 FLOOR = 1e-3  # least noise, as a share of the RMS: no model and no integration is exact
 SIGNIFICANT = 3.5  # standard errors of an autocorrelation
@@ -168,7 +169,9 @@ def _moves(
     return rests & problem.measured & ~are_white(times, samples, problem.split(left))
 
 
-def are_white(times: Sequence[Float[np.ndarray, " _"]], samples: Pieces, left: Pieces) -> StateMask:
+def are_white(
+    times: Sequence[Float[np.ndarray, " _"]], samples: OtherPieces, left: Pieces
+) -> StateMask:
     """True for states of which what a model leaves is white; false for one in a hundred that is.
 
     It holds no line, and the samples of all states, one or two steps before, do not foretell it
@@ -181,7 +184,7 @@ def are_white(times: Sequence[Float[np.ndarray, " _"]], samples: Pieces, left: P
     return ~found
 
 
-def _chance_foretold(samples: Pieces, left: Pieces, n_before: int) -> ByState:
+def _chance_foretold(samples: OtherPieces, left: Pieces, n_before: int) -> ByState:
     """Chance that samples before foretell white residuals as well as these; 1 for too few."""
     from scipy.special import fdtrc  # imported only where it is needed
 
