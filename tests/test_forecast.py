@@ -171,7 +171,8 @@ def test_no_band_is_shown_where_none_can_be_told() -> None:
     t = 0.1 * np.arange(600)
     noise = 0.01 * np.random.default_rng(0).standard_normal((600, 2))
     run = Trajectory(t, damped.simulate(t, [1.0, 0.0]).states + noise, ("x", "v"))
-    assert 0.8 <= ep.model.forecast_skill(damped, run, n_fitted=450).coverage_90 <= 0.97
+    # Of what decays, later errors are not those of the past.
+    assert np.isnan(ep.model.forecast_skill(damped, run, n_fitted=450).coverage_90)
 
 
 def test_a_state_that_was_not_measured_is_fitted_by_the_model() -> None:

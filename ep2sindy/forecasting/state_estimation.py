@@ -153,6 +153,11 @@ class StateEstimator:
         states = np.concatenate(paths) * self.problem.scale
         return replace(own, t=own.t[kept], states=states, inputs=own.inputs[kept])
 
+    def pushed(self, factor: float) -> StateEstimator:
+        """The same with process noise that is larger by a factor."""
+        noise = replace(self.noise, process=factor * self.noise.process)
+        return replace(self, noise=noise)
+
     def scaled_noise(self) -> tuple[np.ndarray, np.ndarray]:
         """Both kinds of noise, scaled; states that are not measured get the mean of the others.
 
