@@ -152,7 +152,7 @@ class ComparedRecord:
         middle = len(states) // 2
         if has_decayed(states[middle:], self.states[middle:], DIED_OUT).all():
             return Comparison(Status.DECAYS, False, np.nan, by_state)
-        if self._spirals:
+        if spirals(self.states):
             is_similar = self._is_followed(states, bounds)
             return Comparison(Status.NO_CYCLE, is_similar, np.nan, by_state)
         is_similar = not self._repeats and self._is_alike(states, bounds)
@@ -182,10 +182,6 @@ class ComparedRecord:
         ) / np.square(self.std)
         is_quiet = np.sqrt(noise) <= TOO_NOISY
         return bool((np.maximum(off - noise, 0.0) > FIRST_PERIOD**2)[is_quiet].any())
-
-    @property
-    def _spirals(self) -> bool:
-        return spirals(self.states)
 
     def _is_followed(self, states: np.ndarray, bounds: FreeRunBounds) -> bool:
         """True if a run has the envelope of the record in each third, and its frequency."""

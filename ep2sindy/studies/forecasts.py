@@ -72,7 +72,8 @@ def _table(skill: ForecastSkill) -> Table:
     held = f"the bands of 90 % hold {100.0 * skill.coverage_90:.0f} % of the samples"
     if not np.isfinite(skill.coverage_90):
         held = (
-            "there are no bands: forecasts diverge where the model was fitted, or it is too short"
+            "there are no bands: what the model was fitted to is too short, grows or decays "
+            "throughout, or forecasts of it diverge"
         )
     steps = " Baselines take the samples interpolated onto equal steps." if skill.resampled else ""
     return Table(
