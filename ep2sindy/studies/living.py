@@ -40,7 +40,7 @@ from ep2sindy.studies.views import CYCLE, add_samples, terms_text
 
 WAVEFORM = "One period by phase, shown twice: samples, their waveform, and the model's."
 CAPTIONS = {
-    "free_run": "The living model (colour) integrated freely from the first sample of held-out "
+    "free_run": "The model (colour) integrated freely from the first sample of held-out "
     "time, over the data (grey): the first and the last periods.",
     "cycle": "Its cycle in the plane of two states, over the data (grey), and runs from other "
     "starts.",
