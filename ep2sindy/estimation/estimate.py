@@ -22,6 +22,7 @@ from ep2sindy.estimation.likelihood import Gram, gram, hessian_on
 from ep2sindy.estimation.noise import remark
 from ep2sindy.estimation.observation import Solution
 from ep2sindy.estimation.problem import (
+    FIRST_MAX_TERMS,
     MIN_SAMPLES,
     SAMPLES_PER_TERM,
     ByCoefficient,
@@ -211,7 +212,8 @@ def _answer(task: Task, settings: _Settings) -> tuple[Explanation, Sequence[Traj
 
     The ways in which hidden states may enter are tried under process noise first. Those that
     explain the samples then are followed to an exact trajectory, and those that ran away, of which
-    that says nothing; if none of these explains them, so is the likeliest of the others.
+    that says nothing; if none of these explains them, so is the likeliest of the others, with few
+    terms.
     """
     if not task.hidden:
         return _Way.of(task, task, (), settings).answer(settings), task.runs
@@ -228,7 +230,8 @@ def _answer(task: Task, settings: _Settings) -> tuple[Explanation, Sequence[Traj
             break
     else:
         for under_noise, way in sorted(doubtful, key=lambda each: each[0].solution.deviance)[:1]:
-            tried.append((way.answer(settings, under_noise), way.runs))
+            few = settings._replace(max_terms=settings.max_terms or FIRST_MAX_TERMS)
+            tried.append((way.answer(few, under_noise), way.runs))
     return min(tried, key=lambda each: (bool(each[0].misfit), each[0].solution.rank))
 
 
