@@ -4,17 +4,17 @@ import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.axial.state_kernels import ENTRY
-from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
-from ep2sindy.thruster.plane.state_kernels import (
+from ep2sindy.thruster.closures import (
     COULOMB,
     COULOMB_LOG,
     EVENTS,
     INELASTIC,
     IONIZATION,
     MOMENTUM,
-    WALL_COLLISIONS,
-    WALL_ENERGY,
+    WALL_COLLISION,
+    WALL_POWER,
 )
+from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
 SIDE_ENERGY = 2.5  # enthalpy in T_e that an electron carries along with an ion leaving sideways
 SQRT_HALF_BITS = 0x3FE6A09E667F3BCD  # bits of the double 1/sqrt(2)
@@ -87,16 +87,16 @@ def collisions(state, model, columns):
             neutrals * lookup(table, row, share, MOMENTUM)
             + neutrals * lookup(table, hot, hot_share, EVENTS)
             + ions * log_lambda * lookup(table, row, share, COULOMB)
-            + walls * lookup(table, hot, hot_share, WALL_COLLISIONS)
+            + walls * lookup(table, hot, hot_share, WALL_COLLISION)
             + model.anomalous[i]
         )
         columns.nu[i] = nu
         columns.conductance[i] = E_CHARGE / M_ELECTRON * nu / (nu**2 + model.omega_ce[i] ** 2) * n
         columns.loss[i] = columns.n_neutrals[i] * lookup(table, hot, hot_share, INELASTIC)
-        columns.loss[i] += state.wall[i] * lookup(table, hot, hot_share, WALL_ENERGY)
+        columns.loss[i] += state.wall[i] * lookup(table, hot, hot_share, WALL_POWER)
         columns.loss[i] += state.side[i] * SIDE_ENERGY * state.T_e_eV[i]
         inelastic = table[hot + 1, INELASTIC] - table[hot, INELASTIC]
-        wall = table[hot + 1, WALL_ENERGY] - table[hot, WALL_ENERGY]
+        wall = table[hot + 1, WALL_POWER] - table[hot, WALL_POWER]
         slope = columns.n_neutrals[i] * inelastic + state.wall[i] * wall
         columns.loss_slope[i] = max(slope * per_eV, 0.0) + state.side[i] * SIDE_ENERGY
         state.ionization[i] = lookup(table, hot, hot_share, IONIZATION)

@@ -12,11 +12,16 @@ import xarray as xr
 from jaxtyping import Float
 
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
-from ep2sindy.thruster import closures as axial
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.balance import INFLOW
 from ep2sindy.thruster.cache import read_or_run
-from ep2sindy.thruster.closures import TABLE_STEP_EV, closure_table
+from ep2sindy.thruster.closures import (
+    TABLE_STEP_EV,
+    WALL_COLLISION,
+    WALL_POWER,
+    closure_table,
+    table_temperatures,
+)
 from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
 from ep2sindy.thruster.parameters import NeutralSpeed, OperatingPoint, Thruster
 from ep2sindy.thruster.plane import state_kernels as kernels
@@ -260,23 +265,17 @@ def check_thruster(thruster: Thruster, point: OperatingPoint) -> None:
         )
 
 
-def plane_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 8"]:
-    """The closures over T_e, with wall losses per ion reaching the wall; columns as in `kernels`.
+def plane_table(thruster: Thruster) -> Float[np.ndarray, "temperatures columns"]:
+    """`closure_table` with wall losses per ion that reaches the wall.
 
     In the axial model, electrons reach the wall at scale * ratio * sqrt(e T_e/m) n / gap, times
     1/(1 - gamma). Here the computed flux of ions to the wall replaces the factor
     ratio * sqrt(e T_e/m) n / gap.
     """
-    axial_table = closure_table(thruster)
-    T = TABLE_STEP_EV * np.arange(len(axial_table))
-    T[0] = 0.1 * TABLE_STEP_EV
-    bohm = np.sqrt(E_CHARGE * T / thruster.propellant.mass)
+    table = closure_table(thruster)
+    bohm = np.sqrt(E_CHARGE * table_temperatures() / thruster.propellant.mass)
     ions = SHEATH_DENSITY_RATIO * bohm / thruster.gap  # 1/s
-    table = np.empty((T.size, 8))
-    for name in ("IONIZATION", "INELASTIC", "EVENTS", "MOMENTUM", "COULOMB", "COULOMB_LOG"):
-        table[:, getattr(kernels, name)] = axial_table[:, getattr(axial, name)]
-    table[:, kernels.WALL_COLLISIONS] = axial_table[:, axial.WALL_COLLISION] / ions
-    table[:, kernels.WALL_ENERGY] = axial_table[:, axial.WALL_POWER] / ions
+    table[:, [WALL_COLLISION, WALL_POWER]] /= ions[:, None]
     return table
 
 
