@@ -143,7 +143,7 @@ def simulate_as(
 class Rows:
     """Sampled arrays, one row per sample."""
 
-    planes: list[Float[np.ndarray, "time z r"]]
+    planes: Float[np.ndarray, "planes time z r"]
     profiles: Float[np.ndarray, "time profiles z"]
     series: Float[np.ndarray, "time series"]
 
@@ -151,23 +151,21 @@ class Rows:
     def room(n_rows: int, grid: MaskedGrid) -> Rows:
         """Arrays for n_rows samples; planes are NaN in the thruster's body."""
         return Rows(
-            [np.full((n_rows, grid.n_z, grid.n_r), np.nan, np.float32) for _ in PLANES],
+            np.full((len(PLANES), n_rows, grid.n_z, grid.n_r), np.nan, np.float32),
             np.empty((n_rows, len(PROFILES), grid.n_z), np.float32),
             np.empty((n_rows, len(SERIES) - 1)),
         )
 
     def until(self, n_rows: int) -> Rows:
         """The first rows, as views."""
-        planes = [plane[:n_rows] for plane in self.planes]
-        return Rows(planes, self.profiles[:n_rows], self.series[:n_rows])
+        return Rows(self.planes[:, :n_rows], self.profiles[:n_rows], self.series[:n_rows])
 
     def march(self, state: PlaneState, model: PlaneModel, sample_s: float, averaged: bool) -> March:
         """A function that records samples of a run into these rows."""
         work = new_work(*state.E.shape)
 
         def march(rows: slice) -> int:
-            planes = [plane[rows] for plane in self.planes]
-            out = (*planes, self.profiles[rows], self.series[rows])
+            out = (*self.planes[:, rows], self.profiles[rows], self.series[rows])
             return advance(state, model, work, sample_s, averaged, *out)[0]
 
         return march
