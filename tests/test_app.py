@@ -16,7 +16,15 @@ from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.report.about import by_places
 from ep2sindy.runtime.files import read_json
 from ep2sindy.selection.criteria import Selection
-from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
+from ep2sindy.studies.study import (
+    Count,
+    Deferred,
+    Levels,
+    Names,
+    PositiveOrAll,
+    Positives,
+    Share,
+)
 from tests.programs import ended
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,7 +45,7 @@ class Toy:
     share: Share
     span: PositiveOrAll
     names: Names
-    lengths: Counts
+    lengths: Positives
     noises: Levels
     inner: Inner
     many: Mapping[str, Inner]
@@ -105,7 +113,7 @@ def test_a_recipe_stands_for_its_groups() -> None:
         ("share=1", "share must be a number between 0 and 1: got 1"),
         ("span=-1", "span must be a positive number, or null for all: got -1"),
         ("names=[a,a]", r"names must be a list such as \[a,b\], each once"),
-        ("lengths=[0]", r"lengths\[0\] must be whole numbers, above zero: got 0"),
+        ("lengths=[0]", r"lengths\[0\] must be numbers, above zero: got 0"),
         ("noises=[-1.0]", r"noises\[0\] must be numbers, zero or more: got -1.0"),
         ("inner.widht=1", r"^inner, Inner: .*; near it is width; it takes \['width', 'label'\]"),
         ("many=1", r"many must be like {name: ...}: got 1"),

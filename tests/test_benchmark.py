@@ -1,4 +1,4 @@
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.searches import STLSQ, AdaptiveLasso
 from ep2sindy.runtime.parallel import Serial
+from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies.benchmark import Study, Variant, cells, merits
 from ep2sindy.systems import collection
@@ -46,7 +47,7 @@ def benchmark(
     variants: Mapping[str, Variant],
     *,
     seed: int = 0,
-    progress: Callable[[int], None] = lambda n_more: None,
+    progress: Progress = SILENT,
     **settings,
 ) -> pd.DataFrame:
     defaults = {"n_trajectories": 1, "degree": None, "parallel": Serial(), "definitions": {}}
@@ -111,7 +112,7 @@ def test_known_findings_give_exact_counts() -> None:
     variants = {"scripted": Scripted([Finding(*pair) for pair in pairs])}
     n_done: list[int] = []
     settings = {"systems": ["oscillator"], "noises": [0.0], "n_realizations": 4}
-    outcomes = benchmark(variants, **settings, progress=n_done.append)
+    outcomes = benchmark(variants, **settings, progress=as_progress(n_done.append))
     assert sum(n_done) == 4
     assert outcomes["number"].tolist() == [0, 1, 2, 3]
     assert outcomes["on_front"].tolist() == [1, 1, 0, 1]

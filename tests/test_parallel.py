@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_info
 
 from ep2sindy.runtime import parallel
 from ep2sindy.runtime.parallel import Dask, Loky, Serial, Workers, collect, rows_in_order, run_alike
+from ep2sindy.runtime.progress import as_progress
 from tests.models import lienard
 from tests.programs import composed, computed
 
@@ -91,11 +92,11 @@ def test_every_piece_is_done_once_and_keeps_its_number(workers: Workers) -> None
 
 def test_rows_come_in_the_order_of_their_pieces() -> None:
     told: list[int] = []
-    rows = rows_in_order(Backwards(), repeated, [3, 0, 2], told.append)
+    rows = rows_in_order(Backwards(), repeated, [3, 0, 2], "piece", as_progress(told.append))
     assert rows == [3, 3, 3, 2, 2]
     assert told == [1, 1, 1]
     with pytest.raises(ValueError, match="there must be something to run: 1 pieces came"):
-        rows_in_order(Serial(), repeated, [0])
+        rows_in_order(Serial(), repeated, [0], "piece")
 
 
 def test_results_come_in_the_order_of_their_pieces_and_are_told_as_they_come() -> None:

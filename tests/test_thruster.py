@@ -155,7 +155,7 @@ def test_bad_parameters_say_what_must_hold(build, message):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"warm_up_s": -1.0}, r"warm_up_s must be finite and zero or more, got -1\.0 s"),
+        ({"warm_up_s": -1.0}, r"warm_up_s must be finite and zero or more, got -1\.0"),
         ({"duration_s": 1e-9}, r"duration_s must hold at least 16 sampling steps"),
         ({"n_cells": 3}, r"n_cells must be 10 or more .* got 3"),
     ],

@@ -14,8 +14,9 @@ from typing import Any
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
-from ep2sindy.app.targets import nodes_of, target_of
+from ep2sindy.app.targets import target_of
 from ep2sindy.runtime.screen import listed, near_words
+from ep2sindy.trust.user_code import nodes_of
 
 JOBS = "jobs"  # folder of a sweep with a record of each job
 COMMANDS = ("compare", "inspect", "warm")  # that stand first, without +exp=NAME

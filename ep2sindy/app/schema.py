@@ -18,12 +18,13 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy._stubs import place_of
-from ep2sindy.app.targets import nodes_of, target_of
+from ep2sindy.app.targets import target_of
 from ep2sindy.discovery.method import AnyMethod, method_of
 from ep2sindy.report.folder import FORMATS
 from ep2sindy.runtime.screen import near_words
 from ep2sindy.studies.source import Source, Step
-from ep2sindy.studies.study import Check, Deferred
+from ep2sindy.studies.study import Check, Deferred, ZeroOrMore
+from ep2sindy.trust.user_code import nodes_of
 
 
 def _are_formats(value: Any) -> bool:
@@ -37,9 +38,7 @@ COMMON: Mapping[str, Any] = {
         Check("a name for a folder, of letters, digits and _", lambda x: str(x).isidentifier()),
     ],
     "study": str,
-    "seed": Annotated[
-        int, Check("a whole number, zero or more", lambda x: type(x) is int and x >= 0)
-    ],
+    "seed": ZeroOrMore,
     "output": Annotated[str, Check("a folder's name", bool)],
     "formats": Annotated[
         Any,

@@ -6,12 +6,12 @@ are given, are not.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from typing import Any
 
 from ep2sindy._stubs import dotted_names
-from ep2sindy.trust.user_code import load_marked
+from ep2sindy.trust.user_code import load_marked, nodes_of
 
 # Full names: `ep2sindy.EBIC`, `ep2sindy.thruster.Thruster`.
 FOR_CONFIGS = frozenset(name for name, entry in dotted_names().items() if entry.for_configs)
@@ -45,17 +45,6 @@ def _own(name: str, place: str) -> Callable[..., Any]:
             f"ep2sindy.EBIC, or one of yours below the folder that you start in: got {name!r}, "
             f"and {error}"
         ) from error
-
-
-def nodes_of(node: Any, place: str = "") -> Iterator[tuple[str, Any]]:
-    """A node of plain settings and all below it, each with its dotted place."""
-    yield place, node
-    if isinstance(node, list):
-        for k, each in enumerate(node):
-            yield from nodes_of(each, f"{place}[{k}]")
-    elif isinstance(node, Mapping):
-        for key, each in node.items():
-            yield from nodes_of(each, f"{place}.{key}" if place else str(key))
 
 
 def check_targets(settings: Any) -> None:

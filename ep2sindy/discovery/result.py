@@ -27,7 +27,7 @@ from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.records import most_central
 from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.front import Candidate, Cloud, LeftOver, ParetoFront
-from ep2sindy.runtime.files import read_json, write_text
+from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
 from ep2sindy.selection.criteria import OtherSystem, Selection
@@ -210,10 +210,7 @@ class Discovery:
         No code from the text runs, and functions of your own must be registered before.
         Raises ValueError for anything else.
         """
-        with read_as(f"a discovery must be {FORMAT} JSON"):
-            content = read_json(text)
-            if content["format"] != FORMAT:
-                raise ValueError(f"format {content['format']!r}")
+        with read_as("a discovery must be", FORMAT, text) as content:
             model = SparseModel.from_json(json.dumps(content["model"]))
             law, points = content["law"], content["points"]
             found = Discovery(

@@ -302,22 +302,6 @@ def points_inside(low: float, high: float) -> Float[np.ndarray, " points"]:
 # A registered function as a formula: what it computes is recorded while it is called once.
 
 
-def formula(kind: Kind, argument: sympy.Expr) -> sympy.Expr:
-    """What a user's function computes, as a sympy expression of its argument.
-
-    Raises ValueError for a function that is no formula of NumPy's arithmetic and functions.
-    """
-    needs = (
-        f"a function of your own leaves the package as {FORMULA}: {kind.name!r} came, which is none"
-    )
-    way_out = (
-        "register it again, written so, and load the model again, or leave the function out of the "
-        "library"
-    )
-    x, found = _record(kind.value, kind.domain[0], needs, way_out)
-    return found.xreplace({x: argument})
-
-
 def _record(
     value: Values, domain: Interval, needs: str = "", way_out: str = ""
 ) -> tuple[sympy.Symbol, sympy.Expr]:

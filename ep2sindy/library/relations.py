@@ -94,37 +94,6 @@ def _unreadable(text: str, position: int, expected: str) -> ValueError:
     )
 
 
-def relations_from_matrix(
-    C: Float[np.ndarray, "states features"], *, states: Sequence[str], terms: Sequence[str]
-) -> tuple[dict[str, tuple[str, ...]], tuple[Relation, ...]]:
-    """Read the thesis's matrix: coef(state i, feature k) = C[i, k] b_k, absent where C is zero.
-
-    Returns the support and the relations for `constraint`. Several columns may hold the same term,
-    so that states can have separate coefficients b_k of it.
-    Raises ValueError for another shape, or for a term that occurs twice in one equation.
-    Source: thesis II-E, Eqs. 13-16.
-    """
-    if C.shape != (len(states), len(terms)):
-        raise ValueError(
-            "C must have one row per state and one column per feature: shape "
-            f"{C.shape} came for {list(states)} and {list(terms)}"
-        )
-    support = {
-        state: tuple(term for term, c in zip(terms, row, strict=True) if c != 0.0)
-        for state, row in zip(states, C, strict=True)
-    }
-    for state, present in support.items():
-        if len(set(present)) < len(present):
-            raise ValueError(f"C may give {state!r} each term once: it has {list(present)}")
-    texts = []
-    for term, column in zip(terms, C.T, strict=True):
-        shares = [(s, float(c)) for s, c in zip(states, column, strict=True) if c != 0.0]
-        for state, c in shares[1:]:
-            first, c_first = shares[0]
-            texts.append(f"{c!r} * {first}: {term} == {c_first!r} * {state}: {term}")
-    return support, tuple(map(parse_relation, texts))
-
-
 @dataclass(frozen=True)
 class Process:
     """One term in one role: its coefficient enters the equations with these factors.

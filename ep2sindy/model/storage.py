@@ -61,10 +61,7 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
     registered beforehand.
     Raises ValueError for any other text, also if `make` rejects the content.
     """
-    with read_as(f"a model file must hold {FORMAT} JSON"):
-        content = read_json(text)
-        if content["format"] != FORMAT:
-            raise ValueError(f"format {content['format']!r}")
+    with read_as("a model file must hold", FORMAT, text) as content:
         states, equations = names_in(content["states"]), content["equations"]
         if sorted(equations) != sorted(states):
             raise ValueError(f"equations of {sorted(equations)}, but the states {states}")
@@ -81,10 +78,17 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
 
 
 @contextmanager
-def read_as(wanted: str) -> Iterator[None]:
-    """Turn whatever goes wrong in reading a text into a ValueError that says what was wanted."""
+def read_as(what: str, form: str, text: str) -> Iterator[Any]:
+    """The content of a JSON text of a format, while it is read.
+
+    Whatever goes wrong within becomes a ValueError that says what was wanted.
+    """
+    wanted = f"{what} {form} JSON"
     try:
-        yield
+        content = read_json(text)
+        if content["format"] != form:
+            raise ValueError(f"format {content['format']!r}")
+        yield content
     except UnknownFunctionError:
         raise  # the text is sound: a function must be registered before it is read
     except KeyError as error:

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.scores import r2
 from ep2sindy.operating.law import LawConstraint
 from ep2sindy.operating.point_fits import FAILED, PointFits, information_of
 from ep2sindy.operating.quantities import Quantity, QuantityEstimate, estimate_quantities
@@ -20,7 +19,7 @@ from ep2sindy.operating.records import Point, group_by_point, name_point, read_p
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
-from ep2sindy.regression.constrained import solve_constrained
+from ep2sindy.regression.constrained import rows_r2, solve_constrained
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -214,11 +213,7 @@ class _FittedPoint:
         information: Float[np.ndarray, "free free"],
         loss: float = float("nan"),
     ) -> FittedModel:
-        scores = {
-            state: _score_rows(problem, model, state)
-            for problem in self.problems
-            for state in problem.equations
-        }
+        scores = rows_r2(model, self.problems)
         estimates = estimate_quantities(model, given.quantities)
         return FittedModel(model, status, scores, estimates, information, loss)
 
@@ -235,11 +230,3 @@ def fits_of(name: str, given: GivenModel, results: Sequence[PointResult]) -> Poi
         information=np.array([fit.information for fit in fits]),
         how="trajectories" if name.endswith(REFINED) else "rows",
     )
-
-
-def _score_rows(problem: RegressionRows, model: SparseModel, state: str) -> float:
-    """R2 of a state's derivative on the unweighted training rows."""
-    rows = ~problem.test
-    predicted = problem.theta[rows] @ model.coef[:, model.states.index(state)]
-    truth = problem.target[rows, problem.equations.index(state)]
-    return float(r2(truth=truth, prediction=predicted[None])[0])

@@ -26,7 +26,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_as, read_stored, texts_in
 from ep2sindy.operating.records import check_varying, read_points
 from ep2sindy.regression.pooled import Basis
-from ep2sindy.runtime.files import read_json, write_text
+from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.values import read_only
 
 FORMAT = "ep2sindy.OperatingLaw/1"
@@ -232,10 +232,7 @@ class OperatingLaw:
     @staticmethod
     def from_json(text: str) -> OperatingLaw:
         """Inverse of `to_json`, exact. Raises ValueError for anything else."""
-        with read_as(f"a law file must hold {FORMAT} JSON"):
-            content = read_json(text)
-            if content["format"] != FORMAT:
-                raise ValueError(f"format {content['format']!r}")
+        with read_as("a law file must hold", FORMAT, text) as content:
             known, left_out = content["covariance"], content["left_out"]
             return OperatingLaw(
                 functions=named_terms(*(names_in(content[k]) for k in ("parameters", "functions"))),

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.model.scores import r2
 from ep2sindy.regression.bootstraps import Resamples
 from ep2sindy.regression.gram_kernels import invert_gram
 from ep2sindy.regression.least_squares import LeastSquares
@@ -260,3 +261,14 @@ def solve_constrained(
         ),
         variance=1.0 if all(noisy) else fit.squares / max(len(target) - C.shape[1], 1),
     )
+
+
+def rows_r2(model: SparseModel, problems: Sequence[RegressionRows]) -> dict[str, float]:
+    """R2 of the derivative by state, on the unweighted training rows of a fit."""
+    found = {}
+    for problem in problems:
+        rows = ~problem.test
+        for k, state in enumerate(problem.equations):
+            fitted = problem.theta[rows] @ model.coef[:, model.states.index(state)]
+            found[state] = float(r2(truth=problem.target[rows, k], prediction=fitted[None])[0])
+    return found

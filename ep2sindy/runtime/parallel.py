@@ -7,7 +7,7 @@ import pickle
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count, islice
@@ -20,6 +20,7 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import cloudpickle
 from joblib import Memory, Parallel, delayed, effective_n_jobs
 
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.trust.interruption import end_with
 from ep2sindy.trust.user_code import own_packages
@@ -79,15 +80,16 @@ def collect(
 def rows_in_order(
     workers: Workers,
     function: Callable[[Any], Sequence[Any]],
-    pieces: Iterable[Any],
-    progress: Callable[[int], None] = lambda n_more: None,
+    pieces: Sequence[Any],
+    unit: str,
+    progress: Progress = SILENT,
 ) -> list[Any]:
     """Compute the rows of every piece and return all rows in the order of the pieces.
 
-    progress: called with 1 for every finished piece.
+    unit: noun for a piece.
     Raises ValueError if there is no row at all.
     """
-    found = collect(workers, function, list(pieces), nullcontext(progress))
+    found = collect(workers, function, pieces, progress.stage(len(pieces), unit))
     if not any(found):
         raise ValueError(
             f"there must be something to run: {len(found)} pieces came, without a row; leave no "

@@ -37,7 +37,7 @@ from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.study import Count, CountOrNone, Deferred, Levels, Names, NamesOrOne
+from ep2sindy.studies.study import Count, Deferred, Levels, Names, NamesOrOne
 from ep2sindy.systems.draws import COLLECTION, DRAWS, realization, system_names
 from ep2sindy.systems.systems import System
 
@@ -129,7 +129,7 @@ class Study:
     noises: Levels
     n_realizations: Count
     n_trajectories: Count
-    degree: CountOrNone
+    degree: Count | None
     variants: Names
     definitions: Mapping[str, Deferred]
     parallel: Workers
@@ -138,12 +138,10 @@ class Study:
     def run(self, report: Report) -> None:
         published = published_cells()
         variants = build_variants(self.variants, self.definitions)
-        n_pieces = len(self._names) * len(self.noises) * self.n_realizations
         with resumed(self.keep, report, self.parallel) as workers:
-            with report.progress(n_pieces, "realization") as progress:
-                outcomes = replace(self, parallel=workers).outcomes(
-                    variants, seed=report.seed, progress=progress
-                )
+            outcomes = replace(self, parallel=workers).outcomes(
+                variants, seed=report.seed, progress=report.watch
+            )
             counted = cells(outcomes)
             report.section(
                 "Realizations",
@@ -178,11 +176,7 @@ class Study:
             report.figure(name, figure, EXAMPLES.format(variant=variant))
 
     def outcomes(
-        self,
-        variants: Mapping[str, Variant],
-        *,
-        seed: int = 0,
-        progress: Callable[[int], None] = lambda n_more: None,
+        self, variants: Mapping[str, Variant], *, seed: int = 0, progress: Progress = SILENT
     ) -> pd.DataFrame:
         """Figures of merit of every variant on every realization; workers share the realizations.
 
@@ -194,7 +188,8 @@ class Study:
         """
         tasks = list(product(self._names, sorted(self.noises), range(self.n_realizations)))
         judge = partial(_outcomes, variants, self._draw(seed), seed=seed)
-        return pd.DataFrame(rows_in_order(self.parallel, judge, tasks, progress))
+        rows = rows_in_order(self.parallel, judge, tasks, "realization", progress)
+        return pd.DataFrame(rows)
 
     def _draw(self, seed: int) -> Draw:
         count = self.n_trajectories
@@ -359,5 +354,5 @@ def _not_selected(collected: pd.DataFrame) -> Table:
 def _heading(system: str, merit: str) -> str:
     if merit != "mean_correct_terms" or system not in DRAWS:
         return system
-    model = DRAWS[system](np.random.default_rng(0)).system.model
+    model = DRAWS[system](np.random.default_rng(0)).model
     return f"{system} ({np.count_nonzero(model.coef)})"

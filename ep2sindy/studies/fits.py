@@ -54,10 +54,9 @@ from ep2sindy.studies.source import DivergedError, Source, split_in_time, zones_
 from ep2sindy.studies.structures import Structures
 from ep2sindy.studies.study import (
     Count,
-    CountOrNone,
     Positive,
     PositiveOrAll,
-    ShareOrNone,
+    Share,
     ZeroOrMore,
 )
 from ep2sindy.studies.views import (
@@ -110,11 +109,11 @@ class Study:
     fits: Mapping[str, Fit]
     figures: PlotRange
     forms: Mapping[str, Formulation] = field(default_factory=dict)
-    held_out: ShareOrNone = None
+    held_out: Share | None = None
     rollout_s: PositiveOrAll = None
     n_windows: Count = 30
     periods: Positive = 2.0
-    window: CountOrNone = None
+    window: Count | None = None
     n_reweights: ZeroOrMore = 1
     windows: Sequence[int] = ()
     n_draws: ZeroOrMore = 0

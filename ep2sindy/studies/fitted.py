@@ -18,11 +18,10 @@ from ep2sindy.library.relations import Constraint
 from ep2sindy.library.roles import Role
 from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.scores import r2
 from ep2sindy.refinement.windows import dominant_window
-from ep2sindy.regression.constrained import constrained_fit
+from ep2sindy.regression.constrained import constrained_fit, rows_r2
 from ep2sindy.regression.formulations import Weak
-from ep2sindy.regression.rows import Formulation, RegressionRows
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.windows import Boxes
 from ep2sindy.report.results import Metric, Metrics, View
 from ep2sindy.studies.processes import Zones, compared_processes
@@ -212,18 +211,6 @@ def fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_s
         return strayed.ravel()
 
     return least_squares(residual, data[0] / std, diff_step=1e-4).x * std
-
-
-def rows_r2(model: SparseModel, problems: Sequence[RegressionRows]) -> dict[str, float]:
-    """R2 of the derivative by state, on the rows of a fit."""
-    found = {}
-    for problem in problems:
-        for k, state in enumerate(problem.equations):
-            coef = model.coef[:, model.states.index(state)]
-            columns = np.flatnonzero(coef)
-            prediction = coef[None, columns] @ problem.theta[:, columns].T
-            found[state] = float(r2(truth=problem.target[:, k], prediction=prediction)[0])
-    return found
 
 
 def wrong_signs(model: SparseModel, held_to: Constraint | None, record: RecordParts) -> list[str]:

@@ -5,11 +5,10 @@ The experiment is `+exp=frontier`. Source: the thesis, appendix, III-B.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,6 +17,7 @@ from ep2sindy.figures.identified import frontier_figure
 from ep2sindy.report.document import Result, Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.studies.benchmark import Variant, build_variants, merits
 from ep2sindy.studies.study import Deferred, Names, Positives
 from ep2sindy.systems.systems import System
@@ -45,8 +45,7 @@ class Study:
 
     def run(self, report: Report) -> None:
         variants = build_variants(self.variants, self.definitions)
-        with report.progress(len(self.rates_Hz) * len(self.durations_s), "trajectory") as progress:
-            points = self.points(variants, seed=report.seed, progress=progress)
+        points = self.points(variants, seed=report.seed, progress=report.watch)
         by_variant = points.groupby("variant", sort=False)
         too_few = points[points["reason"] != ""].groupby("variant", sort=False).size()
         counts = ", ".join(f"{variant} {n}" for variant, n in too_few.items())
@@ -74,11 +73,7 @@ class Study:
         )
 
     def points(
-        self,
-        variants: Mapping[str, Variant],
-        *,
-        seed: int = 0,
-        progress: Callable[[int], None] = lambda n_more: None,
+        self, variants: Mapping[str, Variant], *, seed: int = 0, progress: Progress = SILENT
     ) -> pd.DataFrame:
         """Result of every variant on one noise-free trajectory per sampling rate and duration.
 
@@ -91,7 +86,7 @@ class Study:
         # The largest comes first: a variant that cannot run at all fails before the work is done.
         points = sorted(product(self.rates_Hz, self.durations_s), reverse=True)
         judge = partial(_point, self.system, variants, seed=seed, largest=points[:1])
-        rows: list[dict[str, Any]] = rows_in_order(self.parallel, judge, points, progress)
+        rows = rows_in_order(self.parallel, judge, points, "trajectory", progress)
         place = {name: k for k, name in enumerate(variants)}
         rows.sort(key=lambda row: (place[row["variant"]], row["rate_Hz"], row["duration_s"]))
         return pd.DataFrame(rows)

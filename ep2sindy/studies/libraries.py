@@ -54,7 +54,7 @@ from ep2sindy.studies.source import (
     split_in_time,
     zones_of,
 )
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone, Terms, ZeroOrMore
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, Share, Terms, ZeroOrMore
 from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module
 
@@ -130,7 +130,7 @@ class Study:
     figures: PlotRange
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
-    held_out: ShareOrNone = None
+    held_out: Share | None = None
     forecasts: ZeroOrMore = 0
     inputs: Sequence[str] = ()
     period_s: PositiveOrAll = None

@@ -51,7 +51,7 @@ from ep2sindy.studies.quantity_tables import Published, add_quantities, read_pub
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import Source, compile_kernels
 from ep2sindy.studies.structures import Terms, terms_of
-from ep2sindy.studies.study import Count, CountOrNone, Positive
+from ep2sindy.studies.study import Count, Positive
 
 # Name of models whose terms were searched for; most of them, and sizes of their supports: of every
 # state's, and of a signal's second state's.
@@ -111,8 +111,8 @@ class Study:
     windows: RefiningWindows | None
     law: Functions
     labels: Mapping[str, str]
-    map_points: CountOrNone = None
-    degree: CountOrNone = None
+    map_points: Count | None = None
+    degree: Count | None = None
     thesis: Published | None = None
     keep: bool = True
 

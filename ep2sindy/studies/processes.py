@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
+from ep2sindy.data.numbers import least_squares
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.library.relations import Constraint, Process
@@ -77,8 +78,7 @@ def fitted_rate(
     terms: Sequence[str],
 ) -> FittedRate:
     """A rate by least squares on terms, whose values are the columns."""
-    size = np.abs(columns).max(axis=0)
-    coef = np.linalg.lstsq(columns / size, rate, rcond=None)[0] / size
+    coef = least_squares(columns, rate)
     return FittedRate(dict(zip(terms, coef.tolist(), strict=True)), rate_r2(rate, columns @ coef))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -16,7 +17,7 @@ from ep2sindy.report.report import Report
 from ep2sindy.runtime.files import fingerprint
 from ep2sindy.runtime.parallel import ONE_BY_ONE, KeptWorkers, Workers
 from ep2sindy.runtime.user_cache import cache_folder
-from ep2sindy.trust.user_code import PACKAGE, own_source
+from ep2sindy.trust.user_code import PACKAGE, nodes_of, own_source
 
 # Settings of every study that do not change a piece's result; they may differ when a broken run is
 # continued.
@@ -52,16 +53,11 @@ def own_sources(settings: Mapping[str, Any]) -> list[Path]:
     return sorted(path for path in found if path is not None)
 
 
-def texts(settings: object, key: str = "") -> Iterator[tuple[str, str]]:
-    """Every (key, text) pair among some settings, at any depth."""
-    if isinstance(settings, Mapping):
-        for name, value in settings.items():
-            yield from texts(value, str(name))
-    elif isinstance(settings, list):
-        for each in settings:
-            yield from texts(each, key)
-    elif isinstance(settings, str):
-        yield key, settings
+def texts(settings: object) -> Iterator[tuple[str, str]]:
+    """Every (key, text) pair among some settings, at any depth; in a list, its key counts."""
+    for place, node in nodes_of(settings):
+        if isinstance(node, str):
+            yield re.sub(r"\[\d+\]", "", place).rpartition(".")[2], node
 
 
 def _files_named(settings: object) -> Iterator[str]:

@@ -67,26 +67,15 @@ def _is_count(value: Any) -> bool:
 
 
 Count = Annotated[int, Check("a whole number, one or more", _is_count)]
-CountOrNone = Annotated[
-    int | None, Check("a whole number, one or more, or null", lambda x: x is None or _is_count(x))
-]
 ZeroOrMore = Annotated[
     int, Check("a whole number, zero or more", lambda x: type(x) is int and x >= 0)
 ]
 Share = Annotated[float, Check("a number between 0 and 1", lambda x: _is_positive(x) and x < 1)]
-ShareOrNone = Annotated[
-    float | None,
-    Check(
-        "a number between 0 and 1, or null",
-        lambda x: x is None or (_is_positive(x) and x < 1),
-    ),
-]
 Positive = Annotated[float, Check("a positive number", _is_positive)]
 PositiveOrAll = Annotated[
     float | None,
     Check("a positive number, or null for all", lambda x: x is None or _is_positive(x)),
 ]
-_Counts = Annotated[int, Check("whole numbers, above zero", _is_count)]
 _Levels = Annotated[float, Check("numbers, zero or more", lambda x: _is_number(x) and x >= 0)]
 _Positives = Annotated[float, Check("numbers, above zero", _is_positive)]
 
@@ -106,7 +95,6 @@ NamesOrOne = Annotated[
         lambda x: isinstance(x, str) or _each_once(x),
     ),
 ]
-Counts = Annotated[Sequence[_Counts], A_LIST]
 Levels = Annotated[Sequence[_Levels], A_LIST]
 Positives = Annotated[Sequence[_Positives], A_LIST]
 Terms = Mapping[str, Sequence[int | str]]  # by state; the constant term 1 may be a number

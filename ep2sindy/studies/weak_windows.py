@@ -6,7 +6,7 @@ known, and least squares gives the coefficients, in the ways that `studies.fitte
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -23,6 +23,7 @@ from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Result, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.studies.fitted import Fit, boxes_of, expand
 from ep2sindy.studies.study import Count, Levels, Positive
 from ep2sindy.systems.systems import System
@@ -54,8 +55,7 @@ class Study:
     def run(self, report: Report) -> None:
         ways = expand(self.fits, self.forms, self.formulation)
         forms = {way.name: way.form for way in ways if way.form is not None}
-        with report.progress(len(self.noises) * self.n_realizations, "realization") as progress:
-            errors = self.errors(forms, seed=report.seed, progress=progress)
+        errors = self.errors(forms, seed=report.seed, progress=report.watch)
         cells, system = error_cells(errors, forms), self.system
         report.section(
             "Windows",
@@ -89,11 +89,7 @@ class Study:
         )
 
     def errors(
-        self,
-        forms: Mapping[str, Formulation],
-        *,
-        seed: int = 0,
-        progress: Callable[[int], None] = lambda n_more: None,
+        self, forms: Mapping[str, Formulation], *, seed: int = 0, progress: Progress = SILENT
     ) -> pd.DataFrame:
         """The coefficient error of every form on every realization.
 
@@ -103,7 +99,7 @@ class Study:
         tasks = list(product(self.noises, range(self.n_realizations)))
         sampled = replace(self.system, rate_Hz=self.rate_Hz)
         fit = partial(_realization, sampled, forms, seed=seed)
-        return pd.DataFrame(rows_in_order(self.parallel, fit, tasks, progress))
+        return pd.DataFrame(rows_in_order(self.parallel, fit, tasks, "realization", progress))
 
 
 def coefficient_error(

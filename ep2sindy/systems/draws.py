@@ -6,7 +6,7 @@ Source: the thesis, appendix, II-E and III-C; of the others, `systems.collection
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,51 +22,29 @@ from ep2sindy.systems.systems import (
     van_der_pol,
 )
 
-
-@dataclass(frozen=True)
-class Draw:
-    """A system with a parameter or a starting point drawn at random."""
-
-    system: System
-    initial: np.ndarray
-
-
-def _oscillator(rng: np.random.Generator) -> Draw:
-    return Draw(damped_oscillator(), rng.uniform(-2.0, 2.0, 2))
-
-
-def _lotka_volterra(rng: np.random.Generator) -> Draw:
-    return Draw(lotka_volterra(), rng.uniform(0.1, 1.5, 2))
-
-
-def _van_der_pol(rng: np.random.Generator) -> Draw:
-    return Draw(van_der_pol(mu=rng.uniform(0.1, 10.0)), np.ones(2))
-
-
-def _lorenz(rng: np.random.Generator) -> Draw:
-    return Draw(lorenz(), rng.uniform([-15.0, -15.0, 10.0], [15.0, 15.0, 40.0]))
-
-
-# The thesis draws the Van der Pol oscillator's mu and starts it at (1, 1). It does not state the
-# starts of the other systems, so these ranges are our choice.
-DRAWS: Mapping[str, Callable[[np.random.Generator], Draw]] = {
-    "oscillator": _oscillator,
-    "lotka_volterra": _lotka_volterra,
-    "van_der_pol": _van_der_pol,
-    "lorenz": _lorenz,
+# Systems with a parameter or a start drawn at random. The thesis draws the Van der Pol oscillator's
+# mu and starts it at (1, 1), as the system does. It does not state the starts of the other systems,
+# so these ranges are our choice.
+DRAWS: Mapping[str, Callable[[np.random.Generator], System]] = {
+    "oscillator": lambda rng: replace(damped_oscillator(), initial=rng.uniform(-2.0, 2.0, 2)),
+    "lotka_volterra": lambda rng: replace(lotka_volterra(), initial=rng.uniform(0.1, 1.5, 2)),
+    "van_der_pol": lambda rng: van_der_pol(mu=rng.uniform(0.1, 10.0)),
+    "lorenz": lambda rng: replace(
+        lorenz(), initial=rng.uniform([-15.0, -15.0, 10.0], [15.0, 15.0, 40.0])
+    ),
 }
 
 
 COLLECTION = "dysts"  # stands for all systems of the collection
 
 
-def drawn(name: str, rng: np.random.Generator) -> Draw:
+def drawn(name: str, rng: np.random.Generator) -> System:
     """Draw a system by name; one of the collection starts anywhere on its attractor."""
     if name in DRAWS:
         return DRAWS[name](rng)
     system = collected(name)
     states = system.trajectory().states
-    return Draw(system, states[rng.integers(len(states))])
+    return replace(system, initial=states[rng.integers(len(states))])
 
 
 def realization(
@@ -87,14 +65,14 @@ def realization(
     check_systems([name])
     key = [list(DRAWS).index(name)] if name in DRAWS else list(name.encode())
     rng = np.random.default_rng([seed, *key, number])
-    draw = drawn(name, rng)
-    starts = [draw.initial]
+    own = drawn(name, rng)
+    starts = [own.initial]
     for _ in range(n_trajectories - 1):
         other = rng.uniform(-2.0, 2.0, 2) if name == "van_der_pol" else drawn(name, rng).initial
         starts.append(other)
-    system = draw.system if degree is None else with_degree(draw.system, degree)
+    system = own if degree is None else with_degree(own, degree)
     return system, [
-        draw.system.trajectory(initial=start, noise=noise, rng=stream)
+        own.trajectory(initial=start, noise=noise, rng=stream)
         for start, stream in zip(starts, rng.spawn(n_trajectories), strict=True)
     ]
 

@@ -8,6 +8,22 @@ from collections.abc import Sequence
 import numpy as np
 
 
+def set_profile(owner: object, places: str, name: str, positive_in: str | None) -> None:
+    """Keep two fields of a frozen value as tuples of numbers: increasing places, a value at each.
+
+    positive_in: unit of values that must be positive, "" for pure numbers; None takes values of
+    both signs. Raises ValueError for gaps, places out of order, or a value that is not positive
+    where it must be.
+    """
+    for field in (places, name):
+        object.__setattr__(owner, field, tuple(float(value) for value in getattr(owner, field)))
+    check_increasing(owner, places)
+    check_rows(owner, places, name)
+    if positive_in is not None and (least := min(getattr(owner, name))) <= 0.0:
+        came = f"{least:g} {positive_in}".strip()
+        raise ValueError(f"{type(owner).__name__}.{name} must be positive everywhere, got {came}")
+
+
 def check_positive(owner: object, *names: str) -> None:
     """Raise ValueError for the first named field that is not a finite positive number."""
     for name in names:

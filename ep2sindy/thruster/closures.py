@@ -33,8 +33,7 @@ def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures columns
 
     From FURTHER on stand the coefficients of TRANSITIONS up to the thruster's highest charge.
     """
-    T = TABLE_STEP_EV * np.arange(round(TABLE_TOP_EV / TABLE_STEP_EV) + 1)
-    T[0] = 0.1 * TABLE_STEP_EV  # the formulas divide by T; all rates vanish at so low a T
+    T = table_temperatures()
     rates, wall, mass = thruster.propellant, thruster.wall, thruster.propellant.mass
     further = further_transitions(thruster)
     table = np.zeros((T.size, FURTHER + len(further)))
@@ -52,6 +51,13 @@ def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures columns
         assert isinstance(rates, PropellantTable)  # the thruster checks this
         table[:, column] = rates.further_ionization(charge, higher, T)
     return table
+
+
+def table_temperatures() -> Float[np.ndarray, " temperatures"]:
+    """Electron temperatures in eV of the rows of a closure table."""
+    T = TABLE_STEP_EV * np.arange(round(TABLE_TOP_EV / TABLE_STEP_EV) + 1)
+    T[0] = 0.1 * TABLE_STEP_EV  # the formulas divide by T; all rates vanish at so low a T
+    return T
 
 
 def further_transitions(thruster: Thruster) -> list[tuple[int, int]]:

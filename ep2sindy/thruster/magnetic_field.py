@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.thruster.checks import check_increasing, check_positive, check_rows
-from ep2sindy.thruster.tables import number, numbers, read_cells
+from ep2sindy.data.readers.source import file_named
+from ep2sindy.thruster.checks import check_positive, set_profile
+from ep2sindy.thruster.tables import read_columns
 
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 FIELDS = {"T": 1.0, "mT": 1e-3, "G": 1e-4}
@@ -55,10 +56,7 @@ class MagneticFieldTable:
     B: Points
 
     def __post_init__(self) -> None:
-        for name in ("distance", "B"):
-            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
-        check_increasing(self, "distance")
-        check_rows(self, "distance", "B")
+        set_profile(self, "distance", "B", None)
         largest = max(map(abs, self.B))
         if not 0.0 < largest <= HIGHEST_T:
             raise ValueError(
@@ -100,37 +98,23 @@ def read_magnetic_field(
     taken as m and T, if its numbers are plausible. scale: factor on the field. Lines that begin
     with # are ignored. Raises ValueError for a gap, an unknown unit, or a field above 1 T.
     """
-    header, numbers = _two_columns(Path(path))
-    lengths = _unit(LENGTHS, z_unit, header[0], f"{path}: position")
-    fields = _unit(FIELDS, B_unit, header[1], f"{path}: field")
-    largest = float(np.abs(numbers[:, 1]).max())
+    header, (z, B) = read_columns(Path(path), "file of a magnetic field", 2)
+    z_name, B_name = header or ("", "")
+    lengths = _unit(LENGTHS, z_unit, z_name, f"{path}: position")
+    fields = _unit(FIELDS, B_unit, B_name, f"{path}: field")
+    largest = float(np.abs(B).max())
     if fields is None and largest > HIGHEST_T:
         raise ValueError(
             f"{path}: the field has no unit and reaches {largest:g}, too much for T; write it "
             "into the header, such as z_m,B_G, or give B_unit=G or mT"
         )
-    if lengths is None and np.ptp(numbers[:, 0]) > 1.0:
+    if lengths is None and np.ptp(z) > 1.0:
         raise ValueError(
-            f"{path}: the position has no unit and spans {np.ptp(numbers[:, 0]):g}, too much for "
+            f"{path}: the position has no unit and spans {np.ptp(z):g}, too much for "
             "m; write it into the header, such as z_mm,B_T, or give z_unit=mm or cm"
         )
-    distance = (lengths or 1.0) * numbers[:, 0] - exit_m
-    try:
-        return MagneticFieldTable(
-            tuple(distance.tolist()), tuple((scale * (fields or 1.0) * numbers[:, 1]).tolist())
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _two_columns(path: Path) -> tuple[tuple[str, str], Float[np.ndarray, "rows 2"]]:
-    """Names of the two columns, empty without a header, and their numbers."""
-    rows = read_cells(path, "file of a magnetic field")
-    if len(rows[0]) != 2:
-        raise ValueError(f"{path} must have two columns, position and field: it has {len(rows[0])}")
-    if all(number(cell) is None for cell in rows[0]):
-        return (rows[0][0], rows[0][1]), np.array(numbers(path, rows[1:], 2))
-    return ("", ""), np.array(numbers(path, rows, 2))
+    with file_named(Path(path)):
+        return MagneticFieldTable((lengths or 1.0) * z - exit_m, scale * (fields or 1.0) * B)
 
 
 def _unit(units: dict[str, float], given: str | None, header: str, place: str) -> float | None:

@@ -9,17 +9,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.thruster.checks import (
-    check_increasing,
-    check_not_negative,
-    check_positive,
-    check_rows,
-)
+from ep2sindy.data.readers.source import file_named
+from ep2sindy.thruster.checks import check_not_negative, check_positive, set_profile
 from ep2sindy.thruster.constants import K_BOLTZMANN
 from ep2sindy.thruster.magnetic_field import Field, MagneticField
-from ep2sindy.thruster.plume import Plume, relative_area
+from ep2sindy.thruster.plume import Plume
 from ep2sindy.thruster.propellants import Propellant, XenonFits, gas_name
-from ep2sindy.thruster.tables import number, numbers, read_cells
+from ep2sindy.thruster.tables import read_columns
 from ep2sindy.thruster.transport import (
     AnomalousTransport,
     FunctionTransport,
@@ -96,10 +92,7 @@ class VoltageTable:
     voltage: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        check_increasing(self, "time")
-        check_rows(self, "time", "voltage")
-        if min(self.voltage) <= 0.0:
-            raise ValueError(f"VoltageTable.voltage must be positive, got {min(self.voltage):g} V")
+        set_profile(self, "time", "voltage", "V")
         if self.time[0] > 0.0:
             raise ValueError(
                 f"VoltageTable.time must begin at 0, where the record does, or before: it begins "
@@ -134,15 +127,9 @@ def read_voltage(path: str | Path) -> VoltageTable:
     A first row without numbers is a header; lines that begin with # are ignored. Raises ValueError
     for a gap, or as VoltageTable does.
     """
-    path = Path(path)
-    rows = read_cells(path, "file of a voltage")
-    if all(number(cell) is None for cell in rows[0]):
-        rows = rows[1:]
-    time, voltage = zip(*numbers(path, rows, 2), strict=True)
-    try:
-        return VoltageTable(time, voltage)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    _, columns = read_columns(Path(path), "file of a voltage", 2)
+    with file_named(Path(path)):
+        return VoltageTable(*columns)
 
 
 @dataclass(frozen=True)
@@ -183,14 +170,7 @@ class NeutralSpeed:
     speed: Points
 
     def __post_init__(self) -> None:
-        for name in ("distance", "speed"):
-            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
-        check_increasing(self, "distance")
-        check_rows(self, "distance", "speed")
-        if min(self.speed) <= 0.0:
-            raise ValueError(
-                f"NeutralSpeed.speed must be positive everywhere, got {min(self.speed):g} m/s"
-            )
+        set_profile(self, "distance", "speed", "m/s")
 
     def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """Speed in m/s at distances from the exit in m."""
@@ -318,14 +298,6 @@ class Thruster:
         pressure_Pa = 0.0 if background is None else background.pressure_Pa
         shift = self.channel_length * self.transport.shift(pressure_Pa)
         return self.transport.transport.at(distance - shift)
-
-    def relative_area(
-        self, distance: Float[np.ndarray, " z"], tangents: Float[np.ndarray, " z"]
-    ) -> Float[np.ndarray, " z"]:
-        """Cross-section over the channel's at distances from the exit; see `relative_area`."""
-        return relative_area(
-            distance, tangents, inner_radius=self.inner_radius, outer_radius=self.outer_radius
-        )
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from ep2sindy.data.readers.source import file_named
 from ep2sindy.thruster.constants import ATOMIC_MASS, M_ARGON, M_KRYPTON, M_XENON
 from ep2sindy.thruster.propellants import FURTHER_IONIZATIONS, PropellantTable
-from ep2sindy.thruster.tables import numbers, read_cells
+from ep2sindy.thruster.tables import read_columns
 
 GASES = Path(__file__).parent / "gases"
 RATES = ("ionization", "excitation", "momentum")
@@ -121,14 +122,11 @@ def _table(
     }
     rates["T_e_eV"] = tuple(value / scale[first[0]] for value in columns[first[0]])
     rates |= energies
-    try:
+    with file_named(path):
         return PropellantTable(name, mass, coulomb_weight=coulomb_weight, **rates)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def _columns(path: Path) -> dict[str, tuple[float, ...]]:
     """Columns of a CSV file by name; every cell must be a number."""
-    header, *rows = read_cells(path, "table of a propellant")
-    values = zip(*numbers(path, rows, len(header)), strict=True)
-    return dict(zip(header, values, strict=True))
+    header, columns = read_columns(path, "table of a propellant")
+    return dict(zip(header, map(tuple, columns.tolist()), strict=False))  # none without a header

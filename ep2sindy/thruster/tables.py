@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
 
 from ep2sindy.data.readers.source import damage_named
 
@@ -25,6 +27,26 @@ def read_cells(path: Path, what: str, *, may_be_short: bool = False) -> list[lis
     return rows
 
 
+def read_columns(
+    path: Path, what: str, n_columns: int | None = None
+) -> tuple[list[str], Float[np.ndarray, "columns rows"]]:
+    """Names of the columns, none without a header, and their numbers.
+
+    n_columns: None for as many as the first row has. Raises ValueError that names the row of a gap.
+    """
+    header, *rows = cells = read_cells(path, what)
+    if any(number(cell) is not None for cell in header):
+        header, rows = [], cells
+    n = n_columns or len(cells[0])
+    for k, row in enumerate(rows, start=1):
+        if len(row) != n or None in map(number, row):
+            raise ValueError(
+                f"{path} must have {n} numbers in every row: row {k} below the header is "
+                f"{','.join(row)!r}; fill the gap"
+            )
+    return header, np.array(rows, dtype=np.float64).T
+
+
 def number(cell: str) -> float | None:
     """A cell as a finite number, or None."""
     try:
@@ -32,17 +54,3 @@ def number(cell: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
-
-
-def numbers(path: Path, rows: Sequence[Sequence[str]], n_columns: int) -> list[list[float]]:
-    """Every cell as a number; raises ValueError that names the row of a gap."""
-    found = []
-    for k, row in enumerate(rows, start=1):
-        values = [value for cell in row if (value := number(cell)) is not None]
-        if len(values) != n_columns or len(row) != n_columns:
-            raise ValueError(
-                f"{path} must have {n_columns} numbers in every row: row {k} below the header is "
-                f"{','.join(row)!r}; fill the gap"
-            )
-        found.append(values)
-    return found

@@ -14,12 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.thruster.checks import (
-    check_increasing,
-    check_not_negative,
-    check_positive,
-    check_rows,
-)
+from ep2sindy.thruster.checks import check_not_negative, check_positive, set_profile
+from ep2sindy.thruster.walls import share
 from ep2sindy.trust.user_code import identify, load_marked
 
 Points = Sequence[float] | Float[np.ndarray, " points"]
@@ -39,10 +35,7 @@ class AnomalousTransport:
 
     def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """Coefficient c at a distance from the exit in m."""
-        if self.transition == 0.0:
-            return np.where(distance < 0.0, self.c_channel, self.c_plume)
-        share = np.clip(distance / self.transition + 0.5, 0.0, 1.0)
-        return self.c_channel + (self.c_plume - self.c_channel) * share
+        return share(distance, self.c_channel, self.c_plume, self.transition)
 
 
 @dataclass(frozen=True)
@@ -84,12 +77,7 @@ class MultiLogTransport:
     c: Points
 
     def __post_init__(self) -> None:
-        for name in ("distance", "c"):
-            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
-        check_increasing(self, "distance")
-        check_rows(self, "distance", "c")
-        if min(self.c) <= 0.0:
-            raise ValueError(f"MultiLogTransport.c must be positive at every point, got {self.c}")
+        set_profile(self, "distance", "c", "")
 
     def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """Coefficient c at a distance from the exit in m."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module, invalidate_caches
 from importlib.util import find_spec
 from pathlib import Path
@@ -96,6 +96,17 @@ def load_user_module(name: str) -> ModuleType:
     module = import_module(name)
     _OWN[own.stem] = sys.modules[own.stem]
     return module
+
+
+def nodes_of(node: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    """A node of plain settings and all below it, each with its dotted place."""
+    yield place, node
+    if isinstance(node, list):
+        for k, each in enumerate(node):
+            yield from nodes_of(each, f"{place}[{k}]")
+    elif isinstance(node, Mapping):
+        for key, each in node.items():
+            yield from nodes_of(each, f"{place}.{key}" if place else str(key))
 
 
 def own_source(name: str) -> Path | None:

@@ -176,10 +176,14 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
     return FileSource(path, [*stored], read, dims_named=True, channel_m=length, attributes=said)
 
 
-def counted_dates(dates: pd.Series) -> xr.DataArray:
-    """Dates or durations as numbers in the unit that `count_dates` gives."""
-    elapsed_s, unit = count_dates(dates)
-    return xr.DataArray(elapsed_s / seconds_in(unit), attrs={"units": unit})
+def column_array(column: pd.Series, unit: str) -> xr.DataArray:
+    """A column with its unit; dates and durations as numbers in the unit of `count_dates`."""
+    if column.dtype.kind in "mM":
+        elapsed_s, unit = count_dates(column)
+        return xr.DataArray(elapsed_s / seconds_in(unit), attrs={"units": unit})
+    is_number = column.dtype.kind in "iufb"  # with masked ones, whose missing values become NaN
+    values = column.to_numpy(np.float64, na_value=np.nan) if is_number else column.to_numpy(object)
+    return xr.DataArray(values, attrs={"units": unit})
 
 
 def leaves(node: Any) -> dict[str, Any]:

@@ -15,9 +15,8 @@ from typing import TextIO
 import numpy as np
 import pandas as pd
 import xarray as xr
-from jaxtyping import Float
 
-from ep2sindy.data.readers.source import FileSource, Reader, counted_dates
+from ep2sindy.data.readers.source import FileSource, Reader, column_array
 from ep2sindy.data.readers.table_layout import (
     COMMENTS,
     GROUPED,
@@ -75,9 +74,8 @@ def text_source(path: Path, file: TextIO) -> FileSource:
 
     def read(name: str) -> xr.DataArray:
         j = places[name]
-        if j in dates:
-            return counted_dates(dates[j])
-        return xr.DataArray(_numbers(frame[j], name, layout), attrs={"units": header.units[j]})
+        column = dates[j] if j in dates else _numbers(frame[j], name, layout)
+        return column_array(column, header.units[j])
 
     aliases = tuple(number for number in places if number not in names)
     return FileSource(
@@ -175,10 +173,10 @@ def _frame(file: TextIO, layout: Layout) -> pd.DataFrame:
     return frame.reindex(columns=range(len(layout.header.names)))
 
 
-def _numbers(column: pd.Series, name: str, layout: Layout) -> Float[np.ndarray, " rows"]:
+def _numbers(column: pd.Series, name: str, layout: Layout) -> pd.Series:
     """Convert a column to numbers; raise ValueError with the row of a cell that is not a number."""
     if column.dtype.kind in "fiu":
-        return column.to_numpy(dtype=np.float64)
+        return column
     text = column.astype("string").str.strip(" \t\"'")
     is_grouped = text.str.fullmatch(GROUPED[layout.decimal]).fillna(value=False)
     text = text.mask(is_grouped, text.str.replace(f"[^-+\\d{layout.decimal}]", "", regex=True))
@@ -190,7 +188,7 @@ def _numbers(column: pd.Series, name: str, layout: Layout) -> Float[np.ndarray, 
         raise ValueError(
             f"column {name!r} must hold numbers: row {wrong[0] + 1} holds {column.iloc[wrong[0]]!r}"
         )
-    return values.to_numpy(dtype=np.float64, na_value=np.nan)
+    return values
 
 
 CSV = Reader(
@@ -268,13 +266,7 @@ def read_parquet(path: Path) -> FileSource:
     places = {name: k for k, name in enumerate(header.names)}
 
     def read(name: str) -> xr.DataArray:
-        column = frame.iloc[:, places[name]]
-        if column.dtype.kind in "mM":
-            return counted_dates(column)
-        attrs = {"units": header.units[places[name]]}
-        if column.dtype.kind in "iufb":  # with masked ones, whose missing values become NaN
-            return xr.DataArray(column.to_numpy(dtype=np.float64, na_value=np.nan), attrs=attrs)
-        return xr.DataArray(column.to_numpy(dtype=object), attrs=attrs)
+        return column_array(frame.iloc[:, places[name]], header.units[places[name]])
 
     n_rows, n_columns = frame.shape
     return FileSource(
@@ -329,10 +321,7 @@ def read_tdms(path: Path) -> FileSource:
         said = {name: dict(channel.properties) for name, channel in channels.items()}
 
     def read(name: str) -> xr.DataArray:
-        array = values[name]
-        if array.dtype.kind == "M":
-            return counted_dates(pd.Series(array))
-        return xr.DataArray(array, attrs={"units": str(said[name].get(UNIT, ""))})
+        return column_array(pd.Series(values[name]), str(said[name].get(UNIT, "")))
 
     steps = {float(of[STEP]) for of in said.values() if of.get(STEP)}
     return FileSource(

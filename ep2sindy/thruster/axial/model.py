@@ -23,7 +23,7 @@ from ep2sindy.thruster.closures import (
 )
 from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
-from ep2sindy.thruster.plume import ThermalPlume
+from ep2sindy.thruster.plume import ThermalPlume, relative_area
 from ep2sindy.thruster.propellants import PropellantTable
 from ep2sindy.thruster.transport import FunctionTransport, Plasma
 from ep2sindy.thruster.walls import AnodeSheath
@@ -240,7 +240,8 @@ class Spreading:
     def _set_areas(self) -> None:
         state, model = self.state, self.model
         at_faces = 0.5 * (state.tangent[1:] + state.tangent[:-1])
-        area = self.thruster.relative_area(self.from_exit, at_faces)
+        inner, outer = self.thruster.inner_radius, self.thruster.outer_radius
+        area = relative_area(self.from_exit, at_faces, inner_radius=inner, outer_radius=outer)
         model.spread_at[:] = area
         model.spread[1:-1] = 0.5 * (area[1:] + area[:-1])
         model.spread[[0, -1]] = area[[0, -1]]

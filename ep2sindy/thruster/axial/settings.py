@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ep2sindy.thruster.axial.model import CFL
+from ep2sindy.thruster.checks import check_not_negative, check_positive
 from ep2sindy.trust.memory import check_memory
 
 MIN_STEPS = 16  # fewer samples cannot show an oscillation
@@ -30,10 +31,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Raise ValueError if a run could not start or could not be sampled."""
-        if not (np.isfinite(self.sample_s) and self.sample_s > 0.0):
-            raise ValueError(f"sample_s must be finite and positive, got {self.sample_s!r} s")
-        if not (np.isfinite(self.warm_up_s) and self.warm_up_s >= 0.0):
-            raise ValueError(f"warm_up_s must be finite and zero or more, got {self.warm_up_s!r} s")
+        check_positive(self, "sample_s")
+        check_not_negative(self, "warm_up_s", "coldest_T_e_eV")
         if not (np.isfinite(self.duration_s) and self.duration_s >= MIN_STEPS * self.sample_s):
             raise ValueError(
                 f"duration_s must hold at least {MIN_STEPS} sampling steps of "
@@ -47,10 +46,6 @@ class Settings:
         )
         if not 0.0 < self.cfl <= 1.0:
             raise ValueError(f"cfl must be above 0 and at most 1, got {self.cfl!r}")
-        if not 0.0 <= self.coldest_T_e_eV < np.inf:
-            raise ValueError(
-                f"coldest_T_e_eV must be finite and zero or more, got {self.coldest_T_e_eV!r} eV"
-            )
 
 
 def to_json(parameters: dict[str, Any]) -> str:

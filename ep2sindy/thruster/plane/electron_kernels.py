@@ -3,18 +3,19 @@
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
-from ep2sindy.thruster.axial.state_kernels import ENTRY
-from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
-from ep2sindy.thruster.plane.state_kernels import (
+from ep2sindy.thruster.axial.collision_kernels import between_rows
+from ep2sindy.thruster.axial.state_kernels import ENTRY, ONE
+from ep2sindy.thruster.closures import (
     COULOMB,
     COULOMB_LOG,
     EVENTS,
     INELASTIC,
     IONIZATION,
     MOMENTUM,
-    WALL_COLLISIONS,
-    WALL_ENERGY,
+    WALL_COLLISION,
+    WALL_POWER,
 )
+from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
 SIDE_ENERGY = 2.5  # enthalpy in T_e that an electron carries along with an ion leaving sideways
 SQRT_HALF_BITS = 0x3FE6A09E667F3BCD  # bits of the double 1/sqrt(2)
@@ -62,12 +63,6 @@ def sum_columns(state, model, columns):
             state.log_n[i - 1, j] = state.log_n[i, j]
 
 
-@compiled(inline="always")
-def lookup(table, row, share, column):
-    """Linear interpolation between two rows of the closure table."""
-    return table[row, column] + share * (table[row + 1, column] - table[row, column])
-
-
 @compiled(**ENTRY)
 def collisions(state, model, columns):
     """Collision frequency, conductance and losses; returns False if a table ends."""
@@ -78,28 +73,28 @@ def collisions(state, model, columns):
         y = x + model.drift_weight * state.drift_eV[i] * 2.0 / 3.0 * per_eV
         if not (x >= 0.0 and y < top and n > 0.0):
             return False
-        row, hot = int(x), int(y)
+        row, hot = np.uint64(x), np.uint64(y)
         share, hot_share = x - row, y - hot
         neutrals, ions = columns.n_neutrals[i] / n, columns.n_n[i] / n
         walls = state.wall[i] / n  # 1/s
-        log_lambda = lookup(table, row, share, COULOMB_LOG) - 0.5 * np.log(ions)
+        log_lambda = between_rows(table, row, share, COULOMB_LOG) - 0.5 * np.log(ions)
         nu = (
-            neutrals * lookup(table, row, share, MOMENTUM)
-            + neutrals * lookup(table, hot, hot_share, EVENTS)
-            + ions * log_lambda * lookup(table, row, share, COULOMB)
-            + walls * lookup(table, hot, hot_share, WALL_COLLISIONS)
+            neutrals * between_rows(table, row, share, MOMENTUM)
+            + neutrals * between_rows(table, hot, hot_share, EVENTS)
+            + ions * log_lambda * between_rows(table, row, share, COULOMB)
+            + walls * between_rows(table, hot, hot_share, WALL_COLLISION)
             + model.anomalous[i]
         )
         columns.nu[i] = nu
         columns.conductance[i] = E_CHARGE / M_ELECTRON * nu / (nu**2 + model.omega_ce[i] ** 2) * n
-        columns.loss[i] = columns.n_neutrals[i] * lookup(table, hot, hot_share, INELASTIC)
-        columns.loss[i] += state.wall[i] * lookup(table, hot, hot_share, WALL_ENERGY)
+        columns.loss[i] = columns.n_neutrals[i] * between_rows(table, hot, hot_share, INELASTIC)
+        columns.loss[i] += state.wall[i] * between_rows(table, hot, hot_share, WALL_POWER)
         columns.loss[i] += state.side[i] * SIDE_ENERGY * state.T_e_eV[i]
-        inelastic = table[hot + 1, INELASTIC] - table[hot, INELASTIC]
-        wall = table[hot + 1, WALL_ENERGY] - table[hot, WALL_ENERGY]
+        inelastic = table[hot + ONE, INELASTIC] - table[hot, INELASTIC]
+        wall = table[hot + ONE, WALL_POWER] - table[hot, WALL_POWER]
         slope = columns.n_neutrals[i] * inelastic + state.wall[i] * wall
         columns.loss_slope[i] = max(slope * per_eV, 0.0) + state.side[i] * SIDE_ENERGY
-        state.ionization[i] = lookup(table, hot, hot_share, IONIZATION)
+        state.ionization[i] = between_rows(table, hot, hot_share, IONIZATION)
     return True
 
 

@@ -12,11 +12,16 @@ import xarray as xr
 from jaxtyping import Float
 
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
-from ep2sindy.thruster import closures as axial
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.balance import INFLOW
 from ep2sindy.thruster.cache import read_or_run
-from ep2sindy.thruster.closures import TABLE_STEP_EV, closure_table
+from ep2sindy.thruster.closures import (
+    TABLE_STEP_EV,
+    WALL_COLLISION,
+    WALL_POWER,
+    closure_table,
+    table_temperatures,
+)
 from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
 from ep2sindy.thruster.parameters import NeutralSpeed, OperatingPoint, Thruster
 from ep2sindy.thruster.plane import state_kernels as kernels
@@ -138,7 +143,7 @@ def simulate_as(
 class Rows:
     """Sampled arrays, one row per sample."""
 
-    planes: list[Float[np.ndarray, "time z r"]]
+    planes: Float[np.ndarray, "planes time z r"]
     profiles: Float[np.ndarray, "time profiles z"]
     series: Float[np.ndarray, "time series"]
 
@@ -146,23 +151,21 @@ class Rows:
     def room(n_rows: int, grid: MaskedGrid) -> Rows:
         """Arrays for n_rows samples; planes are NaN in the thruster's body."""
         return Rows(
-            [np.full((n_rows, grid.n_z, grid.n_r), np.nan, np.float32) for _ in PLANES],
+            np.full((len(PLANES), n_rows, grid.n_z, grid.n_r), np.nan, np.float32),
             np.empty((n_rows, len(PROFILES), grid.n_z), np.float32),
             np.empty((n_rows, len(SERIES) - 1)),
         )
 
     def until(self, n_rows: int) -> Rows:
         """The first rows, as views."""
-        planes = [plane[:n_rows] for plane in self.planes]
-        return Rows(planes, self.profiles[:n_rows], self.series[:n_rows])
+        return Rows(self.planes[:, :n_rows], self.profiles[:n_rows], self.series[:n_rows])
 
     def march(self, state: PlaneState, model: PlaneModel, sample_s: float, averaged: bool) -> March:
         """A function that records samples of a run into these rows."""
         work = new_work(*state.E.shape)
 
         def march(rows: slice) -> int:
-            planes = [plane[rows] for plane in self.planes]
-            out = (*planes, self.profiles[rows], self.series[rows])
+            out = (*self.planes[:, rows], self.profiles[rows], self.series[rows])
             return advance(state, model, work, sample_s, averaged, *out)[0]
 
         return march
@@ -260,23 +263,17 @@ def check_thruster(thruster: Thruster, point: OperatingPoint) -> None:
         )
 
 
-def plane_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 8"]:
-    """The closures over T_e, with wall losses per ion reaching the wall; columns as in `kernels`.
+def plane_table(thruster: Thruster) -> Float[np.ndarray, "temperatures columns"]:
+    """`closure_table` with wall losses per ion that reaches the wall.
 
     In the axial model, electrons reach the wall at scale * ratio * sqrt(e T_e/m) n / gap, times
     1/(1 - gamma). Here the computed flux of ions to the wall replaces the factor
     ratio * sqrt(e T_e/m) n / gap.
     """
-    axial_table = closure_table(thruster)
-    T = TABLE_STEP_EV * np.arange(len(axial_table))
-    T[0] = 0.1 * TABLE_STEP_EV
-    bohm = np.sqrt(E_CHARGE * T / thruster.propellant.mass)
+    table = closure_table(thruster)
+    bohm = np.sqrt(E_CHARGE * table_temperatures() / thruster.propellant.mass)
     ions = SHEATH_DENSITY_RATIO * bohm / thruster.gap  # 1/s
-    table = np.empty((T.size, 8))
-    for name in ("IONIZATION", "INELASTIC", "EVENTS", "MOMENTUM", "COULOMB", "COULOMB_LOG"):
-        table[:, getattr(kernels, name)] = axial_table[:, getattr(axial, name)]
-    table[:, kernels.WALL_COLLISIONS] = axial_table[:, axial.WALL_COLLISION] / ions
-    table[:, kernels.WALL_ENERGY] = axial_table[:, axial.WALL_POWER] / ions
+    table[:, [WALL_COLLISION, WALL_POWER]] /= ions[:, None]
     return table
 
 

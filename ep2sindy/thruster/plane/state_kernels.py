@@ -10,18 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# Columns of `Model.table`, one row per electron temperature; coefficients in SI, energies in eV.
-(
-    IONIZATION,
-    INELASTIC,
-    EVENTS,
-    MOMENTUM,
-    COULOMB,
-    COULOMB_LOG,
-    WALL_COLLISIONS,  # electron collisions, per ion that reaches the wall
-    WALL_ENERGY,  # energy lost by electrons, per ion that reaches the wall
-) = range(8)
-
 
 class PlaneModel(NamedTuple):
     """Everything that the compiled loops need and that is constant in time."""
@@ -48,7 +36,7 @@ class PlaneModel(NamedTuple):
     cfl: float
     omega_ce: np.ndarray  # (n_z,), rad/s
     anomalous: np.ndarray  # (n_z,), 1/s
-    table: np.ndarray  # (temperatures, 8)
+    table: np.ndarray  # (temperatures, columns), as `plane_table` fills it
     table_step_eV: float
 
 
