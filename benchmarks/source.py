@@ -103,6 +103,12 @@ def mean_speed_km_s(run: xr.Dataset) -> np.ndarray:
     return 1e-3 * speed.interp(z=1e-3 * np.array(list(LIF))).values
 
 
+def speed_misses_km_s(run: xr.Dataset) -> np.ndarray:
+    """How far each speed lies outside of what both pressures have, at the places of `LIF`."""
+    speed, (low, high) = mean_speed_km_s(run), np.sort(np.array(list(LIF.values())), axis=1).T
+    return np.maximum(np.maximum(low - speed, speed - high), 0.0)
+
+
 def zone_coefficients(run: xr.Dataset) -> np.ndarray:
     """Least-squares coefficients of the models of `EQUATIONS` on the downstream zone."""
     form = ep.Differential(split=RandomSplit(test_fraction=0.0))
@@ -174,15 +180,14 @@ def print_balances() -> None:
 def print_measured() -> None:
     """What is measured of an SPT-100, and what both sets have."""
     print("\nion speed (km/s) at 300 V, 5.16 mg/s: at two pressures, and simulated")
-    speeds = {name: mean_speed_km_s(at_point(name, *LIF_POINT)) for name in measured_sets()}
+    runs = {name: at_point(name, *LIF_POINT) for name in measured_sets()}
     print("mm from the anode" + "".join(f"{z:8.0f}" for z in LIF))
     for k in range(2):
         print(f"measured {k + 1}       " + "".join(f"{pair[k]:8.1f}" for pair in LIF.values()))
-    low, high = np.sort(np.array(list(LIF.values())), axis=1).T
-    for name, speed in speeds.items():
-        off = np.maximum(np.maximum(low - speed, speed - high), 0.0)
-        cells = "".join(f"{value:8.1f}" for value in speed)
-        print(f"{name:17s}{cells}   {(off <= NEAR_KM_S).sum()} of {len(LIF)} within 2 km/s")
+    for name, run in runs.items():
+        n_near = (speed_misses_km_s(run) <= NEAR_KM_S).sum()
+        cells = "".join(f"{value:8.1f}" for value in mean_speed_km_s(run))
+        print(f"{name:17s}{cells}   {n_near} of {len(LIF)} within 2 km/s")
     print("\nI_d (A), off; thrust (mN), off the mean of the two; std over mean; frequency (kHz)")
     for (voltage, flow), (current_A, thrusts) in PERFORMANCE.items():
         known = f"{current_A:.2f} A, {thrusts[0]:.1f} to {thrusts[1]:.1f} mN"
