@@ -65,7 +65,7 @@ PERFORMANCE: Mapping[tuple[float, float], tuple[float, tuple[float, float]]] = {
     (201.0, 4.10): (3.49, (47.1, 50.1)),
 }
 NEAR_KM_S = 2.0
-LIF_SPEED = 225.0  # m/s, of the neutrals
+LIF_SPEED = 220.0  # m/s, of the neutrals
 CHECKED = ("guessed start, N = 100", "hard start", "soft start", "N = 200")
 
 

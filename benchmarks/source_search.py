@@ -187,7 +187,7 @@ def judge(numbers: Numbers, limit: float) -> Measures:
 
 def read_sets(folder: Path) -> pd.DataFrame:
     path = folder / "sets.csv"
-    return pd.read_csv(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
+    return pd.read_csv(path) if path.exists() else pd.DataFrame(columns=COLUMNS, dtype=float)
 
 
 def append(folder: Path, row: Mapping[str, float]) -> None:

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from benchmarks.source import (
+    CHECKED,
     DOWNSTREAM,
     LIF_POINT,
     NEAR_KM_S,
     PERFORMANCE,
     POINTS,
+    VARIANTS,
     alternation_eV,
     at_point,
     full_run,
@@ -84,3 +86,16 @@ def test_the_set_lif_has_the_measured_current_and_thrust(point, known):
     assert run.attrs["status"] == "oscillating"
     assert run.attrs["I_d_mean"] == pytest.approx(current_A, rel=0.15 if point[0] < 250 else 0.08)
     assert 1e3 * run.attrs["thrust_N"] == pytest.approx(np.mean(thrusts), rel=0.12)
+
+
+@pytest.mark.parametrize(
+    ("point", "between_grids"), [(LIF_POINT, 0.01), ((300.0, 4.0), 0.03), ((200.0, 5.0), 0.03)]
+)
+def test_the_set_lif_has_one_cycle_on_both_grids(point, between_grids):
+    guessed, hard, soft, fine = (
+        at_point("lif", *point, **VARIANTS[name]).attrs for name in CHECKED
+    )
+    for other in (hard, soft):
+        assert other["f_kHz"] == pytest.approx(guessed["f_kHz"], rel=0.01)
+        assert other["I_d_std"] == pytest.approx(guessed["I_d_std"], rel=0.05)
+    assert fine["f_kHz"] == pytest.approx(guessed["f_kHz"], rel=between_grids)
