@@ -52,8 +52,8 @@ MEASURES = (
     "grid_all", "runs",
 )  # fmt: skip
 COLUMNS = [*BOUNDS, *MEASURES]
-POPULATION, SPREAD = 24, 0.08  # SPREAD: of the first population, as a share of the bounds
-N_RUNS, FIRST_LIMIT = 11, 150.0  # of a set; cost of a member of the first population
+POPULATION, SPREAD = 12, 0.04  # SPREAD: of the first population, as a share of the bounds
+N_RUNS, FIRST_LIMIT = 11, 100.0  # of a set; cost of a member of the first population
 DURATION = {"warm_up_s": 1.5e-3, "duration_s": 2e-3}
 FREQUENCY_KHZ = (15.0, 20.0)
 QUIET, LOUD = 0.3, 0.7  # deviation of the current over its mean
