@@ -41,7 +41,6 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "barrier": (60.0, 2000.0), "anode": (8.0, 300.0), "plume": (8.0, 150.0),
     "electron_scale": (0.3, 1.4), "ion_scale": (0.3, 1.2), "plume_power": (0.0, 1.2),
     "u_n": (150.0, 400.0), "resistance": (0.0, 2.0), "conduction": (2.0, 9.0),
-    "ion_temperature": (500.0, 12e3),
 }  # fmt: skip
 LOGARITHMIC = ("barrier", "anode", "plume")
 # Places within 2 km/s, rms miss of the speeds; largest misses of current and thrust over what is
@@ -79,7 +78,6 @@ def thruster_of(numbers: Mapping[str, float], voltage: float) -> ep.thruster.Thr
             base.wall,
             **{name: numbers[name] for name in ("electron_scale", "ion_scale", "plume_power")},
         ),
-        ion_temperature=numbers["ion_temperature"],
         conduction_factor=numbers["conduction"],
         series_resistance=numbers["resistance"],
     )
@@ -94,7 +92,7 @@ def numbers_of(thruster: ep.thruster.Thruster, u_n: float) -> Numbers:
         "barrier": barrier, "anode": anode, "plume": plume,
         "electron_scale": wall.electron_scale, "ion_scale": wall.ion_scale,
         "plume_power": wall.plume_power, "u_n": u_n, "resistance": thruster.series_resistance,
-        "conduction": thruster.conduction_factor, "ion_temperature": thruster.ion_temperature,
+        "conduction": thruster.conduction_factor,
     }  # fmt: skip
 
 
