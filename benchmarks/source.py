@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -206,6 +207,24 @@ def print_measured() -> None:
         print(f"{voltage:.0f} V, {flow:g} mg/s" + "".join(f" | {cell}" for cell in cells))
 
 
+def print_walls() -> None:
+    """The cycle of the set lif on three grids, as it is and with larger losses to the wall."""
+    print("\nI_d mean / std (A) / frequency (kHz) of the set lif at 200 V, 5 mg/s, by N")
+    thruster, speed = measured_sets()["lif"]
+    point = ep.thruster.OperatingPoint(200.0, 5.0, neutral_speed=speed)
+    wall = thruster.wall
+    for walls in (wall, replace(wall, electron_scale=0.449, plume_power=0.6)):
+        lossy = replace(thruster, wall=walls)
+        runs = {
+            n: ep.thruster.simulate(
+                lossy, point, duration_s=4e-3, warm_up_s=4e-3, n_cells=n, progress=False
+            )
+            for n in (100, 150, 200)
+        }
+        cells = [f"{n}: {row(run)}" for n, run in runs.items()]
+        print(f"{walls.electron_scale:.3f}, {walls.plume_power:.2f} | " + " | ".join(cells))
+
+
 def print_neighbours() -> None:
     """Which cycle a guessed and a hard start reach beside the default set."""
     print("\nI_d std (A) / f (kHz) from a guessed | a hard start, 4 to 8 ms, by c2")
@@ -260,10 +279,10 @@ def rms_off_parabola(x: np.ndarray, values: np.ndarray) -> float:
 
 def main() -> None:
     """Print every table, or those that are named: cycles, balances, neighbours, smoothness,
-    measured."""
+    measured, walls."""
     parts: dict[str, Callable[[], None]] = {
         "cycles": print_cycles, "balances": print_balances, "neighbours": print_neighbours,
-        "smoothness": print_smoothness, "measured": print_measured,
+        "smoothness": print_smoothness, "measured": print_measured, "walls": print_walls,
     }  # fmt: skip
     for name in sys.argv[1:] or parts:
         began = time.process_time()
