@@ -2,20 +2,20 @@
 
 Two densities, of which each process is a power near the means. Ions are renewed at the rate nu_i,
 what ionization moves over n_i, neutrals at nu_n, the same over n_n, and leave at s. Ionization, net
-of what comes back, is of order p in n_i and q in n_n; what leaves as ions is of order r in n_i. The
-Jacobian of the logarithms has
+of what comes back, is of order p in n_i and q in n_n; the ions' outflow is of order r in n_i and u
+in n_n. The Jacobian of the logarithms has
 
-    trace        nu_i (p - r) - nu_n q - s              twice the growth rate
-    determinant  nu_i nu_n q r - nu_i s (p - r)         that of a slow mode: the frequency squared
+    trace        nu_i (p - r) - nu_n q - s                  twice the growth rate
+    determinant  nu_i nu_n (q r - p u) - nu_i s (p - r)     squares of frequency and growth, added
 
 Prints, for every operating point, growth and frequency of the law's rest point, and what theories
-in zero dimensions say of the averages of the same record. The tables of docs/theories.md.
+in zero dimensions say of the averages of the same record: the table of docs/theories.md.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,103 +24,111 @@ import ep2sindy as ep
 from benchmarks import living
 from ep2sindy.studies.processes import fitted_rate, recorded_rates
 
-N_I, N_N, HEATED, BY_NEUTRALS = "n_i", "n_n", "n_i^2*n_n", "n_i*n_n^2"
-PRODUCT, IONS_SQUARED = "n_i*n_n", "n_i^2"
+IONS, NEUTRALS = living.STATES
+LIBRARY = ep.polynomial(living.STATES, degree=3)
+STEP = 1e-5  # of a logarithm, for the orders
+# Structures of conf/exp/theories.yaml: terms of ionization, net of what comes back, and of the ions
+# that leave. Predator and prey have neutrals that grow by themselves, as fast as they cross.
+STRUCTURES = {
+    "supply": (["n_i*n_n"], ["n_i"]),
+    "back_flow": (["n_i*n_n", "n_i"], ["n_i"]),
+    "field": (["n_i*n_n", "n_i*n_n^2", "n_i"], ["n_i", "n_i*n_n"]),
+    "heating": (["n_i*n_n", "n_i^2*n_n"], ["n_i"]),
+    "terms of the law": (["n_i^2*n_n", "n_i*n_n^2"], ["n_i", "n_i^2"]),
+}
 
 
 @dataclass(frozen=True)
-class Orders:
-    """Rates per particle in 1/s, and the orders of ionization and of the ions' outflow."""
+class Balance:
+    """Rates per particle in 1/s, and the orders of ionization and of the ions' outflow.
+
+    ionized, leave: orders in n_i and in n_n.
+    """
 
     nu_i: float
     nu_n: float
     s: float
-    p: float = 1.0
-    q: float = 1.0
-    r: float = 1.0
+    ionized: tuple[float, float] = (1.0, 1.0)
+    leave: tuple[float, float] = (1.0, 0.0)
 
     @property
     def eigenvalue(self) -> complex:
         """Of the mode that grows fastest, in 1/s: growth, and i times the angular frequency."""
-        trace = self.nu_i * (self.p - self.r) - self.nu_n * self.q - self.s
-        determinant = self.nu_i * self.nu_n * self.q * self.r - self.nu_i * self.s * (
-            self.p - self.r
-        )
-        return 0.5 * trace + np.emath.sqrt(0.25 * trace**2 - determinant)
+        (p, q), (r, u) = self.ionized, self.leave
+        driven = self.nu_i * (p - r)
+        half_trace = 0.5 * (driven - self.nu_n * q - self.s)
+        determinant = self.nu_i * self.nu_n * (q * r - p * u) - driven * self.s
+        return half_trace + complex(np.emath.sqrt(half_trace**2 - determinant))
 
-    @property
-    def parts(self) -> str:
-        """What drives the mode, and what damps it."""
+    def __str__(self) -> str:
+        (p, q), (r, u) = self.ionized, self.leave
         return (
-            f"p {self.p:.2f}, q {self.q:.2f}, r {self.r:.2f}; {self.nu_i * (self.p - self.r):.3g} "
-            f"against {self.nu_n * self.q:.3g} + {self.s:.3g} 1/s"
+            f"p {p:.2f}, q {q:.2f}, r {r:.2f}, u {u:.2f}; {self.nu_i * (p - r):.3g} against "
+            f"{self.nu_n * q:.3g} + {self.s:.3g} 1/s"
         )
 
 
-def order(terms: dict[str, float], at: np.ndarray, state: int) -> float:
-    """d ln(rate) / d ln(state) of a rate, which is a sum of terms, at a point."""
-    library = ep.polynomial(living.STATES, degree=3)
-    coef = np.array(list(terms.values()))
-    columns = [library.index(term) for term in terms]
-
-    def rate(values: np.ndarray) -> float:
-        return float(library.evaluate(values[None])[0, columns] @ coef)
-
-    step = 1e-5 * np.eye(2)[state]
-    return float(np.log(rate(at * np.exp(step)) / rate(at * np.exp(-step))) / 2e-5)
+def orders(terms: Mapping[str, float], at: np.ndarray) -> tuple[float, float]:
+    """d ln(rate) / d ln(n_i) and d ln(rate) / d ln(n_n) of a sum of terms."""
+    coef, columns = np.array(list(terms.values())), [LIBRARY.index(term) for term in terms]
+    near = at * np.exp(STEP * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]))
+    logs = np.log(LIBRARY.evaluate(near)[:, columns] @ coef)
+    return (logs[0] - logs[1]) / (2.0 * STEP), (logs[2] - logs[3]) / (2.0 * STEP)
 
 
-def law_at_rest(whole: living.Record) -> tuple[ep.model.RestPoint, Orders]:
-    """The law of five terms refined on three quarters: rest point, rates and orders there."""
+def law_at_rest(whole: living.Record) -> tuple[complex, Balance]:
+    """The law refined on three quarters: eigenvalue of its rest point, and its balance there."""
     fitted, judged = living.parts(whole.run, "last")
     model = living.law(fitted, whole, seed=0).model
-    run = ep.evaluate(model, judged, initial=living.start_of(judged, model))
-    assert run.rest is not None
-    at, ions, neutrals = run.rest.state, model.terms(N_I), model.terms(N_N)
-    moved = {term: ions[term] for term in (HEATED, BY_NEUTRALS)}
-    leaves = {term: -ions[term] for term in (N_I, IONS_SQUARED)}
-    nu_i = leaves[N_I] + leaves[IONS_SQUARED] * at[0]
-    return run.rest, Orders(
-        nu_i,
-        nu_i * at[0] / at[1],
-        -neutrals[N_N],
-        *(order(moved, at, state) for state in (0, 1)),
-        order(leaves, at, 0),
-    )
+    rest = ep.evaluate(model, judged, initial=living.start_of(judged, model)).rest
+    assert rest is not None
+    moved, leave = [
+        {term: sign * model.terms(IONS)[term] for term in terms}
+        for sign, terms in zip((1.0, -1.0), STRUCTURES["terms of the law"], strict=True)
+    ]
+    columns = [LIBRARY.index(term) for term in moved]
+    ionized = float(LIBRARY.evaluate(rest.state[None])[0, columns] @ list(moved.values()))
+    nu_i, nu_n = ionized / rest.state
+    found = Balance(
+        nu_i, nu_n, -model.terms(NEUTRALS)["n_n"],
+        orders(moved, rest.state), orders(leave, rest.state),
+    )  # fmt: skip
+    return complex(rest.growth_per_s, 2.0 * np.pi * rest.frequency_Hz), found
 
 
-def theories(whole: living.Record, speed_m_s: float) -> dict[str, Orders]:
-    """Structures in two densities, each with its rates by the means, and orders by least squares.
+def theories(whole: living.Record, crossing: float) -> dict[str, Balance]:
+    """Structures with their rates by the means of the record, and orders by least squares on it.
 
-    Predator and prey have neutrals that grow by themselves, at the rate at which they cross.
+    crossing: speed of the neutrals over the channel's length, in 1/s.
     """
     run, rates = whole.run, recorded_rates(whole.balances[""], whole.run)
-    means = run.states.mean(axis=0)
+    means, theta = run.states.mean(axis=0), LIBRARY.evaluate(run.states)
     net = rates["ionization"] - rates["returned"]
+
+    def fitted(rate: np.ndarray, terms: Sequence[str]) -> dict[str, float]:
+        columns = theta[:, [LIBRARY.index(term) for term in terms]]
+        return dict(fitted_rate(rate, columns, terms).terms)
+
     nu_i, s = rates["exit_i"].mean() / means[0], rates["exit_n"].mean() / means[1]
-    nu_n = net.mean() / means[1]
-
-    def orders(rate: np.ndarray, terms: Sequence[str]) -> list[float]:
-        library = ep.polynomial(living.STATES, degree=3)
-        columns = library.evaluate(run.states)[:, [library.index(term) for term in terms]]
-        fit = fitted_rate(rate, columns, terms).terms
-        return [order(dict(fit), means, state) for state in (0, 1)]
-
-    crossing = speed_m_s / ep.thruster.Thruster().channel_length
-    out = orders(rates["exit_i"], [N_I, IONS_SQUARED])[0]
-    return {
-        "predator and prey": Orders(nu_i, crossing, -crossing),
-        "supply, k": Orders(nu_i, nu_n, s),
-        "supply, k, return": Orders(nu_i, nu_n, s, q=rates["ionization"].mean() / net.mean()),
-        "supply, k by n_n": Orders(nu_i, nu_n, s, *orders(net, [PRODUCT, BY_NEUTRALS])),
-        "supply, k by n_i": Orders(nu_i, nu_n, s, *orders(net, [PRODUCT, HEATED])),
-        "terms of the law": Orders(nu_i, nu_n, s, *orders(net, [HEATED, BY_NEUTRALS]), out),
-    }
+    returned = -rates["returned"].mean() / means[0]
+    found = {"predator_prey": Balance(nu_i, crossing, -crossing)}
+    for name, (ionized, leave) in STRUCTURES.items():
+        # Ions that come back by w n_i are a process of their own, which the record gives.
+        gross = "n_i" in ionized
+        terms = fitted(rates["ionization"] if gross else net, [t for t in ionized if t != "n_i"])
+        found[name] = Balance(
+            nu_i,
+            net.mean() / means[1],
+            s,
+            orders(terms | ({"n_i": returned} if gross else {}), means),
+            orders(fitted(rates["exit_i"], leave), means),
+        )
+    return found
 
 
-def row(name: str, found: complex, parts: str = "") -> str:
+def row(name: str, found: complex, balance: Balance) -> str:
     growth, frequency = found.real, abs(found.imag) / (2e3 * np.pi)
-    return f"    {name:20s} growth {growth:8.0f} 1/s, {frequency:5.1f} kHz   {parts}"
+    return f"    {name:18s} growth {growth:7.0f} 1/s, {frequency:5.1f} kHz   {balance}"
 
 
 def main() -> None:
@@ -128,16 +136,15 @@ def main() -> None:
     for name in sys.argv[1:] or ["default"]:
         for label in living.oscillating(name):
             whole = living.record(label, living.CHANNEL, name)
-            field = living.field(label, name)
-            print(f"\n{name}, {label}: cycle {field.attrs['f_kHz']:.1f} kHz")
+            print(f"\n{name}, {label}: cycle {living.field(label, name).attrs['f_kHz']:.1f} kHz")
             if name == "default":
-                rest, orders = law_at_rest(whole)
-                turning = rest.growth_per_s + 2j * np.pi * rest.frequency_Hz
-                print(row("law, Jacobian", turning))
-                print(row("law, closed form", orders.eigenvalue, orders.parts))
+                turning, balance = law_at_rest(whole)
+                print(row("law, Jacobian", turning, balance))
+                print(row("law, closed form", balance.eigenvalue, balance))
             speed = living.LIF_SPEED if name == "lif" else living.POINTS[label].neutral_speed
-            for theory, orders in theories(whole, float(speed)).items():
-                print(row(theory, orders.eigenvalue, orders.parts), flush=True)
+            crossing = float(speed) / ep.thruster.Thruster().channel_length
+            for theory, balance in theories(whole, crossing).items():
+                print(row(theory, balance.eigenvalue, balance), flush=True)
 
 
 if __name__ == "__main__":
