@@ -35,6 +35,10 @@ STRUCTURES = {
     "field": (["n_i*n_n", "n_i*n_n^2", "n_i"], ["n_i", "n_i*n_n"]),
     "heating": (["n_i*n_n", "n_i^2*n_n"], ["n_i"]),
     "terms of the law": (["n_i^2*n_n", "n_i*n_n^2"], ["n_i", "n_i^2"]),
+    "law_back": (
+        ["n_i*n_n", "n_i^2*n_n", "n_i*n_n^2", "n_i"],  # of benchmarks.living
+        ["n_i", "n_i^2", "n_i*n_n^2"],
+    ),
 }
 
 
@@ -126,6 +130,14 @@ def theories(whole: living.Record, crossing: float) -> dict[str, Balance]:
     return found
 
 
+def given_back(whole: living.Record) -> str:
+    """What walls and anode give back, in shares of ionization."""
+    means = {name: float(rate.mean()) for name, rate in whole.balances[""].items()}
+    walls, both = means["wall_loss"], means["returned"]
+    shares = [100.0 * rate / means["ionization"] for rate in (walls, both - walls)]
+    return "given back: by the walls {:.0f} %, by the anode {:.0f} % of ionization".format(*shares)
+
+
 def row(name: str, found: complex, balance: Balance) -> str:
     growth, frequency = found.real, abs(found.imag) / (2e3 * np.pi)
     return f"    {name:18s} growth {growth:7.0f} 1/s, {frequency:5.1f} kHz   {balance}"
@@ -137,6 +149,7 @@ def main() -> None:
         for label in living.oscillating(name):
             whole = living.record(label, living.CHANNEL, name)
             print(f"\n{name}, {label}: cycle {living.field(label, name).attrs['f_kHz']:.1f} kHz")
+            print(f"    {given_back(whole)}")
             if name == "default":
                 turning, balance = law_at_rest(whole)
                 print(row("law, Jacobian", turning, balance))
