@@ -429,9 +429,10 @@ def print_several(n_zones: int, draws: Sequence[tuple[str, int]], name: str = "d
 
 def print_zones(name: str = "default") -> None:
     """Six operating points, other zones: free terms, since no inflow is known."""
-    print(f"\nsix points, by zone, free terms: median / worst of the points and {N_SEEDS} seeds")
+    print(f"\n{name}, by zone, free terms: median / worst of the points and {N_SEEDS} seeds")
+    labels = oscillating(name)
     for z in ZONES:
-        wholes = [record(label, z, name) for label in oscillating(name)]
+        wholes = [record(label, z, name) for label in labels]
         cases = [
             case(*parts(whole.run, "last"), whole, seed=seed, search=free)
             for whole in wholes
@@ -502,7 +503,7 @@ def main() -> None:
         "lif_law_told": lambda: print_law(LAW_TOLD, "lif"),
         "lif_law_back": lambda: print_law(LAW_BACK, "lif"),
         "lif_zones": lambda: print_zones("lif"),
-        "lif_several": lambda: print_several(2, ONCE, "lif"),
+        "lif_several": lambda: print_several(2, [("last", 0)], "lif"),
         "free": lambda: print_points(search=free),
         "zones": print_zones,
         "several": lambda: print_several(2, ONCE),
