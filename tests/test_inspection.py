@@ -14,6 +14,7 @@ from scipy.io import savemat
 import ep2sindy as ep
 from ep2sindy.app import inspection
 from ep2sindy.app.inspection import experiments
+from ep2sindy.data.fields import clock_of
 from ep2sindy.data.quantities import axis_of, axis_unit, conversion, quantity_of, split_unit
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.recognition import recognise
@@ -176,6 +177,9 @@ def test_a_time_without_a_unit_is_asked_for_and_counters_are_no_signals(tmp_path
         ep.open_field(path)
     field = ep.open_field(path, units={"time": "ms"})
     np.testing.assert_allclose(field["time"].values, 1e-3 * T)
+    clock = clock_of(ep.open_field(path, units={"time": "step"}))
+    assert clock.duration_text(3.0) == "3 steps"
+    assert clock.frequency_text(0.25) == "0.25 per step"
 
 
 def test_columns_of_one_array_are_signals_of_their_own(tmp_path: Path) -> None:

@@ -95,9 +95,10 @@ def _with_units(
         if not unit:
             unit = COORDINATE_UNITS.get(ours) or KNOWN_UNITS[ours]
             if not plasma:
+                counts = ", or 'data.units={time:step}' if it counts samples" * (ours == "time")
                 no_unit[ours] = (
                     f"{ours} ({variable.name!r}) names no unit: give it, such as "
-                    f"'data.units={{{ours}:{unit}}}'"
+                    f"'data.units={{{ours}:{unit}}}'{counts}"
                 )
         complete[ours] = replace(variable, unit=unit)
     return complete, no_unit

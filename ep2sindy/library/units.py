@@ -55,7 +55,9 @@ def registry() -> pint.UnitRegistry:
     def plain(text: str) -> str:  # LaTeX's m^{-3}, which newer releases of pint do not read
         return text.replace("{", "(").replace("}", ")")
 
-    return pint.UnitRegistry(preprocessors=[plain])
+    found: pint.UnitRegistry = pint.UnitRegistry(preprocessors=[plain])
+    found.define("step = second")  # of times that count samples: displayed as steps, see `Clock`
+    return found
 
 
 @cache
@@ -199,12 +201,14 @@ class Clock:
     def of(unit: str) -> Clock:
         """Clock for the unit of time in a file; units of a second or less give seconds.
 
+        Of times that count samples the unit is `step`, which all values take for a second.
+
         Raises ValueError for text that is not a unit of time.
         """
         if unit == "s":
             return SECONDS
         seconds = seconds_in(unit)
-        return SECONDS if seconds <= 1.0 else Clock(unit, seconds)
+        return SECONDS if seconds <= 1.0 and unit != "step" else Clock(unit, seconds)
 
     def scale(self, duration_s: float) -> tuple[float, str]:
         """Factor from seconds to the displayed unit, and that unit: (1e6, "µs")."""
@@ -224,7 +228,7 @@ class Clock:
         """Duration as text: `182 µs`, `21 years`; a dash if it is not finite."""
         factor, unit = self.scale(duration_s)
         count = f"{duration_s * factor:.{digits}g}"
-        many = "s" if count != "1" and self.unit in ("day", "week", "month", "year") else ""
+        many = "s" if count != "1" and self.unit in ("step", "day", "week", "month", "year") else ""
         return f"{count} {unit}{many}" if math.isfinite(duration_s) else "-"
 
     def frequency_text(self, frequency_Hz: float) -> str:
