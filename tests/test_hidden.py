@@ -1,6 +1,7 @@
 """Hidden states: laws of states that nobody measured, found from those that were."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,10 +10,12 @@ import ep2sindy as ep
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import _hidden_names
+from ep2sindy.estimation import estimate, explanation
+from ep2sindy.estimation.explanation import Explanation
 from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_guess_by, with_guesses
 from ep2sindy.estimation.likelihood import TrajectoryFit, hessian_on, observe
 from ep2sindy.estimation.noise import noise_beside
-from ep2sindy.estimation.problem import scale_problem
+from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import MAX_HIDDEN_DEFECT, hidden_defects
 from tests.programs import composed, computed
 
@@ -155,16 +158,41 @@ def test_ways_in_from_two_states_and_by_a_relation() -> None:
         entrances(ep.polynomial(["x", "y"], degree=2), ["x", "y"], ["z"])
 
 
-def test_growth_rates_come_first_where_a_state_is_positive() -> None:
+def test_only_positive_states_have_growth_rates_which_come_first() -> None:
     library = ep.polynomial(["x", "g"], degree=2)
-    for shift, first in ((0.0, "x*g"), (-1.0, "g")):
+    for shift, first, n_groups in ((0.0, "x*g", 2), (-1.0, "g", 1)):
         run = only("x")
         moved = Trajectory(run.t, run.states + shift, ["x"])
         groups = list(with_guesses(Task([moved], library, hidden=["g"])))
+        assert len(groups) == n_groups
         ((known, ways),) = groups[0]
         assert ways[0].term == first
         assert known.facts.only == {"x": (first,)}
         assert known.hidden == ()
+
+
+def test_ways_are_followed_that_process_noise_explains(monkeypatch: pytest.MonkeyPatch) -> None:
+    followed = []
+
+    def explain(problem: EstimationProblem, **settings: Any) -> Explanation:
+        followed.append(settings["under_noise"].solution.fits)
+        return explanation.explain(problem, **settings)
+
+    monkeypatch.setattr(estimate, "explain", explain)
+    lorenz = only("x", noise=0.01, system=ep.lorenz())
+    library = ep.polynomial(["x", "v", "h"], degree=2)
+    assert not ep.estimate(lorenz, library, hidden=["v", "h"]).misfit
+    assert followed == [True]  # of three ways
+    followed.clear()
+    assert ep.estimate(walk(lorenz.t), library, hidden=["v", "h"]).misfit
+    assert followed
+    assert not any(followed)
+
+
+def walk(t: np.ndarray) -> Trajectory:
+    """A random walk, which no exact trajectory follows."""
+    steps = np.random.default_rng(0).standard_normal((len(t), 1))
+    return Trajectory(t, np.cumsum(steps, axis=0), ["x"])
 
 
 def test_guesses_are_close_without_noise() -> None:

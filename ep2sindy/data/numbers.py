@@ -216,10 +216,19 @@ def quantiles(draws: Float[np.ndarray, "draws ..."], levels: Sequence[float]) ->
 
     Between two draws of n lies the share 1 / (n + 1) of all others, so bands hold what they say.
     """
-    kept = np.isfinite(draws).any(axis=0)
-    filled = np.where(kept, draws, 0.0)
-    of = np.nanquantile if np.isnan(filled).any() else np.quantile
-    return np.where(kept, of(filled, levels, axis=0, method="weibull"), np.nan)
+    # Sorted along the last axis, which is many times as fast as np.nanquantile.
+    ordered = np.sort(np.moveaxis(np.where(np.isfinite(draws), draws, np.nan), 0, -1), axis=-1)
+    n = np.isfinite(ordered).sum(axis=-1)
+    found = np.empty((len(levels), *n.shape))
+    for k, level in enumerate(levels):
+        place = np.clip(level * (n + 1) - 1, 0, np.maximum(n - 1, 0))
+        below = place.astype(np.int64)
+        above = np.minimum(below + 1, np.maximum(n - 1, 0))
+        low, high = (
+            np.take_along_axis(ordered, at[..., None], axis=-1)[..., 0] for at in (below, above)
+        )
+        found[k] = low + (place - below) * (high - low)
+    return found
 
 
 def band_of(draws: Float[np.ndarray, "draws ..."], level: float) -> np.ndarray:

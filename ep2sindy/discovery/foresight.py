@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from ep2sindy.forecasting.baselines import AUTOREGRESSION, NEIGHBOURS, baseline_errors
-from ep2sindy.model.comparison import REPEATS
 from ep2sindy.signals.trace import Trace
 
 # Error of neighbours, in standard deviations, at which a signal is no longer foreseen: halfway to
@@ -29,8 +28,7 @@ def is_linear(signal: Trace) -> bool:
     trajectory of a few states goes on like that, unless noise drowns it. False for signals that
     repeat themselves, are driven by inputs, or have under twenty turns: they are not looked at.
     """
-    repeats = signal.cycle is not None and signal.cycle.share >= REPEATS
-    if repeats or signal.run.input_names or signal.n_periods < ENOUGH_TURNS:
+    if signal.repeats or signal.run.input_names or signal.n_periods < ENOUGH_TURNS:
         return False
     n, turn = len(signal.t), max(1, round(TURN * signal.per_period))
     longest = min(max(1, round(AHEAD * signal.per_period)), n // 4)

@@ -30,7 +30,7 @@ from ep2sindy.forecasting.state_estimation import StateEstimator, estimate_state
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.names import number_text
 from ep2sindy.library.relations import relations_of
-from ep2sindy.model.comparison import REPEATS, SPIRALS
+from ep2sindy.model.comparison import SPIRALS
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Once, at_once
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -41,8 +41,9 @@ from ep2sindy.signals.trace import Trace, is_positive
 # starts from which it is counted, and draws of each.
 CLEARLY, N_TRIED, N_DRAWS_TRIED = 0.8, 20, 20
 
-# Candidates per equation if no equation is known, so that there are few combinations.
-DEPTH_OF_BOTH = 2
+# Candidates of a size if no equation is known, so that there are few combinations, or if there is no
+# cycle to live on: there the best of a size foresees as well as the eighth.
+FEW = 2
 
 MAX_FITTED = 3000  # samples from the end of the fitted part that a search for hidden states sees
 
@@ -150,8 +151,8 @@ class Preparation:
             functions = fit_functions(functions, smoothed.run, off)
         if states.unsmoothed:
             run, method = end_of(run), by_trajectories(method)
-        elif not states.known:
-            method = replace(method, depth=min(method.depth, DEPTH_OF_BOTH))
+        elif not (states.known and past.repeats):
+            method = replace(method, depth=min(method.depth, FEW))
         library = self._library(states, functions, told)
         search = partial(
             discover, run, library, method, hidden=states.hidden, decimate=None, seed=seed
@@ -272,7 +273,7 @@ def try_in_turn(
         tried = [each for each in tried if each.n_states <= 2] or tried
     else:
         tried = [each for each in tried if each.n_states > 1] or tried
-        if past.cycle is not None and past.cycle.share >= REPEATS:
+        if past.repeats:
             tried = [each for each in tried if each.n_states == 2] or tried
         elif linear and smoothed:
             tried = [smoothed[0].linear(past)]

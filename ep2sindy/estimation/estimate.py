@@ -16,12 +16,13 @@ from ep2sindy.data.coerce import Task, check_domain
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import SearchMonitor, check_limit_s, check_size, growing_parts
-from ep2sindy.estimation.explanation import Explanation, explain
+from ep2sindy.estimation.explanation import Explanation, explain, explain_under_noise
 from ep2sindy.estimation.hidden import Entrance, with_guesses
 from ep2sindy.estimation.likelihood import Gram, gram, hessian_on
 from ep2sindy.estimation.noise import remark
 from ep2sindy.estimation.observation import Solution
 from ep2sindy.estimation.problem import (
+    FIRST_MAX_TERMS,
     MIN_SAMPLES,
     SAMPLES_PER_TERM,
     ByCoefficient,
@@ -207,46 +208,83 @@ class _Settings(NamedTuple):
 
 
 def _answer(task: Task, settings: _Settings) -> tuple[Explanation, Sequence[Trajectory]]:
-    """Answer a task from all of its runs."""
-    best, monitor = [], settings.monitor
-    for group in with_guesses(task) if task.hidden else [[(task, ())]]:
-        tried = []
-        for known, ways in group:
-            tried.append(_try(task, known, ways, settings))
-            if monitor.ended:
-                break
-        best.append(min(tried, key=lambda each: (bool(each[0].misfit), each[0].solution.rank)))
-        if monitor.ended or not best[-1][0].misfit:
+    """Answer a task from all of its runs.
+
+    The ways in which hidden states may enter are tried under process noise first. Those that
+    explain the samples then are followed to an exact trajectory, and those that ran away, of which
+    that says nothing; if none of these explains them, so is the likeliest of the others, with few
+    terms.
+    """
+    if not task.hidden:
+        return _Way.of(task, task, (), settings).answer(settings), task.runs
+    tried: list[tuple[Explanation, Sequence[Trajectory]]] = []
+    doubtful: list[tuple[Explanation, _Way]] = []
+    for group in with_guesses(task):
+        ways = [_Way.of(task, known, entrances, settings) for known, entrances in group]
+        for under_noise, way in [(way.begin(settings), way) for way in ways]:
+            if not under_noise.solution.fits and np.isfinite(under_noise.solution.deviance):
+                doubtful.append((under_noise, way))
+            elif not settings.monitor.ended:
+                tried.append((way.answer(settings, under_noise), way.runs))
+        if settings.monitor.ended or any(not answer.misfit for answer, _ in tried):
             break
-    return min(best, key=lambda each: bool(each[0].misfit))
+    else:
+        for under_noise, way in sorted(doubtful, key=lambda each: each[0].solution.deviance)[:1]:
+            few = settings._replace(max_terms=settings.max_terms or FIRST_MAX_TERMS)
+            tried.append((way.answer(few, under_noise), way.runs))
+    return min(tried, key=lambda each: (bool(each[0].misfit), each[0].solution.rank))
 
 
-def _try(
-    task: Task, known: Task, ways: Sequence[Entrance], settings: _Settings
-) -> tuple[Explanation, Sequence[Trajectory]]:
-    """Answer a task by one way in which its hidden states may enter."""
-    check_runs(known)
-    measured = task.runs[0].state_names
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """A task by one way in which its hidden states may enter. words: on it and on what is left out.
 
-    def problem_of(library: Library) -> EstimationProblem:
-        return scale_problem(
-            known.runs, library, measured=measured, courses=settings.courses,
-            monitor=settings.monitor,
+    runs: with guesses of these states.
+    """
+
+    problem: EstimationProblem
+    runs: Sequence[Trajectory]
+    words: tuple[str, ...]
+
+    @staticmethod
+    def of(task: Task, known: Task, entrances: Sequence[Entrance], settings: _Settings) -> _Way:
+        """known: the task with guesses of hidden states, which are no states of it."""
+        check_runs(known)
+        measured = task.runs[0].state_names
+
+        def problem_of(library: Library) -> EstimationProblem:
+            return scale_problem(
+                known.runs, library, measured=measured, courses=settings.courses,
+                monitor=settings.monitor,
+            )  # fmt: skip
+
+        def widen() -> EstimationProblem:
+            more = polynomial(known.library.variables, degree=int(known.library.degrees.max()) + 1)
+            return problem_of(known.library + more)
+
+        problem = replace(problem_of(known.library), widen=widen)
+        n_samples = sum(run.n_samples for run in known.runs)
+        lonely = (
+            f"{n_samples - problem.n_samples} of {n_samples} samples are left out: fewer than "
+            f"{MIN_SAMPLES} stand together between gaps"
+        )
+        words = [lonely] * (problem.n_samples < n_samples) + [each.words for each in entrances]
+        return _Way(problem, known.runs, tuple(words))
+
+    def begin(self, settings: _Settings) -> Explanation:
+        """Answer under process noise."""
+        return self._told(explain_under_noise(self.problem, max_terms=settings.max_terms))
+
+    def answer(self, settings: _Settings, under_noise: Explanation | None = None) -> Explanation:
+        """Answer by an exact trajectory, if one explains the samples."""
+        found = explain(
+            self.problem, max_terms=settings.max_terms, align=settings.align,
+            under_noise=under_noise,
         )  # fmt: skip
+        return self._told(found)
 
-    def widen() -> EstimationProblem:
-        more = polynomial(known.library.variables, degree=int(known.library.degrees.max()) + 1)
-        return problem_of(known.library + more)
-
-    problem = replace(problem_of(known.library), widen=widen)
-    found = explain(problem, max_terms=settings.max_terms, align=settings.align)
-    n_samples = sum(run.n_samples for run in known.runs)
-    lonely = (
-        f"{n_samples - problem.n_samples} of {n_samples} samples are left out: fewer than "
-        f"{MIN_SAMPLES} stand together between gaps"
-    )
-    words = [lonely] * (problem.n_samples < n_samples) + [way.words for way in ways]
-    return replace(found, remarks=(*words, *found.remarks)), known.runs
+    def _told(self, found: Explanation) -> Explanation:
+        return replace(found, remarks=(*self.words, *found.remarks))
 
 
 def _report(

@@ -2,12 +2,13 @@
 
 Each is a `Solution` under another `Observation`, and the one of least rank is reported. The search
 for an exact trajectory starts from smoothed states. If what it finds does not fit, it starts again
-from states under process noise, and then from other smoothings. Hidden states are first sought
-under process noise, since their guesses are far off.
+from states under process noise, and then from other smoothings. With hidden states, whose guesses
+are far off, it starts from what was found under process noise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import compress
@@ -85,18 +86,40 @@ class Explanation:
     remarks: tuple[str, ...] = ()
 
 
-def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -> Explanation:
+def explain(
+    problem: EstimationProblem, *, max_terms: int | None, align: bool,
+    under_noise: Explanation | None = None,
+) -> Explanation:  # fmt: skip
     """The most likely support, and what beside its trajectory explains the samples, if need be.
 
     max_terms: of one equation; None begins with 7, and allows more where an equation needs them.
+    under_noise: of the same problem, if it was asked for before, see `explain_under_noise`.
     At the limit of its time, or interrupted while its progress is shown, the search ends with the
     best that it has.
     """
+    problem = replace(problem, most_terms=max_terms or FIRST_MAX_TERMS)
+    begun = None if under_noise is None else under_noise.solution
+    return _in_time(problem, lambda: _explain(problem, begun, align, wider=max_terms is None))
+
+
+def explain_under_noise(problem: EstimationProblem, *, max_terms: int | None) -> Explanation:
+    """What explains the samples if process noise moves the states; ends as `explain` does.
+
+    Of hidden states it is quick, and nearly always explains the samples if an exact trajectory
+    does. The reverse does not hold: process noise makes up for much.
+    """
+    problem = replace(problem, most_terms=max_terms or FIRST_MAX_TERMS)
+    return _in_time(
+        problem, lambda: _explanation(_solve_under_noise(on_likeliest_courses(problem)))
+    )
+
+
+def _in_time(problem: EstimationProblem, search: Callable[[], Explanation]) -> Explanation:
+    """What a search of a problem finds, or the best that it has when it is ended."""
     monitor = problem.monitor
     monitor.best = None
     try:
-        problem = replace(problem, most_terms=max_terms or FIRST_MAX_TERMS)
-        return _explain(problem, align, wider=max_terms is None)
+        return search()
     except (OutOfTimeError, KeyboardInterrupt, SystemError) as stop:
         late, interrupted = isinstance(stop, OutOfTimeError), is_interruption(stop)
         # Nobody follows a silent search, which may be one of many: an interruption ends them all.
@@ -133,12 +156,16 @@ def _explanation(
     return Explanation(solution, misfit, solution.observation.delays, remarks)
 
 
-def _explain(problem: EstimationProblem, align: bool, *, wider: bool) -> Explanation:
+def _explain(
+    problem: EstimationProblem, under_noise: Solution | None, align: bool, *, wider: bool
+) -> Explanation:
     """`explain` without a limit to its time. wider: True allows equations to have more terms."""
-    problem, first, under_noise = on_likeliest_courses(problem), None, None
-    if not problem.measured.all():
-        under_noise = _solve_under_noise(problem)
+    first = None
+    if under_noise is not None:
+        problem = under_noise.problem
         first = settle(under_noise.fit)
+    else:
+        problem = on_likeliest_courses(problem)
     if first is None or not first.fits:
         first = _best(_search_by_size(problem, wider=wider), first)
     exact, best = _compare(first, under_noise)

@@ -103,7 +103,7 @@ def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]
 
     They come in groups, the most natural first; the next group counts if no way of it fits. A
     single measured state that is positive has a growth rate, whose equation keeps it positive; one
-    that takes either sign has a rate.
+    that takes either sign has a rate, for no growth rate would let it through zero.
     """
     measured = task.runs[0].state_names
     found = entrances(task.library, measured, task.hidden)
@@ -112,6 +112,8 @@ def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]
         groups = [found]
     elif all(is_positive(run.t, run.states[:, 0]) for run in task.runs):
         groups = sorted(groups, key=lambda ways: ways[0][0].term == task.hidden[0])
+    else:
+        groups = [ways for ways in groups if ways[0][0].term == task.hidden[0]] or groups
     for group in groups:
         yield [(_insert_guesses(task, ways), ways) for ways in group]
 

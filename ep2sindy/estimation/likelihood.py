@@ -311,8 +311,8 @@ def enough_substeps(fit: TrajectoryFit) -> int:
         with np.errstate(over="ignore", invalid="ignore"):
             change = problem.ends(starts, fit.free, n) - problem.ends(starts, fit.free, 2 * n)
             errors = np.square(change) / fit.process
-            errors = np.delete(errors, problem.all_records.breaks, axis=0)
-        if (errors.mean(axis=0) <= SUBSTEP_ERROR**2).all():
+            errors = np.delete(errors, problem.all_records.breaks, axis=0).mean(axis=0)
+        if (errors <= SUBSTEP_ERROR**2).all():
             break
         n *= 2
     return n

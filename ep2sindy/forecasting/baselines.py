@@ -399,12 +399,15 @@ class Neighbours:
         tried = spread_evenly(len(place), N_TRIED) if len(place) else np.empty(0, dtype=np.int64)
         steps = 1 + spread_evenly(apart, N_HORIZONS)
         own = self.delay * (self.n_delays - 1) + apart  # steps over which moments share samples
-        off = np.square(moments[tried, None] - moments).sum(axis=2)
+        square = np.square(moments).sum(axis=1)
+        off = square[tried, None] + square - 2.0 * moments[tried] @ moments.T
         off[np.abs(place[tried, None] - place) <= own] = np.inf
         usable = [number for number in NUMBERS if number + LEAST_KNOWN <= len(place) - 2 * own - 1]
         if not usable:
             return {}
-        nearest = np.argsort(off, axis=1)[:, : usable[-1]]
+        nearest = np.argpartition(off, usable[-1] - 1, axis=1)[:, : usable[-1]]
+        nearer_first = np.argsort(np.take_along_axis(off, nearest, axis=1), axis=1)
+        nearest = np.take_along_axis(nearest, nearer_first, axis=1)
         later = values[place[nearest][..., None] + steps, : self.n_states]
         truth = values[place[tried][:, None] + steps, : self.n_states]
         return {n: float(np.square(later[:, :n].mean(axis=1) - truth).mean()) for n in usable}

@@ -47,7 +47,7 @@ UPPER = 0.5 + 0.5 * LEVEL  # level of its upper bound
 StatesOf = Callable[[Trajectory], Trajectory]
 
 # Starts of the forecasts whose bands are calibrated, draws of each, and how far they go.
-N_STARTS, N_DRAWS, PERIODS_AHEAD = 40, 100, 4.0
+N_STARTS, N_DRAWS, N_WEIGHED, PERIODS_AHEAD = 40, 100, 30, 4.0
 # Slow variations from start to start that tell the error of a share, and the least such error; with
 # under twice as many starts, a band is not told.
 N_WAVES, SURELY = 4, 1e-3
@@ -228,12 +228,17 @@ class RollingStarts:
         samples = self.record.columns(self.estimator.names)
         return np.stack([samples[k : k + self.longest] for k in self.first])
 
-    def ends(self, states_of: StatesOf | None, advance: Advance = nothing) -> list[FittedState]:
-        """The state before every start, from its past alone."""
+    def pasts(self, states_of: StatesOf | None) -> list[Trajectory]:
+        """The states before every start, made of their past alone."""
+        back = 2 * self.estimator.memory
+        pasts = [self.record.window(max(0, k - back), k) for k in self.first.tolist()]
+        return pasts if states_of is None else [states_of(past) for past in pasts]
+
+    def ends(self, pasts: Sequence[Trajectory], advance: Advance = nothing) -> list[FittedState]:
+        """The state before every start."""
         found = []
-        for k in self.first.tolist():
-            past = self.record.window(max(0, k - 2 * self.estimator.memory), k)
-            found.append(self.estimator.filter(past if states_of is None else states_of(past)))
+        for past in pasts:
+            found.append(self.estimator.filter(past))
             advance(1)
         return found
 
@@ -307,17 +312,19 @@ def calibrate(
         return replace(estimator, widths=unknown)
     first = spread_starts(run.t, begin, longest, N_STARTS)
     tried = [RollingStarts(estimator.pushed(factor), run, first, longest) for factor in FACTORS]
-    with progress.stage(None, "", "width of the forecasts' bands"):
-        ahead = [each.forecast(each.ends(states_of), N_DRAWS, seed) for each in tried]
     scale = zero_to_one(run.columns(estimator.names).std(axis=0))
-    errors = [
-        np.median(squared_errors(each.measured(own), each.truth, scale))
-        for each, own in zip(tried, ahead, strict=True)
-    ]
-    best = int(np.argmin(errors))
-    if spirals(run.columns(estimator.names)):
-        return replace(tried[best].estimator, widths=unknown)
-    off = tried[best].off(ahead[best], LEVEL)
+    with progress.stage(None, "", "width of the forecasts' bands"):
+        pasts = tried[0].pasts(states_of)
+        ends = [each.ends(pasts) for each in tried]
+        ahead = [r.forecast(own, N_WEIGHED, seed) for r, own in zip(tried, ends, strict=True)]
+        errors = [
+            np.median(squared_errors(each.measured(own), each.truth, scale))
+            for each, own in zip(tried, ahead, strict=True)
+        ]
+        best = int(np.argmin(errors))
+        if spirals(run.columns(estimator.names)):
+            return replace(tried[best].estimator, widths=unknown)
+        off = tried[best].off(tried[best].forecast(ends[best], N_DRAWS, seed), LEVEL)
     edges = np.append(2 ** np.arange(int(np.log2(longest)) + 1), longest + 1) - 1
     widths = np.full((len(edges) - 1, len(estimator.measured)), nan)
     widths[:, estimator.measured] = [

@@ -285,7 +285,7 @@ def forecast_skill(
     assert linear is None or isinstance(linear, Autoregression)
     rolling = RollingStarts(estimator, record, first, longest)
     with watch.stage(len(first), "start", "forecasts") as advance:
-        ends = rolling.ends(states_of, advance)
+        ends = rolling.ends(rolling.pasts(states_of), advance)
     ahead = rolling.forecast(ends, check_count("n_draws", n_draws), seed)
     begins = _bins(longest, period_s / record.dt_s)
     scale = zero_to_one(own.states[n_fitted:].std(axis=0))

@@ -20,7 +20,6 @@ from ep2sindy.signals.attractor import (
 from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency, has_decayed, power_spectrum
 
 LONG = 8.0  # fewest periods in a record whose first half may be left out as a transient
-REPEATS = 0.9  # least share of the variance that the waveform of a cycle explains; chaos: 0.5-0.75
 
 # Depth below zero, in standard deviations of the data, from which a density counts as negative.
 BELOW_ZERO = 1e-3
@@ -194,7 +193,7 @@ class ComparedRecord:
     @property
     def _repeats(self) -> bool:
         """True if the record repeats one cycle; otherwise runs are compared by statistics first."""
-        return self.cycle is not None and self.cycle.share >= REPEATS
+        return self.cycle is not None and self.cycle.repeats
 
     @property
     def _is_long(self) -> bool:

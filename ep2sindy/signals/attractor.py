@@ -26,6 +26,9 @@ MIN_VISIBLE = 0.1
 
 MIN_SHARE = 0.5  # least share of the variance that the waveform explains if there is a period
 
+# Least share from which a record repeats itself: that of chaos is 0.5 to 0.75, of some nearly this.
+REPEATS = 0.9
+
 MAX_HARMONICS = 16
 
 SAMPLES_PER_HARMONIC = 2.5  # fewest samples per period of a harmonic; the Nyquist limit is two
@@ -65,6 +68,11 @@ class Cycle:
     @property
     def n_periods(self) -> float:
         return float((self.phase[-1] - self.phase[0]) / (2.0 * np.pi))
+
+    @property
+    def repeats(self) -> bool:
+        """Whether the waveform is all there is; otherwise it is what chaos has on average."""
+        return self.share >= REPEATS
 
     def waveform(self, phase: Float[np.ndarray, " points"]) -> Float[np.ndarray, "points n_states"]:
         """States of the periodic waveform at the given phases, in rad."""

@@ -33,7 +33,6 @@ MAINS_Hz, MAINS_ERROR, MAINS_TOLD = (50.0, 60.0, 100.0, 120.0), 1e-3, 3e-3
 # A year has 365 to 365.25 days. Two decades hold three periods: an error of 0.02 is rarely met.
 CALENDAR, CALENDAR_ERROR, CALENDAR_TOLD = ("day", "year"), 1e-3, 0.02
 
-REPEATS = 0.9  # least share of the variance of the waveform: some chaos keeps time nearly as well
 MIN_TOLD = 20  # fewest periods in which a phase that returns is told from one that walks
 # Mean square of a random walk of n unit steps about its best line, over n: one in a hundred walks
 # of twenty steps is below this, and fewer of longer ones (simulated).
@@ -200,7 +199,7 @@ def _looks_driven(signal: Trace) -> tuple[str, float] | None:
     if found := _round_number(record.frequency_Hz, N_ERRORS * record.error, signal.clock):
         words, f_Hz = found
         return f"its frequency is {words} to its resolution", 1.0 / f_Hz
-    repeats = signal.cycle.share >= REPEATS and len(between_gaps(signal.t)) == 1
+    repeats = signal.cycle.repeats and len(between_gaps(signal.t)) == 1
     if not (repeats and record.returns):
         return None
     return (

@@ -97,6 +97,11 @@ class Trace:
         return float(self.t[-1] - self.t[0]) * self.frequency_Hz
 
     @property
+    def repeats(self) -> bool:
+        """Whether it repeats one cycle, or else is chaos, or grows or decays."""
+        return self.cycle is not None and self.cycle.repeats
+
+    @property
     def per_period(self) -> float:
         """Mean number of samples in a period."""
         return self.period_s / mean_step(self.t)
