@@ -405,7 +405,7 @@ def stiff(k_dt: float) -> tuple[ep.SparseModel, ep.Trajectory]:
 
 
 @pytest.mark.parametrize("noise", [0.0, pytest.param(0.01, marks=pytest.mark.slow), 0.05])
-@pytest.mark.parametrize("k_dt", [0.5, 2.0, 5.0, 50.0])
+@pytest.mark.parametrize("k_dt", [0.5, 2.0, 5.0, 20.0])
 @pytest.mark.parametrize("step", [RungeKutta(), RungeKutta(32)])
 def test_stiff_model_is_right_or_says_that_it_is_not(
     k_dt: float, noise: float, step: RungeKutta
