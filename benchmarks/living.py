@@ -2,11 +2,10 @@
 
 Equations that conserve what ions and neutrals of the whole channel exchange, as `+exp=breathing`
 finds them: over operating points, splits of the record and seeds, on the default source, on the
-former one, and on `thruster=lif`, whose ions flow back (`lif`, `lif_law`, `lif_law_told`); beside
-free terms, in other zones, in several at once (`several`, `three`), in
-noise, and from the (z, r) simulator. Every model called living is run again by another
-solver, ten times as long; its processes are compared with the balance of the zone. Prints the
-tables of docs/living.md; name some to print those alone.
+former one, and on `thruster=lif`, whose ions flow back (`lif`, `lif_law_back`); beside free terms,
+in other zones, in several at once (`several`, `three`), in noise, and from the (z, r) simulator.
+Every model called living is run again by another solver, ten times as long; its processes are
+compared with the balance of the zone. Prints the tables of docs/living.md, or those that are named.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as field_of
-from functools import cache
+from functools import cache, partial
 from itertools import product
 from typing import Any
 
@@ -82,6 +81,8 @@ LAW_TOLD = replace(
     exchange=[("n_n", "n_i", ["n_i*n_n", "n_i^2*n_n", "n_i*n_n^2"]), ("n_i", "n_n", "known")],
     outflow={"n_i": ["n_i", "n_i^2"], "n_n": "known"},
 )
+# Where ions flow back, those that leave go with the neutrals, too.
+LAW_BACK = replace(LAW_TOLD, outflow={"n_i": ["n_i", "n_i^2", "n_i*n_n^2"], "n_n": "known"})
 LIF, LIF_SPEED = measured_sets()["lif"]
 SETS = {"default": ep.thruster.Thruster(), "former": FORMER, "lif": LIF}
 
@@ -164,9 +165,9 @@ def record(label: str, z: str | tuple[float, float] = CHANNEL, name: str = "defa
 
 
 @cache
-def zones_record(label: str, n_zones: int) -> Record:
+def zones_record(label: str, n_zones: int, name: str = "default") -> Record:
     """Averages over zones of equal length that make up the channel."""
-    run = field(label)
+    run = field(label, name)
     edges = np.linspace(0.0, ep.thruster.Thruster().channel_length, n_zones + 1)
     zones = {f"z{k + 1}": tuple(edges[k : k + 2]) for k in range(n_zones)}
     settings = ZoneAverage(STATES, zones=zones)
@@ -195,14 +196,9 @@ class AllTerms:
         return np.ones((1, len(xy)), dtype=np.bool_)
 
 
-def law(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
-    """The terms of `LAW`, with nothing selected."""
-    return under(LAW, fitted, whole, seed=seed, search=AllTerms())
-
-
-def law_told(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
-    """The terms of `LAW_TOLD`, with nothing selected."""
-    return under(LAW_TOLD, fitted, whole, seed=seed, search=AllTerms())
+def law(fitted: ep.Trajectory, whole: Record, *, seed: int, roles: ep.Roles = LAW) -> ep.Discovery:
+    """The terms that roles name, with nothing selected."""
+    return under(roles, fitted, whole, seed=seed, search=AllTerms())
 
 
 def under(
@@ -367,9 +363,10 @@ def print_points(
     print(line("all", everything))
 
 
-def print_law(search: Callable, name: str = "default") -> None:
+def print_law(roles: ep.Roles, name: str = "default") -> None:
     """Six operating points, terms that are given: the worst of three splits, and coefficients."""
-    print(f"\n{search.__doc__} Coefficients over those of the record: medians of the splits")
+    print(f"\n{roles.exchange}, {roles.outflow}; coefficients over the record's: medians of splits")
+    search = partial(law, roles=roles)
     for label in oscillating(name):
         whole, ratios, cases, verdicts = record(label, CHANNEL, name), [], [], []
         for split, seed in ONCE:
@@ -414,12 +411,12 @@ def print_profiles() -> None:
         print(f"{label:24s} eps {found.terms['n_i*n_n*R_ion']:.2f}, R2 {found.r2:.3f}", flush=True)
 
 
-def print_several(n_zones: int, draws: Sequence[tuple[str, int]]) -> None:
+def print_several(n_zones: int, draws: Sequence[tuple[str, int]], name: str = "default") -> None:
     """Six operating points, the channel cut into zones of equal length."""
     print(f"\n{n_zones} zones, equations that conserve: median / worst of {len(draws)} draws")
     everything = []
-    for label in POINTS:
-        whole = zones_record(label, n_zones)
+    for label in oscillating(name):
+        whole = zones_record(label, n_zones, name)
         cases = [
             case(*parts(whole.run, s), whole, seed=seed, search=by_neighbourhood)
             for s, seed in draws
@@ -429,18 +426,19 @@ def print_several(n_zones: int, draws: Sequence[tuple[str, int]]) -> None:
     print(line("all", everything))
 
 
-def print_zones() -> None:
+def print_zones(name: str = "default") -> None:
     """Six operating points, other zones: free terms, since no inflow is known."""
-    print(f"\nsix points, by zone, free terms: median / worst of the points and {N_SEEDS} seeds")
+    print(f"\n{name}, by zone, free terms: median / worst of the points and {N_SEEDS} seeds")
+    labels = oscillating(name)
     for z in ZONES:
-        wholes = [record(label, z) for label in POINTS]
+        wholes = [record(label, z, name) for label in labels]
         cases = [
             case(*parts(whole.run, "last"), whole, seed=seed, search=free)
             for whole in wholes
             for seed in range(N_SEEDS)
         ]
-        name = z if isinstance(z, str) else f"{1e3 * z[0]:g} to {1e3 * z[1]:g} mm"
-        print(line(name, cases), flush=True)
+        words = z if isinstance(z, str) else f"{1e3 * z[0]:g} to {1e3 * z[1]:g} mm"
+        print(line(words, cases), flush=True)
 
 
 def noisy(run: ep.Trajectory, share: float, n_periods: float, *, seed: int) -> ep.Trajectory:
@@ -494,13 +492,17 @@ def main() -> None:
     """Print every table, or those that are named."""
     tables: dict[str, Callable[[], None]] = {
         "points": print_points,
-        "law": lambda: print_law(law),
-        "law_told": lambda: print_law(law_told),
+        "law": lambda: print_law(LAW),
+        "law_told": lambda: print_law(LAW_TOLD),
+        "law_back": lambda: print_law(LAW_BACK),
         "profiles": print_profiles,
         "former": lambda: print_points("former", draws=ONCE),
         "lif": lambda: print_points("lif", search=told, draws=ONCE),
-        "lif_law": lambda: print_law(law, "lif"),
-        "lif_law_told": lambda: print_law(law_told, "lif"),
+        "lif_law": lambda: print_law(LAW, "lif"),
+        "lif_law_told": lambda: print_law(LAW_TOLD, "lif"),
+        "lif_law_back": lambda: print_law(LAW_BACK, "lif"),
+        "lif_zones": lambda: print_zones("lif"),
+        "lif_several": lambda: print_several(2, [("last", 0)], "lif"),
         "free": lambda: print_points(search=free),
         "zones": print_zones,
         "several": lambda: print_several(2, ONCE),

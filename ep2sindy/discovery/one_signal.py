@@ -41,8 +41,8 @@ from ep2sindy.signals.trace import Trace, is_positive
 # starts from which it is counted, and draws of each.
 CLEARLY, N_TRIED, N_DRAWS_TRIED = 0.8, 20, 20
 
-# Candidates of a size if no equation is known, so that there are few combinations, or if there is no
-# cycle to live on: there the best of a size foresees as well as the eighth.
+# Candidates of a size if no equation is known, so that there are few combinations, or if there is
+# no cycle to live on: there the best of a size foresees as well as the eighth.
 FEW = 2
 
 MAX_FITTED = 3000  # samples from the end of the fitted part that a search for hidden states sees

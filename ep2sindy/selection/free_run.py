@@ -63,6 +63,8 @@ DEARER = 1
 # `systems`: its error stays below 1e-9 variances. The second step is for sparser samples.
 N_SUBSTEPS = 2
 
+N_DOUBTFUL = 2  # systems that are refined on all data if none lives where it was not fitted
+
 # A state that is farther from its mean than this many standard deviations has diverged.
 BLOW_UP = 20.0
 
@@ -115,8 +117,8 @@ class FreeRunScore:
     derived from it; None takes all. n_starts: number of runs over every held-out part for models
     without inputs, at phases spread over the period; all must end on the cycle.
     max_combinations: of more, the most promising are tried, those whose candidates rank best in
-    their own fronts; the note says so. n_confirmed: most systems to refine on all data. seed: of
-    the random windows.
+    their own fronts; the note says so. n_confirmed: most systems to refine on all data; two at most
+    if none lives where it was not fitted. seed: of the random windows.
     """
 
     bounds: FreeRunBounds | None = field(default_factory=FreeRunBounds)
@@ -165,7 +167,8 @@ class FreeRunScore:
         living = find_living(trials)
         ranked = order_equals(sorted(living, key=lambda trial: trial.rank(self.margin)))
         by_error = sorted(trials, key=lambda trial: (trial.error, trial.loss))
-        confirmed = self._confirm(ranked or by_error, measure, runs, progress)
+        best = ranked[: self.n_confirmed] or by_error[: min(N_DOUBTFUL, self.n_confirmed)]
+        confirmed = self._confirm(best, measure, runs, progress)
         won = min(confirmed, key=lambda each: each.rank)
         scores = found.score(np.array([t.error for t in trials]), trials.index(won.trial))
         note = f"{reason}{won.text(len(living), len(trials))}{found.left_out}"
@@ -215,14 +218,13 @@ class FreeRunScore:
 
     def _confirm(
         self,
-        ranked: Sequence[Trial],
+        best: Sequence[Trial],
         measure: Measure,
         runs: Sequence[Trajectory],
         progress: Progress,
     ) -> list[Confirmed]:
         """The systems, refined on all data in order, up to one that nothing after it can outdo."""
         found: list[Confirmed] = []
-        best = ranked[: self.n_confirmed]
         for trial in count_pieces(progress, best, "system", "refined on all data"):
             attracting = [each for each in found if each.share]
             if attracting and trial.system.n_free > attracting[0].trial.system.n_free + DEARER:
