@@ -43,6 +43,7 @@ from typing import NamedTuple
 import numpy as np
 
 import ep2sindy as ep
+from benchmarks.collection import collected_draw, collected_names
 from benchmarks.known_systems import KINDS, OTHERS, noisy
 from benchmarks.living import DOWNSTREAM, POINTS, parts, record
 from benchmarks.many_states import lorenz_96
@@ -53,8 +54,7 @@ from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.model.inputs import COURSES, curve_through
 from ep2sindy.studies.living import start_of
-from ep2sindy.systems.collection import collected_names
-from ep2sindy.systems.draws import DRAWS, realization
+from ep2sindy.systems.draws import DRAWS
 from ep2sindy.systems.systems import System, lorenz
 from tests.models import model_of
 
@@ -321,8 +321,8 @@ class Judged(NamedTuple):
     inside: float
 
 
-def collected_draw(name: str, noise: float, number: int) -> Judged:
-    system, runs = realization(name, noise, number)
+def judged_draw(name: str, noise: float, number: int) -> Judged:
+    system, runs = collected_draw(name, noise, number)
     start = time.process_time()
     found = ep.estimate(runs, system.model.library)
     cpu_s = time.process_time() - start
@@ -363,7 +363,7 @@ def _behind(system: System, runs: Sequence[ep.Trajectory], found: Estimate) -> f
 
 def collection(noises: Sequence[float], n: int) -> None:
     for noise, number in product(noises, range(n)):
-        rows = [collected_draw(name, noise, number) for name in collected_names()]
+        rows = [judged_draw(name, noise, number) for name in collected_names()]
         cpu = [row.cpu_s for row in rows]
         wrong = [row for row in rows if row.failure]
         print(
@@ -382,7 +382,7 @@ def prices(noises: Sequence[float], n: int) -> None:
     for noise, weight in product(noises, (0.0, 0.25, 0.5, 1.0, 1.5)):
         supports.GAMMA = weight
         rows = [
-            collected_draw(name, noise, number)
+            judged_draw(name, noise, number)
             for name, number in product(collected_names(), range(n))
         ]
         missed, false = sum(row.missed for row in rows), sum(row.false for row in rows)

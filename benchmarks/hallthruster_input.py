@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from benchmarks.landmark import ExponentialWall
 from ep2sindy.runtime.files import read_json
 from ep2sindy.runtime.progress import Progress
 from ep2sindy.thruster.axial.simulate import simulate
@@ -34,7 +35,6 @@ from ep2sindy.thruster.transport import (
 )
 from ep2sindy.thruster.walls import (
     AnodeSheath,
-    ExponentialWall,
     FixedAnode,
     SheathWall,
     Wall,

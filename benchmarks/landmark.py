@@ -8,15 +8,121 @@ authors distribute (landmark-plasma.com); the table is the caller's to supply.
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.thruster.checks import check_not_negative
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
-from ep2sindy.thruster.propellants import TabulatedRates
+from ep2sindy.thruster.propellants import FloatArray, XenonFits
 from ep2sindy.thruster.transport import AnomalousTransport
-from ep2sindy.thruster.walls import ExponentialWall, FixedAnode
+from ep2sindy.thruster.walls import FixedAnode, share
 
 ALPHA_CHANNEL = {1: 1.0, 2: 0.5, 3: 0.4}  # energy-loss coefficient by case; 1 in the plume
 LANDMARK_POINT = OperatingPoint(300.0, 5.0, neutral_speed=150.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TabulatedRates(XenonFits):
+    """Xenon by a table over the mean energy 1.5 T_e in place of formulas, as defined by LANDMARK.
+
+    mean_energy_eV: increasing. ionization_rate: m^3/s. energy_loss_rate: eV m^3/s. elastic_rate:
+    constant momentum transfer, m^3/s. Coulomb collisions and the drift energy K are left out. Below
+    the first row both coefficients fall to zero linearly; beyond the last row they are constant, as
+    the benchmark's authors use them.
+    """
+
+    mean_energy_eV: tuple[float, ...]
+    ionization_rate: tuple[float, ...]
+    energy_loss_rate: tuple[float, ...]
+    elastic_rate: float = 2.5e-13  # LANDMARK test case 3
+    drift_weight: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        energy = np.asarray(self.mean_energy_eV)
+        lengths = {len(self.mean_energy_eV), len(self.ionization_rate), len(self.energy_loss_rate)}
+        if len(lengths) > 1 or energy.size < 2 or not np.all(np.diff(energy) > 0.0):
+            raise ValueError(
+                "a rate table needs two or more rows of increasing mean energy, with both rates "
+                f"in every row: got lengths {len(self.mean_energy_eV)}, "
+                f"{len(self.ionization_rate)}, {len(self.energy_loss_rate)}; sort the rows first"
+            )
+
+    def _interpolate(self, T_e_eV: FloatArray, values: tuple[float, ...]) -> FloatArray:
+        return np.interp(1.5 * T_e_eV, (0.0, *self.mean_energy_eV), (0.0, *values))
+
+    def ionization(self, T_e_eV: FloatArray) -> FloatArray:
+        """Rate coefficient in m^3/s."""
+        return self._interpolate(T_e_eV, self.ionization_rate)
+
+    def energy_loss(self, T_e_eV: FloatArray) -> FloatArray:
+        """Energy lost in all inelastic collisions, in eV m^3/s."""
+        return self._interpolate(T_e_eV, self.energy_loss_rate)
+
+    def events(self, T_e_eV: FloatArray) -> FloatArray:
+        """Zero: LANDMARK's constant momentum transfer includes all collisions."""
+        return np.zeros_like(T_e_eV)
+
+    def momentum(self, T_e_eV: FloatArray) -> FloatArray:
+        """Momentum lost to neutrals, in m^3/s."""
+        return np.full_like(T_e_eV, self.elastic_rate)
+
+    def coulomb(self, T_e_eV: FloatArray) -> FloatArray:
+        """Zero: this closure has no Coulomb collisions."""
+        return np.zeros_like(T_e_eV)
+
+
+@dataclass(frozen=True)
+class ExponentialWall:
+    """Wall loss 1e7 alpha eps exp(-20/eps) with eps = 1.5 T_e, as LANDMARK defines it.
+
+    power_weights: alpha in the channel and in the plume. Electrons collide with the channel
+    wall at 1e7 1/s; ions never do. transition: as for `SheathWall`.
+    Source: LANDMARK, test case 3.
+    """
+
+    power_weights: Sequence[float]
+    frequency: float = 1e7  # 1/s
+    sheath_V: float = 20.0
+    transition: float = 0.0  # m
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "power_weights", tuple(map(float, self.power_weights)))
+        check_not_negative(self, "frequency", "sheath_V", "transition")
+        if len(self.power_weights) != 2 or min(self.power_weights) < 0.0:
+            raise ValueError(
+                "ExponentialWall.power_weights must be two numbers, in the channel and in the "
+                f"plume, zero or more: {self.power_weights} came"
+            )
+
+    def ion_loss(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
+        """No ion reaches the wall."""
+        return np.zeros_like(T_e_eV)
+
+    def collision(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
+        """Constant frequency, in 1/s."""
+        return np.full_like(T_e_eV, self.frequency)
+
+    def power(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
+        """Power lost to the wall per electron, in eV/s."""
+        energy = 1.5 * T_e_eV
+        return self.frequency * energy * np.exp(-self.sheath_V / energy)
+
+    def ion_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """1 in the channel and 0 in the plume, but the ion loss itself is zero."""
+        return share(distance, 1.0, 0.0, self.transition)
+
+    def collision_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Share of the wall collisions: electrons collide in the channel only."""
+        return share(distance, 1.0, 0.0, self.transition)
+
+    def power_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """alpha at a distance from the exit in m, negative inside."""
+        return share(distance, self.power_weights[0], self.power_weights[1], self.transition)
 
 
 def landmark_thruster(case: int, rates: TabulatedRates) -> Thruster:
@@ -57,4 +163,4 @@ def read_landmark_rates(path: Path) -> TabulatedRates:
             f"m^3/s, energy loss in eV m^3/s): {error}"
         ) from error
     energy, ionization, loss = columns
-    return TabulatedRates(energy, ionization, loss)
+    return TabulatedRates(mean_energy_eV=energy, ionization_rate=ionization, energy_loss_rate=loss)

@@ -30,7 +30,6 @@ from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import Iteration, RefinementProblem, RefinementSettings
 from ep2sindy.refinement.refine import refine
-from ep2sindy.refinement.steps import HermiteSimpson
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from tests.single_shooting import SingleShooting
 
@@ -237,9 +236,6 @@ def compare(case: Case) -> None:
     print(f"  the same, to its usual tolerance       {whole:9.4f} s")
     free = cpu_s(partial(ours, case, shooting, free_start=True), n_runs=9)
     print(f"  the same, starts fitted too            {free:9.4f} s")
-    implicit = MultipleShooting(step=HermiteSimpson())
-    timed = cpu_s(partial(ours, case, implicit, free_start=False), n_runs=9)
-    print(f"  the same, Hermite-Simpson              {timed:9.4f} s")
     others: dict[str, float] = {
         "forward sensitivities, least_squares": cpu_s(
             partial(ours, case, SingleShooting(), free_start=False), n_runs=3

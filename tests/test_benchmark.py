@@ -17,9 +17,7 @@ from ep2sindy.runtime.parallel import Serial
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies.benchmark import Study, Variant, cells, merits
-from ep2sindy.systems import collection
-from ep2sindy.systems.collection import collected
-from ep2sindy.systems.draws import realization, system_names
+from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import damped_oscillator
 from tests.rules import BySize
 
@@ -199,38 +197,6 @@ def test_a_wider_library_holds_the_same_model() -> None:
         realization("lorenz", 0.0, 0, degree=1)
 
 
-def test_the_collection_is_read_as_it_is_written() -> None:
-    """Equations of dysts, expanded: their rates are those of the package's own code."""
-    pytest.importorskip("dysts")
-    from dysts import flows
-
-    names = system_names(["dysts"])
-    assert len(names) > 70
-    assert len(set(names)) == len(names)
-    for name in ("Lorenz", "Aizawa", "HyperRossler", "SprottJerk", "LorenzCoupled"):
-        system, entry = collected(name), getattr(flows, name)()
-        x = system.initial + 0.1
-        rates = np.array(entry.rhs(x, 0.0))
-        np.testing.assert_allclose(system.model.derivative(x, np.empty(0)), rates, rtol=1e-12)
-        assert system.duration_s == pytest.approx(10.0 * entry.period)
-        assert round(system.duration_s * system.rate_Hz) == 1000
-    first, other = (realization("Rossler", 0.05, number)[1][0] for number in (0, 1))
-    assert not np.array_equal(first.states[0], other.states[0])
-
-
 def test_systems_that_there_are_not() -> None:
-    pytest.importorskip("dysts")
     with pytest.raises(ValueError, match=r"unknown systems \['Lorentz'\]; there are"):
-        system_names(["lorenz", "Lorentz"])
-    with pytest.raises(ValueError, match="a system of polynomial equations named 'Duffing'"):
-        collected("Duffing")
-
-
-def test_without_the_collection_the_error_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(collection, "find_spec", lambda name: None)
-    collection.collected_names.cache_clear()
-    with pytest.raises(ValueError, match=r'pip install "ep2sindy\[benchmark\]", or name'):
-        system_names(["dysts"])
-    assert system_names(["lorenz"]) == ("lorenz",)
+        outcomes_of(systems=["lorenz", "Lorentz"], variants={"STLSQ": STLSQ_})

@@ -110,18 +110,3 @@ def test_a_rival_without_pysindy_is_refused(tmp_path: Path) -> None:
     message = r"PySINDy is not there: pip install \"ep2sindy\[benchmark\]\""
     with pytest.raises(ValueError, match=message):
         run_config(config)
-
-
-def test_systems_of_the_collection_are_counted_together(tmp_path: Path) -> None:
-    pytest.importorskip("dysts")
-    overrides = [
-        f"output={tmp_path}", "n_realizations=1", "parallel=serial", "noises=[0.01]",
-        "systems=[Lorenz,SprottA,lorenz]", "variants=[STLSQ]",
-    ]  # fmt: skip
-    folder = run_config(composed(*overrides))
-    counted = summary_of(folder)["cells"]
-    assert [(c["system"], c["n"]) for c in counted] == [("dysts", 2), ("lorenz", 1)]
-    outcomes = pd.read_csv(folder / "tables" / "outcomes.csv")
-    assert set(outcomes["system"]) == {"Lorenz", "SprottA", "lorenz"}
-    page = (folder / "report.html").read_text()
-    assert "Systems that are not selected" in page

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
+from benchmarks.collection import collected_draw
 from ep2sindy.estimation.likelihood import TrajectoryFit, divergence_rate
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.model.flow import Steps, _in_arrays, ends, flow
 from ep2sindy.model.flow_kernels import _advance
 from ep2sindy.model.vector_field import VectorField
-from ep2sindy.systems.draws import realization
 
 N = 37  # no multiple of the lanes
 
@@ -96,7 +96,7 @@ def test_supports_that_exchanges_between_exact_flows_do_not_reach(
     draw: tuple[str, float, int],
 ) -> None:
     pytest.importorskip("dysts")
-    system, runs = realization(*draw)
+    system, runs = collected_draw(*draw)
     found = ep.estimate(runs, system.model.library)
     assert np.array_equal(found.model.coef != 0.0, system.model.coef != 0.0)
     assert not found.misfit

@@ -8,7 +8,7 @@ from torchdiffeq import odeint
 
 import ep2sindy as ep
 from ep2sindy.refinement.ode import ODE, Drive, ScaledEquations
-from ep2sindy.refinement.steps import FusedRungeKutta, HermiteSimpson, RungeKutta, Step
+from ep2sindy.refinement.steps import FusedRungeKutta, RungeKutta, Step
 
 SCALE = np.array([2.0, 3.0])
 
@@ -77,7 +77,7 @@ def test_tangents_agree_with_autograd() -> None:
     torch.testing.assert_close(out[:, :, 1:], tangents)
 
 
-@pytest.mark.parametrize("step", [RungeKutta(), RungeKutta(2), FusedRungeKutta(), HermiteSimpson()])
+@pytest.mark.parametrize("step", [RungeKutta(), RungeKutta(2), FusedRungeKutta()])
 def test_steps_are_of_order_four(step: Step) -> None:
     """x' = -x from one: the end of a step against exp(-h)."""
     library = ep.named_terms(["x"], ["x"])

@@ -15,7 +15,7 @@ from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import Iteration, Method
 from ep2sindy.refinement.refine import Refinement
-from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
+from ep2sindy.refinement.steps import RungeKutta
 from ep2sindy.refinement.windows import cut_windows, dominant_window
 from ep2sindy.systems.systems import System
 from tests.models import model_of
@@ -82,13 +82,9 @@ def test_methods_agree_on_the_minimiser() -> None:
 
     for free_start in (True, False):
         best = fitted(MultipleShooting(), free_start=free_start)
-        for method, tolerance in (
-            (SingleShooting(), 1e-7),
-            (MultipleShooting(step=HermiteSimpson()), 1e-4),
-        ):
-            other = fitted(method, free_start=free_start)
-            assert other.status == "converged"
-            np.testing.assert_allclose(other.model.coef, best.model.coef, rtol=tolerance)
+        other = fitted(SingleShooting(), free_start=free_start)
+        assert other.status == "converged"
+        np.testing.assert_allclose(other.model.coef, best.model.coef, rtol=1e-7)
     other = fitted(NelderMead(tolerance=1e-3), free_start=False)
     assert other.loss == pytest.approx(best.loss, rel=1e-4)
 
@@ -202,7 +198,7 @@ def test_unequal_steps_and_inputs_are_followed() -> None:
     library = ep.named_terms(["x", "u"], ["x*u"])
     model = ep.SparseModel(library, ["x"], np.array([[-0.6]]))
     data = ep.Trajectory(t, x[:, None], ["x"], u[:, None], ["u"])
-    for method in (MultipleShooting(), MultipleShooting(step=HermiteSimpson()), SingleShooting()):
+    for method in (MultipleShooting(), SingleShooting()):
         found = ep.refine(model, [data], window=50, n_windows=4, method=method, seed=rng)
         assert found.model.coef[0, 0] == pytest.approx(-1.0, abs=1e-6)
 
@@ -409,10 +405,10 @@ def stiff(k_dt: float) -> tuple[ep.SparseModel, ep.Trajectory]:
 
 
 @pytest.mark.parametrize("noise", [0.0, pytest.param(0.01, marks=pytest.mark.slow), 0.05])
-@pytest.mark.parametrize("k_dt", [0.5, 2.0, 5.0, 50.0])
-@pytest.mark.parametrize("step", [RungeKutta(), HermiteSimpson()])
+@pytest.mark.parametrize("k_dt", [0.5, 2.0, 5.0, 20.0])
+@pytest.mark.parametrize("step", [RungeKutta(), RungeKutta(32)])
 def test_stiff_model_is_right_or_says_that_it_is_not(
-    k_dt: float, noise: float, step: RungeKutta | HermiteSimpson
+    k_dt: float, noise: float, step: RungeKutta
 ) -> None:
     model, data = stiff(k_dt)
     rng = np.random.default_rng(1)
@@ -428,7 +424,7 @@ def test_stiff_model_is_right_or_says_that_it_is_not(
         used = model.coef.T[model.coef.T != 0.0]
         allowed = np.maximum(4.0 * np.sqrt(np.diag(covariance)), 1e-3 * np.abs(used))
         assert (np.abs(errors(found, model) * used) < allowed).all()
-    if k_dt <= 2.0 or (k_dt == 5.0 and noise and isinstance(step, HermiteSimpson)):
+    if k_dt <= 2.0 or (step.n_substeps == 32 and (k_dt == 5.0 or noise == 0.0)):
         assert found.status == "converged"
 
 

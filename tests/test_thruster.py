@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.landmark import landmark_thruster
 from ep2sindy.thruster.axial.heavy_kernels import heavy_step
 from ep2sindy.thruster.axial.model import build_model, cell_faces, lengths_and_centres
 from ep2sindy.thruster.axial.settings import to_json
@@ -15,7 +14,7 @@ from ep2sindy.thruster.axial.state_kernels import CELL_SUMS, new_sums, new_work
 from ep2sindy.thruster.closures import IONIZATION, TABLE_STEP_EV, closure_table
 from ep2sindy.thruster.magnetic_field import MagneticField
 from ep2sindy.thruster.parameters import OPERATING_POINTS, OperatingPoint, Thruster
-from ep2sindy.thruster.propellants import TabulatedRates, XenonFits
+from ep2sindy.thruster.propellants import XenonFits
 from ep2sindy.thruster.transport import AnomalousTransport
 from ep2sindy.thruster.verdict import judge_status
 
@@ -143,8 +142,6 @@ def test_verdict_follows_the_late_amplitude(growth_per_record, level, verdict):
         (lambda: Thruster(channel_length=0.06), r"channel must end inside .* lengthen the domain"),
         (lambda: Thruster(inner_radius=0.06), r"inner_radius must be below outer_radius"),
         (lambda: MagneticField(peak=0.0), r"MagneticField\.peak must be finite and positive"),
-        (lambda: TabulatedRates((2.0, 1.0), (0.0, 0.0), (0.0, 0.0)), r"increasing mean energy"),
-        (lambda: landmark_thruster(4, TabulatedRates((1.0, 2.0), (0.0, 1.0), (0.0, 1.0))), "got 4"),
     ],
 )
 def test_bad_parameters_say_what_must_hold(build, message):

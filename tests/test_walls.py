@@ -62,19 +62,11 @@ def test_shares_change_at_the_exit_or_across_a_layer():
     np.testing.assert_allclose(soft.collision_weight(DISTANCE), [1.0, 0.75, 0.5, 0.25, 0.0])
 
 
-def test_landmark_wall_is_the_benchmarks_formula():
-    wall = ep.thruster.ExponentialWall(power_weights=[0.5, 1.0])
-    np.testing.assert_allclose(wall.power(T, 0.0, M_XENON), 1.5e7 * T * np.exp(-20.0 / (1.5 * T)))
-    np.testing.assert_array_equal(wall.power_weight(DISTANCE), [0.5, 0.5, 1.0, 1.0, 1.0])
-    np.testing.assert_array_equal(wall.collision_weight(DISTANCE), [1.0, 1.0, 0.0, 0.0, 0.0])
-
-
 @pytest.mark.parametrize(
     ("build", "message"),
     [
         (lambda: ep.thruster.wall_material("glass"), r"there are walls of \['BN-SiO2', .*"),
         (lambda: ep.thruster.SheathWall(yield_0=1.0), r"SheathWall\.yield_0 must be below 1"),
-        (lambda: ep.thruster.ExponentialWall((1.0,)), r"power_weights must be two numbers"),
     ],
 )
 def test_bad_walls_say_what_must_hold(build, message):

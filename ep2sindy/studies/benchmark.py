@@ -1,14 +1,12 @@
 """The thesis's synthetic benchmark: how often each variant of the method finds known equations.
 
 The experiment is `+exp=benchmark`. Source: the thesis, appendix, II-E and III-C. The experiment
-`+exp=frontier` uses the same variants and figures of merit. With `systems=dysts` it runs on a
-collection of chaotic systems, which are counted together.
+`+exp=frontier` uses the same variants and figures of merit.
 """
 
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,8 +35,8 @@ from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.study import Count, Deferred, Levels, Names, NamesOrOne
-from ep2sindy.systems.draws import COLLECTION, DRAWS, realization, system_names
+from ep2sindy.studies.study import Count, Deferred, Levels, Names
+from ep2sindy.systems.draws import DRAWS, check_systems, realization
 from ep2sindy.systems.systems import System
 
 FIGURE = (
@@ -58,14 +56,8 @@ INTRODUCTION = (
     "thesis's own numbers, for 100 realizations. CPU: time of one search (all equations of one "
     "realization), on one thread."
 )
-COLLECTED = (
-    "The systems of dysts are chaotic, with polynomial equations; a record of ten periods, of 100 "
-    "samples each, starts anywhere on the attractor, and the library holds all products of the "
-    "states up to the degree of the equations. They are counted together."
-)
 SELECTED = {"selected": "selected exactly right", "on_front": "right on the front"}
 Draw = Callable[[str, float, int], tuple[System, list[Trajectory]]]  # `realization`, with settings
-MAX_EXAMPLES = 4  # systems of the collection whose first realizations are drawn
 TITLES = {
     "on_front": "True equations on the front, % of realizations",
     "selected": "True equations selected, % of realizations",
@@ -118,14 +110,13 @@ def merits(finding: Finding, system: System) -> dict[str, float]:
 class Study:
     """Run every variant on the same realizations of all systems and noises; count successes.
 
-    systems: names of systems, or `dysts` for all of that collection, which needs the package.
-    noises: standard deviations of the white noise, in RMS of each state. n_trajectories: number of
-    trajectories in each realization. degree: of the library; None takes each system's own.
-    variants: names among the definitions. keep: whether a run goes on with the finished
-    realizations of one that was broken off.
+    systems: names in `systems.draws.DRAWS`. noises: standard deviations of the white noise, in RMS
+    of each state. n_trajectories: number of trajectories in each realization. degree: of the
+    library; None takes each system's own. variants: names among the definitions. keep: whether a
+    run goes on with the finished realizations of one that was broken off.
     """
 
-    systems: NamesOrOne
+    systems: Names
     noises: Levels
     n_realizations: Count
     n_trajectories: Count
@@ -148,8 +139,6 @@ class Study:
                 f"Realizations of every system and noise level: {self.n_realizations}.",
                 Text(INTRODUCTION, page_only=True),
             )
-            if COLLECTION in set(outcomes["group"]):
-                report.add(Text(COLLECTED, page_only=True))
             draw = partial(benchmark_figure, counted, thesis=published)
             report.figure("benchmark", draw, FIGURE)
             self._add_examples(variants, report)
@@ -165,9 +154,8 @@ class Study:
         if not methods:
             return
         variant, method = methods.popitem()
-        systems = [name for name in self._names if name in DRAWS] or self._names[:MAX_EXAMPLES]
-        pairs = [*product(systems, sorted(self.noises))]
-        seed = [report.seed, 0, *variant.encode()]  # as in `_outcomes`
+        pairs = [*product(self.systems, sorted(self.noises))]
+        seed = [report.seed, 0, *variant.encode()]  # as in `judged`
         draw = self._draw(report.seed)
         found = first_realizations(method, pairs, draw, seed=seed, progress=report.watch)
         report.section(f"Identified by {variant}")
@@ -180,14 +168,14 @@ class Study:
     ) -> pd.DataFrame:
         """Figures of merit of every variant on every realization; workers share the realizations.
 
-        One row per system, noise, number and variant. group: the name under which a system is
-        counted: its own, or that of the collection. on_front and selected: 1 if the equations of
+        One row per system, noise, number and variant. on_front and selected: 1 if the equations of
         all states are right, else 0. correct_terms: number of true terms among the selected ones.
         cpu_s: time of the search. selected and correct_terms are NaN for a variant that selects
         nothing. Raises ValueError for an unknown system, or if there is nothing to run.
         """
-        tasks = list(product(self._names, sorted(self.noises), range(self.n_realizations)))
-        judge = partial(_outcomes, variants, self._draw(seed), seed=seed)
+        check_systems(self.systems)
+        tasks = list(product(self.systems, sorted(self.noises), range(self.n_realizations)))
+        judge = partial(judged, variants, self._draw(seed), seed=seed)
         rows = rows_in_order(self.parallel, judge, tasks, "realization", progress)
         return pd.DataFrame(rows)
 
@@ -195,14 +183,11 @@ class Study:
         count = self.n_trajectories
         return partial(realization, n_trajectories=count, degree=self.degree, seed=seed)
 
-    @property
-    def _names(self) -> tuple[str, ...]:
-        return system_names([self.systems] if isinstance(self.systems, str) else self.systems)
 
-
-def _outcomes(
+def judged(
     variants: Mapping[str, Variant], draw: Draw, task: tuple[str, float, int], *, seed: int
 ) -> list[dict[str, object]]:
+    """Rows of `Study.outcomes` of one realization: a system, a noise, and its number."""
     name, noise, number = task
     system, runs = draw(name, noise, number)
     rows: list[dict[str, object]] = []
@@ -213,8 +198,7 @@ def _outcomes(
         finding = variant.find(runs, system.model.library, rng=rng)
         cpu_s = time.process_time() - start
         rows.append(
-            {"group": name if name in DRAWS else COLLECTION, "system": name}
-            | {"noise": noise, "number": number, "variant": label}
+            {"system": name, "noise": noise, "number": number, "variant": label}
             | merits(finding, system)
             | {"cpu_s": cpu_s}
         )
@@ -222,21 +206,20 @@ def _outcomes(
 
 
 def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
-    """Counts over all realizations, one row per system or collection, noise and variant.
+    """Counts over all realizations, one row per system, noise and variant.
 
     on_front, selected: numbers of realizations. mean_correct_terms: mean over the realizations.
     n: number of realizations. cpu_s_per_search: the median, so that compilation during the first
     search does not count.
     """
-    grouped = outcomes.groupby(["group", "noise", "variant"], sort=False)
-    counts = grouped.agg(
+    grouped = outcomes.groupby(["system", "noise", "variant"], sort=False)
+    return grouped.agg(
         on_front=("on_front", "sum"),
         selected=("selected", lambda s: s.sum(min_count=1)),
         mean_correct_terms=("correct_terms", "mean"),
         n=("number", "count"),
         cpu_s_per_search=("cpu_s", "median"),
     ).reset_index()
-    return counts.rename(columns={"group": "system"})
 
 
 def first_realizations(
@@ -286,10 +269,6 @@ def add_tables(
     levels = "/".join(f"{100 * noise:g}" for noise in cells["noise"].unique())
     report.section(f"By system; noise {levels} %")
     report.add(*(_readable(cells, published, merit) for merit in MERITS))
-    collected = outcomes[outcomes["group"] == COLLECTION]
-    if len(collected):
-        report.section("Systems that are not selected")
-        report.add(_not_selected(collected))
 
 
 def means(cells: pd.DataFrame) -> dict[str, float]:
@@ -339,20 +318,8 @@ def _readable(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> Table
     )
 
 
-def _not_selected(collected: pd.DataFrame) -> Table:
-    """Systems of the collection that the variant with most successes does not select, by noise."""
-    best = str(collected.groupby("variant", sort=False)["selected"].sum().idxmax())
-    missed = collected[(collected["variant"] == best) & (collected["selected"] != 1.0)]
-    rows = []
-    for noise in collected["noise"].unique():
-        counts = Counter(missed[missed["noise"] == noise]["system"])
-        words = [f"{name} ({n} times)" if n > 1 else name for name, n in counts.items()]
-        rows.append({"noise": f"{100 * noise:g} %", f"not by {best}": ", ".join(words)})
-    return Table(pd.DataFrame(rows))
-
-
 def _heading(system: str, merit: str) -> str:
-    if merit != "mean_correct_terms" or system not in DRAWS:
+    if merit != "mean_correct_terms":
         return system
     model = DRAWS[system](np.random.default_rng(0)).model
     return f"{system} ({np.count_nonzero(model.coef)})"

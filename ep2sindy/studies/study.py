@@ -88,13 +88,6 @@ def _each_once(values: Any) -> bool:
 
 A_LIST = Check("a list such as [a,b], each once", _each_once)
 Names = Annotated[Sequence[str], A_LIST]
-NamesOrOne = Annotated[
-    Sequence[str] | str,
-    Check(
-        "a name, or a list such as [a,b], each once",
-        lambda x: isinstance(x, str) or _each_once(x),
-    ),
-]
 Levels = Annotated[Sequence[_Levels], A_LIST]
 Positives = Annotated[Sequence[_Positives], A_LIST]
 Terms = Mapping[str, Sequence[int | str]]  # by state; the constant term 1 may be a number

@@ -1,6 +1,6 @@
-"""Random draws of known systems: those of the thesis's benchmark, and a collection of chaotic ones.
+"""Random draws of the known systems of the thesis's benchmark.
 
-Source: the thesis, appendix, II-E and III-C; of the others, `systems.collection`.
+Source: the thesis, appendix, II-E and III-C.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.systems.collection import collected, collected_names, is_installed
 from ep2sindy.systems.systems import (
     System,
     damped_oscillator,
@@ -35,18 +35,6 @@ DRAWS: Mapping[str, Callable[[np.random.Generator], System]] = {
 }
 
 
-COLLECTION = "dysts"  # stands for all systems of the collection
-
-
-def drawn(name: str, rng: np.random.Generator) -> System:
-    """Draw a system by name; one of the collection starts anywhere on its attractor."""
-    if name in DRAWS:
-        return DRAWS[name](rng)
-    system = collected(name)
-    states = system.trajectory().states
-    return replace(system, initial=states[rng.integers(len(states))])
-
-
 def realization(
     name: str,
     noise: float,
@@ -63,17 +51,30 @@ def realization(
     [-2, 2]^2 for the Van der Pol oscillator. degree: of the library; None takes the system's own.
     """
     check_systems([name])
-    key = [list(DRAWS).index(name)] if name in DRAWS else list(name.encode())
-    rng = np.random.default_rng([seed, *key, number])
-    own = drawn(name, rng)
-    starts = [own.initial]
+    rng = np.random.default_rng([seed, list(DRAWS).index(name), number])
+    system, starts = DRAWS[name](rng), []
     for _ in range(n_trajectories - 1):
-        other = rng.uniform(-2.0, 2.0, 2) if name == "van_der_pol" else drawn(name, rng).initial
+        other = rng.uniform(-2.0, 2.0, 2) if name == "van_der_pol" else DRAWS[name](rng).initial
         starts.append(other)
-    system = own if degree is None else with_degree(own, degree)
-    return system, [
-        own.trajectory(initial=start, noise=noise, rng=stream)
-        for start, stream in zip(starts, rng.spawn(n_trajectories), strict=True)
+    return noisy_records(system, starts, noise, rng, degree=degree)
+
+
+def noisy_records(
+    system: System,
+    further: Sequence[Float[np.ndarray, " n_states"]],
+    noise: float,
+    rng: np.random.Generator,
+    *,
+    degree: int | None,
+) -> tuple[System, list[Trajectory]]:
+    """A system with its noisy trajectories, from its own start and from further ones.
+
+    degree: of the library; None takes the system's own.
+    """
+    starts = [system.initial, *further]
+    return system if degree is None else with_degree(system, degree), [
+        system.trajectory(initial=start, noise=noise, rng=stream)
+        for start, stream in zip(starts, rng.spawn(len(starts)), strict=True)
     ]
 
 
@@ -94,23 +95,8 @@ def with_degree(system: System, degree: int) -> System:
     return replace(system, model=SparseModel(library, model.states, coef))
 
 
-def system_names(asked: Sequence[str]) -> tuple[str, ...]:
-    """The names asked for, with all names of the collection in place of `dysts`.
-
-    Raises ValueError for a name that there is not, or if the collection is not installed.
-    """
-    every = [collected_names() if name == COLLECTION else (name,) for name in asked]
-    names = tuple(dict.fromkeys(name for names in every for name in names))
-    check_systems(names)
-    return names
-
-
-def check_systems(systems: Sequence[str]) -> None:
-    others = [name for name in systems if name not in DRAWS]
-    known = collected_names() if others and is_installed() else ()
-    unknown = [name for name in others if name not in known]
+def check_systems(names: Sequence[str]) -> None:
+    """Raise ValueError for a name that there is not."""
+    unknown = [name for name in names if name not in DRAWS]
     if unknown:
-        raise ValueError(
-            f"unknown systems {unknown}; there are {[*DRAWS]}, and with the package dysts the "
-            f"names of its systems, such as Rossler, and {COLLECTION} for all of these"
-        )
+        raise ValueError(f"unknown systems {unknown}; there are {[*DRAWS]}")

@@ -31,7 +31,6 @@ from ep2sindy.thruster.transport import GaussianTransport as GaussianTransport  
 from ep2sindy.thruster.transport import FunctionTransport as FunctionTransport  # for configs
 from ep2sindy.thruster.transport import MultiLogTransport as MultiLogTransport  # for configs
 from ep2sindy.thruster.transport import PressureShift as PressureShift  # for configs
-from ep2sindy.thruster.walls import ExponentialWall as ExponentialWall  # for configs
 from ep2sindy.thruster.walls import SheathWall as SheathWall  # for configs
 from ep2sindy.thruster.walls import wall_material as wall_material  # for configs
 from ep2sindy.thruster.walls import AnodeSheath as AnodeSheath  # for configs

@@ -129,63 +129,6 @@ class XenonFits:
 
 
 @dataclass(frozen=True)
-class TabulatedRates:
-    """Coefficients from a user's table over the mean energy 1.5 T_e, as defined by LANDMARK.
-
-    mean_energy_eV: increasing. ionization_rate: m^3/s. energy_loss_rate: eV m^3/s. elastic_rate:
-    constant momentum transfer, m^3/s. Coulomb collisions and the drift energy K are left out. Below
-    the first row both coefficients fall to zero linearly; beyond the last row they are constant.
-    """
-
-    mean_energy_eV: tuple[float, ...]
-    ionization_rate: tuple[float, ...]
-    energy_loss_rate: tuple[float, ...]
-    elastic_rate: float = 2.5e-13  # LANDMARK test case 3
-    mass: ClassVar[float] = M_XENON
-    ionization_eV: ClassVar[float] = E_IONIZATION_EV
-    drift_weight: ClassVar[float] = 0.0
-    range_eV: ClassVar[tuple[float, float] | None] = None  # as the benchmark's authors use it
-    charge_states: ClassVar[int] = 1
-
-    def __post_init__(self) -> None:
-        energy = np.asarray(self.mean_energy_eV)
-        lengths = {len(self.mean_energy_eV), len(self.ionization_rate), len(self.energy_loss_rate)}
-        if len(lengths) > 1 or energy.size < 2 or not np.all(np.diff(energy) > 0.0):
-            raise ValueError(
-                "a rate table needs two or more rows of increasing mean energy, with both rates "
-                f"in every row: got lengths {len(self.mean_energy_eV)}, "
-                f"{len(self.ionization_rate)}, {len(self.energy_loss_rate)}; sort the rows first"
-            )
-
-    def _interpolate(self, T_e_eV: FloatArray, values: tuple[float, ...]) -> FloatArray:
-        return np.interp(1.5 * T_e_eV, (0.0, *self.mean_energy_eV), (0.0, *values))
-
-    def ionization(self, T_e_eV: FloatArray) -> FloatArray:
-        """Rate coefficient in m^3/s."""
-        return self._interpolate(T_e_eV, self.ionization_rate)
-
-    def energy_loss(self, T_e_eV: FloatArray) -> FloatArray:
-        """Energy lost in all inelastic collisions, in eV m^3/s."""
-        return self._interpolate(T_e_eV, self.energy_loss_rate)
-
-    def events(self, T_e_eV: FloatArray) -> FloatArray:
-        """Zero: LANDMARK's constant momentum transfer includes all collisions."""
-        return np.zeros_like(T_e_eV)
-
-    def drift_events(self, T_e_eV: FloatArray) -> FloatArray:
-        """Zero: the drift energy is left out."""
-        return np.zeros_like(T_e_eV)
-
-    def momentum(self, T_e_eV: FloatArray) -> FloatArray:
-        """Momentum lost to neutrals, in m^3/s."""
-        return np.full_like(T_e_eV, self.elastic_rate)
-
-    def coulomb(self, T_e_eV: FloatArray) -> FloatArray:
-        """Zero: this closure has no Coulomb collisions."""
-        return np.zeros_like(T_e_eV)
-
-
-@dataclass(frozen=True)
 class PropellantTable:
     """Any gas: rate coefficients in m^3/s over the electron temperature, linear between rows.
 
@@ -321,7 +264,7 @@ class PropellantTable:
         return name
 
 
-Propellant = XenonFits | TabulatedRates | PropellantTable
+Propellant = XenonFits | PropellantTable
 
 
 def gas_name(propellant: Propellant) -> str:

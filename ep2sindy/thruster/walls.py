@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -34,6 +34,18 @@ def share(
     if transition == 0.0:
         return np.where(distance < 0.0, channel, plume)
     return channel + (plume - channel) * np.clip(distance / transition + 0.5, 0.0, 1.0)
+
+
+@runtime_checkable
+class Wall(Protocol):
+    """What a wall takes: per electron by T_e, and the shares at distances from the exit in m."""
+
+    def ion_loss(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray: ...
+    def collision(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray: ...
+    def power(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray: ...
+    def ion_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]: ...
+    def collision_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]: ...
+    def power_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]: ...
 
 
 @dataclass(frozen=True)
@@ -135,58 +147,6 @@ def wall_material(
         yield_0, crossover_eV, electron_scale, ion_scale, plume_collisions, plume_power, transition,
         shielded_T_e_eV,
     )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class ExponentialWall:
-    """Wall loss 1e7 alpha eps exp(-20/eps) with eps = 1.5 T_e, as LANDMARK defines it.
-
-    power_weights: alpha in the channel and in the plume. Electrons collide with the channel
-    wall at 1e7 1/s; ions never do. transition: as for `SheathWall`.
-    Source: LANDMARK, test case 3.
-    """
-
-    power_weights: Sequence[float]
-    frequency: float = 1e7  # 1/s
-    sheath_V: float = 20.0
-    transition: float = 0.0  # m
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "power_weights", tuple(map(float, self.power_weights)))
-        check_not_negative(self, "frequency", "sheath_V", "transition")
-        if len(self.power_weights) != 2 or min(self.power_weights) < 0.0:
-            raise ValueError(
-                "ExponentialWall.power_weights must be two numbers, in the channel and in the "
-                f"plume, zero or more: {self.power_weights} came"
-            )
-
-    def ion_loss(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
-        """No ion reaches the wall."""
-        return np.zeros_like(T_e_eV)
-
-    def collision(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
-        """Constant frequency, in 1/s."""
-        return np.full_like(T_e_eV, self.frequency)
-
-    def power(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
-        """Power lost to the wall per electron, in eV/s."""
-        energy = 1.5 * T_e_eV
-        return self.frequency * energy * np.exp(-self.sheath_V / energy)
-
-    def ion_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """1 in the channel and 0 in the plume, but the ion loss itself is zero."""
-        return share(distance, 1.0, 0.0, self.transition)
-
-    def collision_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Share of the wall collisions: electrons collide in the channel only."""
-        return share(distance, 1.0, 0.0, self.transition)
-
-    def power_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """alpha at a distance from the exit in m, negative inside."""
-        return share(distance, self.power_weights[0], self.power_weights[1], self.transition)
-
-
-Wall = SheathWall | ExponentialWall
 
 
 @dataclass(frozen=True)
