@@ -3,10 +3,10 @@
 Equations that conserve what ions and neutrals of the whole channel exchange, as `+exp=breathing`
 finds them: over operating points, splits of the record and seeds, on the default source, on the
 former one, and on `thruster=lif`, whose ions flow back (`lif`, `lif_law_back`, and with 200 cells
-`lif_law_back_fine`); beside free terms,
-in other zones, in several at once (`several`, `three`), in noise, and from the (z, r) simulator.
-Every model called living is run again by another solver, ten times as long; its processes are
-compared with the balance of the zone. Prints the tables of docs/living.md, or those that are named.
+`lif_law_back_fine`); beside free terms, in other zones, in several at once (`several`, `three`), in
+noise, and from the (z, r) simulator. Every model called living is run again by another solver, ten
+times as long; its processes are compared with the balance of the zone. Prints the tables of
+docs/living.md, or those that are named.
 """
 
 from __future__ import annotations
@@ -383,6 +383,9 @@ def print_law(roles: ep.Roles, name: str = "default") -> None:
         medians = ", ".join(f"{ratio:.2f}" for ratio in np.median(ratios, axis=0))
         print("\n".join([line(label, cases), balances(cases), f"    {medians}"]), flush=True)
         print(f"    with the record's own coefficients: {verdicts[0]}", flush=True)
+        for each in (c for c in cases if c.run.status is not ep.model.Status.SUSTAINED):
+            off = f"f {each.run.f_error:+.2%}, amplitude {each.amplitude:.1%}"
+            print(f"    {each.run.text}: {off}, waveform {each.waveform:.3f}")
         spread = 100.0 * field(label, name).attrs["peak_spread"]
         print(f"    peaks of the record's current vary by {spread:.1f} %", flush=True)
 
