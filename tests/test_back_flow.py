@@ -1,12 +1,14 @@
 """Where ions flow back, their outflow goes with the neutrals, too."""
 
+from pathlib import Path
+
 import pytest
 
 from tests.programs import composed, computed
 
 
 @pytest.mark.slow
-def test_where_ions_flow_back_a_law_is_found_that_lives() -> None:
+def test_where_ions_flow_back_a_law_is_found_that_lives(tmp_path: Path) -> None:
     found = computed(
         composed(
             "+exp=breathing",
@@ -16,6 +18,7 @@ def test_where_ions_flow_back_a_law_is_found_that_lives() -> None:
             "~libraries.ionization",
             "~libraries.velocity",
             "forecasts=0",
+            f"output={tmp_path}",
         )
     ).summary
     run = found["evaluations"]["simple_living"]
