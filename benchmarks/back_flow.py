@@ -39,7 +39,10 @@ STRUCTURES = {
         LAW_TOLD, outflow={"n_i": ["n_i", "n_i^2", "n_i*n_n"], "n_n": "known"}
     ),
     "and ions out by n_i*n_n^2": LAW_BACK,
-    "the same, neutrals free": replace(LAW_BACK, outflow={**LAW_BACK.outflow, "n_n": ["n_n"]}),
+    "and ions out by both": replace(
+        LAW_BACK, outflow={**LAW_BACK.outflow, "n_i": [*LAW_BACK.outflow["n_i"], "n_i*n_n"]}
+    ),
+    "by n_i*n_n^2, neutrals free": replace(LAW_BACK, outflow={**LAW_BACK.outflow, "n_n": ["n_n"]}),
     "the same, nothing told": replace(
         LAW,
         exchange=[IONIZED, ("n_i", "n_n", ["n_i"])],

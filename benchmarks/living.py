@@ -2,10 +2,11 @@
 
 Equations that conserve what ions and neutrals of the whole channel exchange, as `+exp=breathing`
 finds them: over operating points, splits of the record and seeds, on the default source, on the
-former one, and on `thruster=lif`, whose ions flow back (`lif`, `lif_law_back`); beside free terms,
-in other zones, in several at once (`several`, `three`), in noise, and from the (z, r) simulator.
-Every model called living is run again by another solver, ten times as long; its processes are
-compared with the balance of the zone. Prints the tables of docs/living.md, or those that are named.
+former one, and on `thruster=lif`, whose ions flow back (`lif`, `lif_law_back`, and with 200 cells
+`lif_law_back_fine`); beside free terms, in other zones, in several at once (`several`, `three`), in
+noise, and from the (z, r) simulator. Every model called living is run again by another solver, ten
+times as long; its processes are compared with the balance of the zone. Prints the tables of
+docs/living.md, or those that are named.
 """
 
 from __future__ import annotations
@@ -84,7 +85,8 @@ LAW_TOLD = replace(
 # Where ions flow back, those that leave go with the neutrals, too.
 LAW_BACK = replace(LAW_TOLD, outflow={"n_i": ["n_i", "n_i^2", "n_i*n_n^2"], "n_n": "known"})
 LIF, LIF_SPEED = measured_sets()["lif"]
-SETS = {"default": ep.thruster.Thruster(), "former": FORMER, "lif": LIF}
+SETS = {"default": ep.thruster.Thruster(), "former": FORMER, "lif": LIF, "lif_fine": LIF}
+N_CELLS = {"lif_fine": 200}  # at 200 V, 100 cells are too few for cycles of lif that repeat
 
 
 @dataclass(frozen=True)
@@ -143,9 +145,10 @@ def field(label: str, name: str = "default") -> xr.Dataset:
     point = POINTS[label]
     if name == "former":
         point = replace(point, neutral_speed=FORMER_SPEED.get(label, 280.0))
-    if name == "lif":
+    if SETS[name] is LIF:
         point = replace(point, neutral_speed=LIF_SPEED)
-    return ep.thruster.simulate(SETS[name], point, cache=True, progress=False)
+    n_cells = N_CELLS.get(name, 100)
+    return ep.thruster.simulate(SETS[name], point, n_cells=n_cells, cache=True, progress=False)
 
 
 def oscillating(name: str) -> list[str]:
@@ -380,6 +383,11 @@ def print_law(roles: ep.Roles, name: str = "default") -> None:
         medians = ", ".join(f"{ratio:.2f}" for ratio in np.median(ratios, axis=0))
         print("\n".join([line(label, cases), balances(cases), f"    {medians}"]), flush=True)
         print(f"    with the record's own coefficients: {verdicts[0]}", flush=True)
+        for each in (c for c in cases if c.run.status is not ep.model.Status.SUSTAINED):
+            off = f"f {each.run.f_error:+.2%}, amplitude {each.amplitude:.1%}"
+            print(f"    {each.run.text}: {off}, waveform {each.waveform:.3f}")
+        spread = 100.0 * field(label, name).attrs["peak_spread"]
+        print(f"    peaks of the record's current vary by {spread:.1f} %", flush=True)
 
 
 def by_the_record(
@@ -501,6 +509,7 @@ def main() -> None:
         "lif_law": lambda: print_law(LAW, "lif"),
         "lif_law_told": lambda: print_law(LAW_TOLD, "lif"),
         "lif_law_back": lambda: print_law(LAW_BACK, "lif"),
+        "lif_law_back_fine": lambda: print_law(LAW_BACK, "lif_fine"),
         "lif_zones": lambda: print_zones("lif"),
         "lif_several": lambda: print_several(2, [("last", 0)], "lif"),
         "free": lambda: print_points(search=free),
