@@ -49,7 +49,7 @@ class Node:
 
     def __init__(self, values: Any, place: str) -> None:
         if not isinstance(values, Mapping):
-            raise ValueError(f"{place} must be a mapping: {values!r} came")
+            raise ValueError(f"{place} must be a mapping, got {values!r}")
         self.place = place
         self._left = dict(values)
 
@@ -65,7 +65,7 @@ class Node:
         """Take a number."""
         value = self.take(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError(f"{self.place}.{key} must be a number: {value!r} came")
+            raise ValueError(f"{self.place}.{key} must be a number, got {value!r}")
         return float(value)
 
     def node(self, key: str, default: Any = NEEDED) -> Node:
@@ -75,9 +75,9 @@ class Node:
     def at_rest(self, values: Mapping[str, Any]) -> None:
         """Take keys that are supported at a single value only."""
         for key, value in values.items():
-            if (came := self.take(key, value)) != value:
+            if (given := self.take(key, value)) != value:
                 raise ValueError(
-                    f"{self.place}.{key} is not supported here but at {value!r}: {came!r} came"
+                    f"{self.place}.{key} is not supported here but at {value!r}, got {given!r}"
                 )
 
     def idle(self, *keys: str) -> None:
@@ -186,7 +186,7 @@ def wall_of(node: Node, *, transition: float, plume_power: float, ion_losses: bo
         scale = node.number("loss_scale", 1.0)
         if material not in MATERIALS:
             raise ValueError(
-                f"{node.place}.material must be one of {list(MATERIALS)}: {material!r} came"
+                f"{node.place}.material must be one of {list(MATERIALS)}, got {material!r}"
             )
         wall = wall_material(
             MATERIALS[material],
@@ -216,7 +216,7 @@ def conduction_of(node: Node) -> tuple[float, float]:
     node.end()
     known = {"Mitchner": (1.5 * 2.4, 2.0**-0.5), "Braginskii": (1.5 * 4.66, 0.0)}
     if kind not in known:
-        raise ValueError(f"{node.place}.type must be one of {list(known)}: {kind!r} came")
+        raise ValueError(f"{node.place}.type must be one of {list(known)}, got {kind!r}")
     return known[kind]
 
 
@@ -400,7 +400,7 @@ def _anode(config: Node, cathode_T_e_eV: float) -> FixedAnode | AnodeSheath:
         return AnodeSheath(T_e_eV, potential_weight=2.0)
     if kind == "dirichlet":
         return FixedAnode(T_e_eV)
-    raise ValueError(f"config.anode_boundary_condition must be sheath or dirichlet: {kind!r} came")
+    raise ValueError(f"config.anode_boundary_condition must be sheath or dirichlet, got {kind!r}")
 
 
 def _flow(config: Node) -> dict[str, Any]:

@@ -96,7 +96,7 @@ class ExponentialWall:
         if len(self.power_weights) != 2 or min(self.power_weights) < 0.0:
             raise ValueError(
                 "ExponentialWall.power_weights must be two numbers, in the channel and in the "
-                f"plume, zero or more: {self.power_weights} came"
+                f"plume, zero or more, got {self.power_weights}"
             )
 
     def ion_loss(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:

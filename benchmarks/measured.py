@@ -569,7 +569,7 @@ TABLES = {each.__name__: each for each in (
 def main(names: Sequence[str]) -> None:
     unknown = set(names) - set(TABLES)
     if unknown:
-        raise SystemExit(f"tables are {', '.join(TABLES)}: {', '.join(sorted(unknown))} came")
+        raise SystemExit(f"tables are {', '.join(TABLES)}, got {', '.join(sorted(unknown))}")
     for name in names or TABLES:
         TABLES[name]()
 

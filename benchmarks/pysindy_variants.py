@@ -333,7 +333,7 @@ def pysindy_library(
     if library.variables != tuple(states) or set(library.names) != set(whole.names):
         raise ValueError(
             f"PySINDy needs the whole polynomial library of the states {list(states)} up to "
-            f"degree {degree}: {list(library.names)} came"
+            f"degree {degree}, got {list(library.names)}"
         )
     features = pysindy.PolynomialLibrary(degree=degree).fit(np.zeros((2, len(states))))
     place = {tuple(powers): j for j, powers in enumerate(features.powers_.tolist())}

@@ -74,7 +74,7 @@ class RegionField:
         """Copy with white noise of `noise` times the RMS of each variable at each point."""
         rng = np.random.default_rng(rng)
         if noise < 0.0:
-            raise ValueError(f"noise must be zero or more: {noise} came")
+            raise ValueError(f"noise must be zero or more, got {noise}")
         field = self.field.map(_with_noise, keep_attrs=True, args=(noise, rng))
         return replace(self, field=field)
 
@@ -105,8 +105,8 @@ def three_regions(
     if len(regions) != 3 or min(n_z, n_r, n_samples) < 2 or not min(dt_s, transition) > 0.0:
         raise ValueError(
             "a field of three regions needs three sets of equations, two points or more along "
-            f"every axis, and dt_s and transition above 0: {list(regions)}, n_z={n_z}, n_r={n_r}, "
-            f"n_samples={n_samples}, dt_s={dt_s}, transition={transition} came"
+            f"every axis, and dt_s and transition above 0, got {list(regions)}, n_z={n_z}, n_r={n_r}, "
+            f"n_samples={n_samples}, dt_s={dt_s}, transition={transition}"
         )
     channel = thruster or Thruster()
     # Cell centres, as shares of the channel's length and gap.

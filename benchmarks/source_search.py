@@ -262,7 +262,7 @@ def number_by_name(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
     if name not in BOUNDS:
         raise argparse.ArgumentTypeError(
-            f"a number must be one of {', '.join(BOUNDS)}: {name} came"
+            f"a number must be one of {', '.join(BOUNDS)}, got {name}"
         )
     return name, float(value)
 

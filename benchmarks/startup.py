@@ -66,7 +66,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Output:
-    """What came on a terminal at once. wall_s, cpu_s: since the command began."""
+    """One output on a terminal. wall_s, cpu_s: since the command began."""
 
     wall_s: float
     cpu_s: float
@@ -154,8 +154,8 @@ def watched(command: Sequence[str], folder: Path, environment: dict[str, str]) -
     try:
         while data := os.read(reader, 65536):
             wall_s, cpu_s = time.perf_counter() - begin, session_cpu_s(process.pid)
-            came = Output(wall_s, cpu_s, data.decode("utf-8", "replace"))
-            outputs += [came] if came.words else []
+            output = Output(wall_s, cpu_s, data.decode("utf-8", "replace"))
+            outputs += [output] if output.words else []
     except OSError:  # the terminal of a process that has ended
         pass
     finally:

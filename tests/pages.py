@@ -30,7 +30,7 @@ PROGRAMS = (["ep2sindy"], ["python", "-m", "experiments.run"])
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block and, where its output is shown, what it is said to print.
+    """A fenced block and, where its output is shown, what it is shown to print.
 
     language: `console` for a command that stands in a comment. place: of the output in the page.
     """
@@ -81,7 +81,7 @@ def quoted(number: str, summary: Mapping, path: str, form: str) -> str:
         try:
             value = value[int(key)] if isinstance(value, list) else value[key]
         except (KeyError, IndexError, ValueError, TypeError) as error:
-            raise KeyError(f"{number} is said to be {path}: no {key} in the summary") from error
+            raise KeyError(f"{number} is shown to be {path}: no {key} in the summary") from error
     return re.sub(r"e\+?(-?)0*(?=\d)", r"e\1", f"{value:{form}}").replace("%", " %")
 
 
@@ -101,60 +101,60 @@ def arguments(words: list[str]) -> list[str] | None:
     return None
 
 
-def difference(said: str, came: str) -> str:
-    """The first line of what is said that did not come; empty if all did.
+def difference(shown: str, printed: str) -> str:
+    """The first line of the page that was not printed; empty if all were.
 
     A line `...` stands for any lines. Numbers agree to a twentieth, half-widths of intervals (±)
     to a factor of two: other machines round, draw and compile otherwise.
     """
-    lines, at, is_free = came.strip().splitlines(), 0, False
-    for line in said.strip().splitlines():
+    lines, at, is_free = printed.strip().splitlines(), 0, False
+    for line in shown.strip().splitlines():
         if line.strip() == "...":
             is_free = True
             continue
         here = range(at, len(lines)) if is_free else range(at, min(at + 1, len(lines)))
         place = next((k for k in here if is_alike(line, lines[k])), None)
         if place is None:
-            return f"{line!r} is said, {lines[at : at + 1]} came"
+            return f"the page has {line!r}, got {lines[at : at + 1]}"
         at, is_free = place + 1, False
-    return "" if is_free or at == len(lines) else f"{lines[at]!r} is not said"
+    return "" if is_free or at == len(lines) else f"{lines[at]!r} is not shown"
 
 
-def is_alike(said: str, came: str) -> bool:
-    if " ".join(NUMBER.sub("#", said).split()) != " ".join(NUMBER.sub("#", came).split()):
+def is_alike(shown: str, printed: str) -> bool:
+    if " ".join(NUMBER.sub("#", shown).split()) != " ".join(NUMBER.sub("#", printed).split()):
         return False
-    pairs = zip(NUMBER.finditer(said), NUMBER.finditer(came), strict=True)
+    pairs = zip(NUMBER.finditer(shown), NUMBER.finditer(printed), strict=True)
     return all(is_near(a[0], b[0], is_width=a[1] is not None) for a, b in pairs)
 
 
-def is_near(said: str, came: str, *, is_width: bool) -> bool:
-    a, b = float(said.lstrip("±")), float(came.lstrip("±"))
+def is_near(shown: str, printed: str, *, is_width: bool) -> bool:
+    a, b = float(shown.lstrip("±")), float(printed.lstrip("±"))
     return abs(a - b) <= (0.5 if is_width else 0.05) * max(abs(a), abs(b))
 
 
-def updated(said: str, came: str) -> str:
-    """What a page is to say: the lines that came in the place of those that are said.
+def updated(shown: str, printed: str) -> str:
+    """What a page is to say: the printed lines in place of those that the page shows.
 
     After a line `...` follows the next line that is alike but for its numbers, else the most alike.
     Raises ValueError if there is none.
     """
-    lines, at, is_free = came.strip().splitlines(), 0, False
+    lines, at, is_free = printed.strip().splitlines(), 0, False
     found = []
-    for line in said.strip().splitlines():
+    for line in shown.strip().splitlines():
         if line.strip() == "...":
             is_free = True
             found.append(line)
             continue
         place = _place(line, lines, at) if is_free else at
         if not at <= place < len(lines):
-            raise ValueError(f"nothing like {line!r} came; put the page right by hand")
+            raise ValueError(f"nothing printed is like {line!r}; put the page right by hand")
         found.append(lines[place].rstrip())
         at, is_free = place + 1, False
     return "\n".join(found if is_free else found + lines[at:]) + "\n"
 
 
-def _place(said: str, lines: list[str], at: int) -> int:
+def _place(shown: str, lines: list[str], at: int) -> int:
     """The line from `at` on that is most alike; -1 if none is."""
     shapes = [" ".join(NUMBER.sub("#", line).split()) for line in lines[at:]]
-    near = get_close_matches(" ".join(NUMBER.sub("#", said).split()), shapes, n=1)
+    near = get_close_matches(" ".join(NUMBER.sub("#", shown).split()), shapes, n=1)
     return at + shapes.index(near[0]) if near else -1

@@ -174,7 +174,7 @@ def test_studies_are_found_by_name() -> None:
     assert "libraries" in list_studies()
     assert study_class("libraries").__name__ == "Study"
     for name in ("librarys", "ep2sindy.studies.views"):
-        with pytest.raises(ValueError, match=f"study must name a module .* '{name}' came"):
+        with pytest.raises(ValueError, match=f"study must name a module .* '{name}'"):
             study_class(name)
 
 

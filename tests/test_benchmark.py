@@ -193,7 +193,7 @@ def test_a_wider_library_holds_the_same_model() -> None:
     assert np.array_equal(run.states, same.states)
     for state in system.model.states:
         assert wider.model.terms(state) == system.model.terms(state)
-    with pytest.raises(ValueError, match=r"terms of Lorenz, of degree 2 or more: degree=1 came"):
+    with pytest.raises(ValueError, match=r"terms of Lorenz, of degree 2 or more, got degree=1"):
         realization("lorenz", 0.0, 0, degree=1)
 
 

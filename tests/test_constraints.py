@@ -111,8 +111,8 @@ def test_relations_are_read(text: str, factors: list[tuple[float, str, str]], va
         ("1 == 2", "must name a coefficient: '1 == 2'"),
         ("x: x == 1e999", "must be finite: 'x: x == 1e999'"),
         ("x: x == ", r"a number must stand at character 9 of the relation 'x: x == ': 'the end'"),
-        ("x: x y: y == 0", r"\+, -, == or the end must stand at character 6 .*'y: y == 0' came"),
-        ("x: x + 2 * foo == 0", r"character 10 .*'\* foo == 0' came; write it like 'n_i: n"),
+        ("x: x y: y == 0", r"\+, -, == or the end must stand at character 6 .*'y, got y == 0'"),
+        ("x: x + 2 * foo == 0", r"character 10 .*'\* foo == 0'; write it like 'n_i: n"),
     ],
 )
 def test_unreadable_relations_are_quoted_with_the_position(text: str, message: str) -> None:

@@ -141,7 +141,7 @@ def test_learned_term_is_in_si_and_knows_the_inputs() -> None:
         found.learned(x[:, None], u[:, None]), (0.2 * x * u)[:, None], rtol=1e-3, atol=1e-3
     )
     assert found.model.terms("x")["x"] == pytest.approx(-1.0, rel=1e-3)
-    with pytest.raises(ValueError, match=r"takes \['x'\] and inputs \['u'\]: 1 columns came"):
+    with pytest.raises(ValueError, match=r"takes \['x'\] and inputs \['u'\], got 1 columns"):
         found.learned(x[:, None])
 
 
@@ -174,5 +174,5 @@ def test_blow_up_hands_back_what_came() -> None:
 
 
 def test_wrong_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"one column per state \['x', 'y'\]: \(3, 1\) came"):
+    with pytest.raises(ValueError, match=r"one column per state \['x', 'y'\], got \(3, 1\)"):
         refined(known_part(), data(), network(2, 1), window=10)

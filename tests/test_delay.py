@@ -75,10 +75,10 @@ def test_another_delay_does_not_live() -> None:
 @pytest.mark.parametrize(
     ("state", "delay_s", "t", "message"),
     [
-        ("y", 1.0, np.arange(9.0), r"is of a state: 'y' came, and the states are \['x', 'x_lag1'"),
+        ("y", 1.0, np.arange(9.0), r"is of a state, got 'y', and the states are \['x', 'x_lag1'"),
         ("x", 1.0, np.arange(9.0), r"has stages of 'x' already: \['x_lag1'\]"),
         ("z", 1.0, np.arange(9.0) ** 2, "at equal time steps"),
-        ("z", 3.0, np.arange(9.0), "longer than three delays of 3 s.*: 8 s came"),
+        ("z", 3.0, np.arange(9.0), "longer than three delays of 3 s.*, got 8 s"),
     ],
 )
 def test_runs_without_a_delay_are_refused(state, delay_s, t, message) -> None:

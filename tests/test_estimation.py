@@ -541,7 +541,7 @@ def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
         ep.estimate([run], ep.polynomial(["x", "y", "z"], degree=1))
     with pytest.raises(ValueError, match="limit_s must be positive"):
         ep.estimate([run], ep.polynomial(["x", "y"], degree=2), limit_s=-1.0)
-    with pytest.raises(ValueError, match="needs more samples than terms: 6 came"):
+    with pytest.raises(ValueError, match="needs more samples than terms, got 6"):
         ep.estimate([run.window(0, 6)], ep.polynomial(["x", "y"], degree=2))
     with pytest.raises(ValueError, match="a run must have five samples or more: .* has 2"):
         ep.estimate([run, run.window(0, 2)], ep.polynomial(["x", "y"], degree=2))

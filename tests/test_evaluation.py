@@ -84,7 +84,7 @@ def test_bounds_are_settings() -> None:
     assert (
         evaluate(model, record(), bounds=FreeRunBounds(amplitude=0.03)).status is Status.WRONG_CYCLE
     )
-    with pytest.raises(ValueError, match="the bound waveform must be positive: 0.0 came"):
+    with pytest.raises(ValueError, match="the bound waveform must be positive, got 0.0"):
         FreeRunBounds(waveform=0.0)
 
 

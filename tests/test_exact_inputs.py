@@ -73,9 +73,9 @@ def test_noise_in_whole_digits_is_no_switch() -> None:
 
 
 def test_only_inputs_can_be_exact() -> None:
-    with pytest.raises(ValueError, match=r"must name inputs: \['x'\] came; .* inputs \['u'\]"):
+    with pytest.raises(ValueError, match=r"must name inputs, got \['x'\]; .* inputs \['u'\]"):
         followed(driven(SWITCH), replace(EVERY_ROW, exact_inputs=["x"]))
-    with pytest.raises(ValueError, match=r"a list: 'u' came; write \['u'\]"):
+    with pytest.raises(ValueError, match=r"a list, got 'u'; write \['u'\]"):
         Weak(exact_inputs="u")
 
 

@@ -60,12 +60,12 @@ ROLES = ep.Roles(outflow=["x"], inflow={"y": 1.0})
         (lambda: LIBRARY.only({"x": {"x": 0.6667}}), "a coefficient that is known is a relation"),
         (
             lambda: LIBRARY.only({"x": "x"}),
-            r"the terms of 'x' must be a list: 'x' came; write",
+            r"the terms of 'x' must be a list, got 'x'; write",
         ),
-        (lambda: LIBRARY.only(["x"]), r"terms must be lists by state, .*: \['x'\] came"),
+        (lambda: LIBRARY.only(["x"]), r"terms must be lists by state, .*, got \['x'\]"),
         (
             lambda: LIBRARY.exclude({"x": [1]}),
-            r"terms must be lists of names, .*: \[1\] came for 'x'; the",
+            r"terms must be lists of names, .*, got \[1\] for 'x'; the",
         ),
         (
             lambda: LIBRARY.only({"x": []}),
@@ -83,11 +83,11 @@ ROLES = ep.Roles(outflow=["x"], inflow={"y": 1.0})
         ),
         (
             lambda: LIBRARY.exclude({"x": ["y*x"]}).only({"x": ["x", "x*y"]}),
-            r"is excluded, or it is named in terms and relations: 'x\*y' of 'x' came in both",
+            r"is excluded, or it is named in terms and relations, got 'x\*y' of 'x' in both",
         ),
         (
             lambda: LIBRARY.exclude({"x": ["x"]}).with_roles(ROLES),
-            "terms, or coefficients came as well; give roles alone",
+            "terms, or coefficients as well; give roles alone",
         ),
         (
             lambda: discover(RUN, LIBRARY.exclude({"z": ["x"]})),

@@ -177,7 +177,7 @@ def test_a_recognised_signal_without_a_unit_takes_the_one_given(tmp_path: Path) 
 
 def test_a_unit_that_the_data_contradict_is_refused(tmp_path: Path) -> None:
     config = recognised(tmp_path / "scope.csv", "time [s],I_d [A]", "signal=I_d", "unit=mA")
-    with pytest.raises(ValueError, match="I_d comes in 'A', and unit=mA came; leave unit out"):
+    with pytest.raises(ValueError, match="I_d comes in 'A', got unit=mA; leave unit out"):
         computed(config)
 
 
@@ -226,7 +226,7 @@ def test_an_offset_that_no_equations_tell_is_refused(tmp_path: Path) -> None:
     path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)
     with pytest.raises(ValueError, match=r"offset=fit asks for equations .* write offset=NUMBER"):
         computed(composed(*toy(path, tmp_path, "offset=fit", "tried=[{how: hidden, degree: 1}]")))
-    with pytest.raises(ValueError, match="offset must be a number or fit: 'fitted' came"):
+    with pytest.raises(ValueError, match="offset must be a number or fit, got 'fitted'"):
         computed(composed(*toy(path, tmp_path, "offset=fitted")))
 
 

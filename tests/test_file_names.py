@@ -95,8 +95,8 @@ def test_a_pattern_is_proposed_where_names_differ_in_numbers(
     ("text", "message"),
     [
         ("runs/a.csv", "need a pattern with a placeholder for each quantity, like 'runs/V"),
-        ("runs/{a b}.csv", "a placeholder must be the name of a quantity, .*: 'a b' came"),
-        ("runs/{data}.csv", "a placeholder must be .* and not 'data', .*: 'data' came"),
+        ("runs/{a b}.csv", "a placeholder must be the name of a quantity, .*, got 'a b'"),
+        ("runs/{data}.csv", "a placeholder must be .* and not 'data', .*, got 'data'"),
         ("runs/W{V}.csv", r"no file fits .* 1 files beside it: runs/V1.csv \.\.\."),
     ],
 )

@@ -264,7 +264,7 @@ def test_a_gap_is_no_obstacle() -> None:
         (lambda: ep.model.forecast_skill(SPRING, spring(0.05), n_fitted=1200), "and leave four"),
         (
             lambda: ep.model.forecast_skill(SPRING, spring(0.05), n_fitted=900, horizon_s=40.0),
-            "the horizon must leave room for starts: 40 s came, and 30 s are held out",
+            "the horizon must leave room for starts, got 40 s, and 30 s are held out",
         ),
     ],
 )

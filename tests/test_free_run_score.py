@@ -90,7 +90,7 @@ def test_a_state_that_was_not_measured_need_not_keep_its_waveform(found):
     judged = ep.evaluate(found.model, spoilt, judged=["n_i"])
     assert judged.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
     assert judged.waveform_error["n_n"] > 0.2
-    with pytest.raises(ValueError, match=r"judged must name some of the states .*: \['T'\] came"):
+    with pytest.raises(ValueError, match=r"judged must name some of the states .*, got \['T'\]"):
         ep.evaluate(found.model, run, judged=["T"])
 
 
@@ -156,8 +156,8 @@ def test_units_change_nothing(found):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"window_periods": 0.0}, "window_periods must be positive: 0.0 came"),
-        ({"margin": 1.5}, "margin must lie between 0 and 1: 1.5 came"),
+        ({"window_periods": 0.0}, "window_periods must be positive, got 0.0"),
+        ({"margin": 1.5}, "margin must lie between 0 and 1, got 1.5"),
     ],
 )
 def test_settings_are_checked(settings, message):

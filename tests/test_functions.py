@@ -137,8 +137,8 @@ def test_a_library_takes_functions_of_every_variable_or_of_one() -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"functions": ["sine"]}, r"functions must be some of \['sin', .*: 'sine' came"),
-        ({"functions": "sin"}, r"functions must be a list: 'sin' came; write \['sin'\]"),
+        ({"functions": ["sine"]}, r"functions must be some of \['sin', .*, got 'sine'"),
+        ({"functions": "sin"}, r"functions must be a list, got 'sin'; write \['sin'\]"),
         ({"functions": ["x*sin(v)"]}, "go into products"),
         ({"functions": ["sin(x)^2"]}, "come with function_degree=2"),
         ({"function_degree": 2}, r"function_degree=2 needs functions, such as \['sin'\]"),
@@ -272,7 +272,7 @@ def test_what_is_no_formula_needs_a_derivative(value: Callable[..., object]) -> 
     ("name", "value", "slope", "domain", "message"),
     [
         ("sin", np.sin, np.cos, None, "'sin' is built in: give your function another name"),
-        ("a b", np.sin, np.cos, None, "must be a plain word, such as 'tanh': 'a b' came"),
+        ("a b", np.sin, np.cos, None, "must be a plain word, such as 'tanh', got 'a b'"),
         ("wrong", np.sin, np.sin, None, "derivative of 'wrong' must be that of its value: at"),
         ("root", np.sqrt, lambda x: 0.5 / np.sqrt(x), None, "value of 'root' must give a finite"),
         ("of_one", math.tanh, np.cos, None, "must take and return NumPy arrays: .* not math.tanh"),

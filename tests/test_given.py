@@ -31,7 +31,7 @@ def test_numbered_columns_are_named_as_those_of_arrays() -> None:
 
 @pytest.mark.parametrize("name", ["1", "", "x^2", "x*y", "=cmd", "a b", "1/x", "<a", "x\n", "${x}"])
 def test_names_that_no_term_could_hold_are_refused_at_every_door(name: str) -> None:
-    message = r"must be a word of letters, digits and _, .* came; rename it, perhaps '[a-z]\w*'"
+    message = r"must be a word of letters, digits and _, .*; rename it, perhaps '[a-z]\w*'"
     with pytest.raises(ValueError, match=message):
         trajectories_of(pd.DataFrame({"t": T, name: X[:, 0], "y": X[:, 1]}))
     with pytest.raises(ValueError, match=message):
@@ -46,20 +46,20 @@ def test_averages_of_products_are_names() -> None:
 
 def test_columns_that_repeat_are_refused() -> None:
     table = pd.DataFrame(np.column_stack([T, X]), columns=["t", "x", "x"])
-    with pytest.raises(ValueError, match=r"\['t', 'x', 'x'\] came; rename or drop those"):
+    with pytest.raises(ValueError, match=r"got \['t', 'x', 'x'\]; rename or drop those"):
         trajectories_of(table)
 
 
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
-        ([], "at least one run is needed: an empty list came"),
+        ([], "at least one run is needed, got an empty list"),
         ([T, X], "a run must be a Trajectory, a pandas DataFrame .* run 0 of the list is of type"),
         (pd.DataFrame({"x": T}), r"must have one time column, .* its columns are \['x'\]"),
         (pd.DataFrame({"t": T, "x": ["a"] * len(T)}), "must hold real numbers: {'x': .*; drop"),
-        (pd.DataFrame({"t": T > 0, "x": T}), "{.t.: .bool.} came; give time in s, as numbers or"),
-        ((T, X.T), r"must have shapes .*: \(31,\) and \(2, 31\) came"),
-        ((T, X + 1j), "states must hold real numbers: complex128 came"),
+        (pd.DataFrame({"t": T > 0, "x": T}), "{.t., got .bool.}; give time in s, as numbers or"),
+        ((T, X.T), r"must have shapes .*, got \(31,\) and \(2, 31\)"),
+        ((T, X + 1j), "states must hold real numbers, got complex128"),
     ],
     ids=str,
 )
@@ -138,7 +138,7 @@ def test_several_arrays_take_times_for_each_or_one_step() -> None:
     by_step = trajectories_of(parts, t=PREY.dt_s)
     for run, part in zip([*by_times, *by_step], parts + parts, strict=True):
         np.testing.assert_array_equal(run.states, part)
-    with pytest.raises(ValueError, match="t must hold times for each run: 1 came for 2"):
+    with pytest.raises(ValueError, match="t must hold times for each run, got 1 for 2"):
         trajectories_of(parts, t=[TIMES])
 
 
@@ -182,9 +182,9 @@ def test_arrays_lack_samples_as_tables_do() -> None:
 @pytest.mark.parametrize(
     ("runs", "t", "message"),
     [
-        (SAMPLES, "time", "t must be times or a step in s: 'time' came"),
-        (pd.DataFrame(SAMPLES), TIMES[:5], r"a time for each of \d+ rows: \(5,\) came"),
-        (PREY, TIMES, "t is for arrays and tables without times: a Trajectory came"),
+        (SAMPLES, "time", "t must be times or a step in s, got 'time'"),
+        (pd.DataFrame(SAMPLES), TIMES[:5], r"a time for each of \d+ rows, got \(5,\)"),
+        (PREY, TIMES, "t is for arrays and tables without times, got a Trajectory"),
     ],
 )
 def test_times_that_cannot_be_are_refused(runs: object, t: object, message: str) -> None:

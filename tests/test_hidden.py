@@ -123,7 +123,7 @@ def test_a_number_of_hidden_states_makes_names_that_no_run_has() -> None:
     assert _hidden_names(1, ["x"]) == ["h"]
     assert _hidden_names(2, ["x", "h1"]) == ["h2", "h3"]
     assert _hidden_names(["w"], ["x"]) == ["w"]
-    with pytest.raises(ValueError, match="hidden must be a whole number, zero or more: -1 came"):
+    with pytest.raises(ValueError, match="hidden must be a whole number, zero or more, got -1"):
         ep.discover(only("x"), hidden=-1)
 
 
@@ -247,8 +247,8 @@ def test_what_was_not_measured_counts_nothing() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: ep.discover(only("x"), hidden=["x"]), "one that no run has: .'x'. came with"),
-        (lambda: ep.discover(only("x"), hidden=["g", "g"]), "'g'. came with samples or twice"),
+        (lambda: ep.discover(only("x"), hidden=["x"]), "one that no run has, got .'x'. with"),
+        (lambda: ep.discover(only("x"), hidden=["g", "g"]), "got 'g'. with samples or twice"),
         (
             lambda: ep.discover(only("x"), method=ep.Regression(), hidden=["g"]),
             "a regression needs samples of every state",

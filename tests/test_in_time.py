@@ -115,13 +115,13 @@ def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> No
     ("step", "settings", "message"),
     [
         (ep.data.resample, {"dt_s": 2.0},
-         "leave two samples or more: 2 s came for a record of 1 s"),
+         "leave two samples or more, got 2 s for a record of 1 s"),
         (ep.data.delay, {"variable": "q", "delay_s": 0.1},
          r"unknown variable .*'q'; .*\['x', 'I_d'\]"),
         (ep.data.delay, {"variable": "x", "delay_s": -0.1}, "delay_s must be positive"),
         (ep.data.delay, {"variable": "x", "delay_s": 0.1, "name": "I_d"},
          "a new name: the field already has 'I_d'"),
-        (ep.data.detrend, {"degree": 0}, "degree must be 1 or more, .*: 0 came"),
+        (ep.data.detrend, {"degree": 0}, "degree must be 1 or more, .*, got 0"),
     ],
 )  # fmt: skip
 def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: str) -> None:
@@ -131,7 +131,7 @@ def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: st
 
 def test_a_step_takes_a_field_and_no_trajectory() -> None:
     run = ep.lotka_volterra().trajectory()
-    with pytest.raises(ValueError, match=r"must be an xarray\.Dataset, .*: Trajectory came"):
+    with pytest.raises(ValueError, match=r"must be an xarray\.Dataset, .*, got Trajectory"):
         ep.data.crop(run, start_s=5.0)
 
 

@@ -296,7 +296,7 @@ def test_all_that_is_wrong_with_a_mapping_is_told_at_once(tmp_path: Path) -> Non
         )
     text = str(caught.value)
     for part in (
-        "no variable 'nii' (wanted as n_i); near it is 'ni'", "no variable 'nn'", "'kg' came",
+        "no variable 'nii' (wanted as n_i); near it is 'ni'", "no variable 'nn'", "got 'kg'",
         "T_e_eV must fit the grid: the file has shape (10, 7)", "ni (40, 7)",
     ):  # fmt: skip
         assert part in text, part

@@ -203,9 +203,9 @@ def test_conversion_factors(ours: str, unit: str, factor: float, target: str) ->
     ("ours", "unit", "message"),
     [
         ("p", "furlongg^-3", "the unit of p must be one that converts to SI: 'furlongg"),
-        ("n_i", "s", "the unit of n_i must be one that converts to m\\^-3: 's' came"),
-        ("n_i", "", "'' came"),
-        ("T_e_eV", "m", "the unit of T_e_eV must be one that converts to eV: 'm' came"),
+        ("n_i", "s", "the unit of n_i must be one that converts to m\\^-3, got 's'"),
+        ("n_i", "", "got ''"),
+        ("T_e_eV", "m", "the unit of T_e_eV must be one that converts to eV, got 'm'"),
         ("B", "gauss", "'gauss' is not; write a gauss as '1e-4 T'"),
         ("P", "dBm", "'dBm' is not"),
     ],
@@ -395,7 +395,7 @@ def test_a_field_is_written_and_read_back_whole(tmp_path: Path) -> None:
 
 def test_a_written_field_is_netcdf(tmp_path: Path) -> None:
     field = open_field(npz(tmp_path), **SETTINGS)
-    with pytest.raises(ValueError, match=r"to a name that ends in .nc: .*field.h5 came"):
+    with pytest.raises(ValueError, match=r"to a name that ends in .nc, got .*field.h5"):
         write_field(field, tmp_path / "field.h5")
     with pytest.raises(ValueError, match=r"a written field is NetCDF: .*a.npz is not"):
         read_field(tmp_path / "a.npz")

@@ -81,7 +81,7 @@ def test_a_field_that_ends_short_of_the_domain_is_refused(tmp_path):
         ("z_m,B_T\n0,0.01\n0.01,\n0.02,0.01\n", {}, r"row 2 below the header .*fill the gap"),
         ("z_m,B_T\n0,0.01\n0,0.02\n", {}, r"distance must increase: -0\.025 follows -0\.025"),
         ("0,50\n0.05,200\n", {}, r"no unit and reaches 200, too much for T; .* B_unit=G or mT"),
-        ("z_inch,B_T\n0,0.01\n2,0.02\n", {}, r"position must be in one of .* 'inch' came"),
+        ("z_inch,B_T\n0,0.01\n2,0.02\n", {}, r"position must be in one of .* 'inch'"),
         ("z_m,B_T\n0,50\n0.05,200\n", {}, r"MagneticFieldTable\.B must be in T"),
         ("z_m,B_T\n", {}, r"must have two rows or more"),
     ],

@@ -83,7 +83,7 @@ def test_complete_samples_and_windows_keep_what_is_missing() -> None:
 @pytest.mark.parametrize(
     ("missing", "message"),
     [
-        (np.zeros((5, 1), dtype=bool), r"bool of shape \(5, 1\) came with states of shape \("),
+        (np.zeros((5, 1), dtype=bool), r"got bool of shape \(5, 1\) with states of shape \("),
         (np.tile([True, False], (5, 1)), r"every state needs samples: all of \['x'\] are missing"),
     ],
 )

@@ -20,10 +20,10 @@ ROOT = Path(__file__).resolve().parents[1]
     ("typed", "message"),
     [
         (["+exp=breathin"], "there is no experiment 'breathin'; near it is +exp=breathing; there"),
-        (["+ex=breathing"], "an experiment is chosen with +exp=breathing: '+ex=breathing' came"),
+        (["+ex=breathing"], "an experiment is chosen with +exp=breathing, got '+ex=breathing'"),
         (["exp=breathing"], "'exp=breathing' adds to the config, which needs a plus: write +exp="),
-        (["breathing"], "must be KEY=VALUE, such as +exp=discover or seed=1: 'breathing' came; +e"),
-        (["inspct", "run.csv"], "'inspct' came; near it is the command inspect, which stands fi"),
+        (["breathing"], "must be KEY=VALUE, such as +exp=discover or seed=1, got 'breathing'; +e"),
+        (["inspct", "run.csv"], "got 'inspct'; near it is the command inspect, which stands fi"),
         (["+exp=discover", "data=recogn"], "near it is data=recognised; there are file, recog"),
         (["+exp=discover", "serch=joint"], "unknown key 'serch'; near it is search; there are"),
         (

@@ -32,9 +32,9 @@ def test_a_time_that_is_no_date_is_missing() -> None:
 @pytest.mark.parametrize(
     ("values", "match"),
     [
-        (X + 0j, "complex128 came; give real and imaginary parts"),
-        (X > 0, "bool came; give 0.0 and 1.0"),
-        (["1", "2"], "<U1 came; convert them first"),
+        (X + 0j, "got complex128; give real and imaginary parts"),
+        (X > 0, "got bool; give 0.0 and 1.0"),
+        (["1", "2"], "got <U1; convert them first"),
         (np.array(["2024"], dtype="M8[Y]"), "datetime64"),
     ],
 )

@@ -109,11 +109,11 @@ def test_the_law_of_a_known_family_is_found() -> None:
     [
         (
             {"coef": np.ones((3, 3))},
-            r"a finite number for every .* shape \(3, 3\) came for \(4, 3\)",
+            r"a finite number for every .* shape \(3, 3\) for \(4, 3\)",
         ),
         ({"coef": np.full((4, 3), np.nan)}, "a finite number for every coefficient"),
-        ({"coefficients": (("x", "x"), ("x", "y"), ("x", "x^3"), ("z", "x"))}, "x of z came"),
-        ({"coefficients": (("x", "x"), ("x", "y"), ("x", "q"), ("y", "x"))}, "q of x came"),
+        ({"coefficients": (("x", "x"), ("x", "y"), ("x", "x^3"), ("z", "x"))}, "got x of z"),
+        ({"coefficients": (("x", "x"), ("x", "y"), ("x", "q"), ("y", "x"))}, "got q of x"),
         ({"points": np.ones((4, 3))}, r"a column for each of \['a', 'b'\]"),
         ({"points": np.ones((0, 2))}, "a column for each"),
         ({"points": np.full((4, 2), np.inf)}, "points must be finite"),
@@ -303,10 +303,10 @@ def test_a_point_that_the_law_needs_cannot_be_left_out() -> None:
         information=fit().information[corner],
     )  # fmt: skip
     with pytest.raises(
-        ValueError, match="a law of 3 functions .* more points than these.*: 3 came"
+        ValueError, match="a law of 3 functions .* more points than these.*, got 3"
     ):
         three.rate_errors(LINEAR)
-    with pytest.raises(ValueError, match="a law of 3 terms needs as many points: 2 came"):
+    with pytest.raises(ValueError, match="a law of 3 terms needs as many points, got 2"):
         three.law_without(0, LINEAR)
     found = three.law(LINEAR)
     np.testing.assert_allclose(found.coef, truth(), atol=1e-4)
@@ -320,7 +320,7 @@ def test_a_law_that_is_tested_needs_a_point_more_than_it_has_functions() -> None
     make_basis(LINEAR, corners)
     make_basis(LINEAR, points[[0, 2, 6, 8]], n_spare=1)
     with pytest.raises(
-        ValueError, match="a law of 3 functions .* more points than these.*: 3 came"
+        ValueError, match="a law of 3 functions .* more points than these.*, got 3"
     ):
         make_basis(LINEAR, corners, n_spare=1)
 

@@ -267,7 +267,7 @@ def test_a_channel_that_is_not_known_is_asked_for() -> None:
         ep.zone_average(GRID, ep.Zone(z="downstream"), states=["n_i"])
     flat = GRID.isel(z=0, drop=True)
     assert ep.zone_average(flat, ep.Zone(z="downstream"), states=["n_i"]).n_samples == 5
-    with pytest.raises(ValueError, match="in m or one of channel, downstream: 'upstream' came"):
+    with pytest.raises(ValueError, match="in m or one of channel, downstream, got 'upstream'"):
         ep.Zone(z="upstream")
 
 

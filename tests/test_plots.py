@@ -131,5 +131,5 @@ def test_a_law_of_two_parameters_is_drawn_as_a_map_and_of_three_not_at_all() -> 
 
 
 def test_what_cannot_be_drawn_says_what_can() -> None:
-    with pytest.raises(TypeError, match=r"plot draws a Discovery, Evaluation, .*: list came"):
+    with pytest.raises(TypeError, match=r"plot draws a Discovery, Evaluation, .*, got list"):
         ep.plot([1.0])

@@ -62,7 +62,7 @@ def test_a_thermal_plume_spreads_by_sound_over_speed() -> None:
 
 @pytest.mark.parametrize("degrees", [-1.0, 46.0, math.nan, math.inf])
 def test_an_angle_out_of_range_is_refused(degrees: float) -> None:
-    with pytest.raises(ValueError, match=r"half_angle_deg must be from 0 to 45: .* came; give"):
+    with pytest.raises(ValueError, match=r"half_angle_deg must be from 0 to 45, got .*; give"):
         ep.thruster.ConicalPlume(degrees)
 
 

@@ -196,7 +196,7 @@ def test_what_makes_no_sense_is_refused() -> None:
     with pytest.raises(ValueError, match="needs a grid: this field has time alone"):
         ep.pointwise(field.isel(z=0, r=0, drop=True), searching(), workers=Serial())
     with pytest.raises(
-        ValueError, match="block_points must be a whole number, one or more: 0 came"
+        ValueError, match="block_points must be a whole number, one or more, got 0"
     ):
         ep.pointwise(field, searching(), workers=Serial(), block_points=0)
     with pytest.raises(ValueError, match="needs bootstraps for its spread: n=0"):
@@ -300,7 +300,7 @@ def test_a_draw_of_all_rows_is_the_fit_of_all_rows() -> None:
 
 
 def test_relations_that_cannot_hold_are_refused_at_once() -> None:
-    with pytest.raises(ValueError, match="n_culled must be 0, 1 came"):
+    with pytest.raises(ValueError, match="n_culled must be 0, 1"):
         sharing(SHARED, bootstraps=ep.Bootstraps(n=4, n_culled=1))
     with pytest.raises(ValueError, match="'v'"):
         sharing("x: v == -1 * y: v")

@@ -123,7 +123,7 @@ def test_charge_states_follow_the_columns():
     assert states == [3, 3, 1]
     assert XenonFits().charge_states == 1
     argon = ep.thruster.propellant("argon")
-    message = r"argon has further ionisations between the charges \[\]: \(1, 2\) came"
+    message = r"argon has further ionisations between the charges \[\], got \(1, 2\)"
     with pytest.raises(ValueError, match=message):
         argon.further_ionization(1, 2, T)
 

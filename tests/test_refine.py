@@ -245,9 +245,9 @@ def test_windows_are_as_many_periods_as_are_asked_for() -> None:
     ("settings", "message"),
     [
         ({"window": 4}, "at least one window of 5 samples is needed: n_windows=30, window=4"),
-        ({"n_windows": 0}, "n_windows must be a whole number, one or more: 0 came"),
+        ({"n_windows": 0}, "n_windows must be a whole number, one or more, got 0"),
         ({"window": 20, "periods": 1.0}, "by its samples or by its periods: window=20 and periods"),
-        ({"periods": 0.0}, "periods must be positive: 0.0 came"),
+        ({"periods": 0.0}, "periods must be positive, got 0.0"),
     ],
 )
 def test_settings_that_say_nothing_or_two_things_are_refused(
@@ -378,7 +378,7 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(ValueError, match="a list of trajectories of its own: 2 models and 1 lists"):
         ep.refine([model] * 2, [[data]], ep.refinement.RefinementSettings(window=50), seed=rng)
     for runs, came in ((data, "one run"), ([data], "a list of runs")):
-        with pytest.raises(ValueError, match=f"as in refine.* 1 models came with {came}"):
+        with pytest.raises(ValueError, match=f"as in refine.* 1 models with {came}"):
             ep.refine([model], runs, window=50, seed=rng)
 
 

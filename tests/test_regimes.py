@@ -276,5 +276,5 @@ def test_no_regime_at_all_is_refused() -> None:
 
 
 def test_equations_of_a_regime_that_is_not_there_are_refused() -> None:
-    with pytest.raises(ValueError, match="regimes run from 0 to 1: 2 came"):
+    with pytest.raises(ValueError, match="regimes run from 0 to 1, got 2"):
         found_in(patched()).equations(2)

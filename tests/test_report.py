@@ -230,10 +230,10 @@ def test_two_of_one_name_are_an_error(
 ) -> None:
     with start_run(toy) as report:
         add(report)
-        with pytest.raises(ValueError, match=f"every {kind} .* a name of its own: 'a' came twice"):
+        with pytest.raises(ValueError, match=f"every {kind} .* a name of its own, got 'a' twice"):
             add(report)
         if kind == "table":
-            with pytest.raises(ValueError, match="'a' came twice"):
+            with pytest.raises(ValueError, match="got 'a' twice"):
                 report.table("a", SIZES)
             assert report.tables["a"] is ROWS
 

@@ -129,7 +129,7 @@ def test_mass_action_takes_terms_that_contain_what_they_lower():
     assert [term for role, term in found if role == "n_i to n_n"] == ["n_i", "n_i^2", "n_i*n_n"]
     named = replace(MASS_ACTION, outflow={"n_i": ["n_n*n_i"]})
     assert [p.term for p in named.processes(LIBRARY, STATES) if p.role == "n_i out"] == ["n_i*n_n"]
-    with pytest.raises(ValueError, match=r"what lowers 'n_i' contains it: \['n_n'\] came"):
+    with pytest.raises(ValueError, match=r"what lowers 'n_i' contains it, got \['n_n'\]"):
         replace(MASS_ACTION, outflow={"n_i": ["n_i", "n_n"]}).processes(LIBRARY, STATES)
     births = replace(MASS_ACTION, inflow={"n_n": ["n_n", "1"]})
     assert [p.term for p in births.processes(LIBRARY, STATES) if p.role == "n_n in"] == ["n_n", "1"]
@@ -187,8 +187,8 @@ def test_what_is_told_is_kept_beside_what_is_found(record):
         (lambda: ep.Roles(exchange=[("x", "x")]), "joins two states"),
         (lambda: ep.Roles(inflow={"x": "some"}), "must be a number in SI per second, a list"),
         (lambda: ep.Roles(outflow={"x": {"x": "fast"}}), "terms with their coefficients in SI"),
-        (lambda: ep.Roles(exchange=[("x", "y"), ("x", "y")]), r"\['x to y'\] came twice"),
-        (lambda: ep.Roles(outflow=["z"]).processes(LIBRARY, STATES), r"\['z'\] came"),
+        (lambda: ep.Roles(exchange=[("x", "y"), ("x", "y")]), r"got \['x to y'\] twice"),
+        (lambda: ep.Roles(outflow=["z"]).processes(LIBRARY, STATES), r"got \['z'\]"),
         (
             lambda: ep.Roles(inflow={"n_n": "known"}).processes(LIBRARY, STATES),
             "known only where a record gives them",
@@ -250,7 +250,7 @@ def test_a_known_equation_is_kept_and_its_terms_stand_in_no_other() -> None:
     ("equations", "message"),
     [
         ({"n_i": {"n_i": 1.0}}, r"roles or a known equation: \['n_i'\] have both"),
-        ({"n_x": {"n_i": 1.0}}, r"must name states: \['n_x'\] came"),
+        ({"n_x": {"n_i": 1.0}}, r"must name states, got \['n_x'\]"),
     ],
 )
 def test_known_equations_that_make_no_sense_are_refused(equations, message) -> None:

@@ -54,11 +54,11 @@ def test_a_trajectory_keeps_its_point_as_finite_numbers() -> None:
 @pytest.mark.parametrize(
     ("point", "message"),
     [
-        ({"V": np.inf}, "a parameter must be a finite number: V=inf came"),
-        ({"V": True}, "finite number: V=True came"),
-        ({"V": "300"}, "finite number: V='300' came"),
+        ({"V": np.inf}, "a parameter must be a finite number, got V=inf"),
+        ({"V": True}, "finite number, got V=True"),
+        ({"V": "300"}, "finite number, got V='300'"),
         ({"V d": 3.0}, "must be a word of letters, digits and _"),
-        ({"x": 3.0}, "a name that no variable has: 'x' came"),
+        ({"x": 3.0}, "a name that no variable has, got 'x'"),
     ],
 )
 def test_what_is_no_point_is_refused(point: dict, message: str) -> None:
@@ -137,7 +137,7 @@ def test_files_say_their_points_in_columns_scalars_and_attributes(here: Path) ->
             {"parameters": ["x"]},
             "^a.csv: a parameter must be constant: 'x' has 40 values",
         ),
-        ({"parameters": "V"}, "parameters must be a list: 'V' came"),
+        ({"parameters": "V"}, "parameters must be a list, got 'V'"),
         ({"states": ["q"]}, r"^a.csv: unknown variables \['q'\]"),
         ({}, "^a.csv: a state must vary: 'V' stays at 300"),
         ({"files": ["a.csv", Path("../here/a.csv")]}, "every file may come once: .*a.csv comes ag"),

@@ -193,10 +193,10 @@ def test_supports_are_counted_among_terms_of_no_higher_degree() -> None:
 @pytest.mark.parametrize(
     ("rule", "setting", "message"),
     [
-        (ep.EBIC, {"gamma": -1.0}, "gamma must be zero or more: -1.0 came"),
-        (ep.EBIC, {"coarsening": 1.0}, "coarsening counts rows, and must be above 1: 1.0 came"),
-        (ep.Knee, {"n_norm": "libary"}, "'library' or 'max_terms': 'libary' came"),
-        (ep.Knee, {"scale": "ln"}, "scale must be 'linear' or 'log': 'ln' came"),
+        (ep.EBIC, {"gamma": -1.0}, "gamma must be zero or more, got -1.0"),
+        (ep.EBIC, {"coarsening": 1.0}, "coarsening counts rows, and must be above 1, got 1.0"),
+        (ep.Knee, {"n_norm": "libary"}, "'library' or 'max_terms', got 'libary'"),
+        (ep.Knee, {"scale": "ln"}, "scale must be 'linear' or 'log', got 'ln'"),
     ],
 )
 def test_impossible_settings_are_refused(rule: type, setting: dict, message: str) -> None:

@@ -34,7 +34,7 @@ TEXTS = {
 @pytest.mark.parametrize("name", TEXTS)
 def test_a_text_where_a_list_belongs_is_refused(name: str) -> None:
     call: Callable[[], object] = TEXTS[name]
-    with pytest.raises(ValueError, match=rf"{name.strip()} must be a list: '.*' came; write \['"):
+    with pytest.raises(ValueError, match=rf"{name.strip()} must be a list, got '.*'; write \['"):
         call()
 
 
@@ -87,7 +87,7 @@ WRONG_KINDS = [
     ),
     (
         lambda: ep.Weak(split=0.25),
-        r"split must be a Split, such as ep.regression.RandomSplit\(\): 0.25 came",
+        r"split must be a Split, such as ep.regression.RandomSplit\(\), got 0.25",
     ),
     (lambda: ep.Differential(smoother="kalman"), "smoother must be a Smoother, such as ep.sig"),
     (lambda: ep.discovery.PointSearch(["x"], None, ROWS), "library must be a Library, such as"),

@@ -508,15 +508,15 @@ UNLIKE = "runs of several operating points need the same parameters"
             {"law": 1},
             "'x' is in 1 in trajectory 0 and in m.-3 in trajectory 2",
         ),
-        ({}, {"law": 4}, "a law of 5 terms needs as many points: 3 came"),
+        ({}, {"law": 4}, "a law of 5 terms needs as many points, got 3"),
         (
             {"parameters": {"a": 0.6}},
             {"law": "auto"},
             r"a law of 2 functions of \['a'\] needs more points",
         ),
-        ({}, {"law": ep.named_terms(["b"], ["1", "b"])}, r"must be of \['a'\]: \['b'\] came"),
+        ({}, {"law": ep.named_terms(["b"], ["1", "b"])}, r"must be of \['a'\], got \['b'\]"),
         ({}, {"law": []}, "must name degrees or functions"),
-        ({}, {"law": 1, "hidden": ["z"]}, r"samples of every state: .*z.* came as hidden"),
+        ({}, {"law": 1, "hidden": ["z"]}, r"samples of every state, got .*z.* as hidden"),
         (
             {},
             {"law": 1, "method": ep.Regression(search=ep.AdaptiveLasso())},

@@ -182,7 +182,7 @@ def test_predictions_take_samples_one_or_many_and_trajectories() -> None:
         model.predict(run, {"u": u, "w": w})
     with pytest.raises(ValueError, match=r"a column for each of \['x', 'y'\]: shape \(7, 1\)"):
         linear().predict(x[:, None])
-    with pytest.raises(ValueError, match="must be samples here: a function came"):
+    with pytest.raises(ValueError, match="must be samples here, got a function"):
         model.predict(x[:, None], {"u": np.sin, "w": w})
 
 

@@ -70,7 +70,7 @@ def test_several_trajectories_are_fitted_together() -> None:
     both = [found.model_.score(run) for run in runs]
     assert found.score(states, times) == pytest.approx((3 * both[0] + 5 * both[1]) / 8)
     assert [each.shape for each in found.predict(states)] == [(300, 2), (500, 2)]
-    with pytest.raises(ValueError, match=r"each of 2 trajectories needs .* lists of 1 and 2 came"):
+    with pytest.raises(ValueError, match=r"each of 2 trajectories needs .* lists of 1 and 2"):
         found.fit(states, times[:1])
 
 

@@ -265,9 +265,9 @@ def test_a_model_with_inputs_has_no_cycle_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("start", "settings", "message"),
     [
-        ([1.0], {"period_s": 1.0}, r"for each of \['x', 'y'\]: \[1.0\] came"),
-        ([1.0, 0.0], {"period_s": 0.0}, "positive time in s: 0.0 came"),
-        ([1.0, 0.0], {"period_s": 1.0, "n_samples": 4}, "8 or more.*: 4 came"),
+        ([1.0], {"period_s": 1.0}, r"for each of \['x', 'y'\], got \[1.0\]"),
+        ([1.0, 0.0], {"period_s": 0.0}, "positive time in s, got 0.0"),
+        ([1.0, 0.0], {"period_s": 1.0, "n_samples": 4}, "8 or more.*, got 4"),
     ],
 )
 def test_a_search_needs_a_state_a_period_and_samples(
@@ -279,7 +279,7 @@ def test_a_search_needs_a_state_a_period_and_samples(
 
 def test_starts_that_cannot_be_and_a_cycle_of_another_model_are_refused() -> None:
     model, cycle = found(HOPF, [1.0, 0.0], 6.0)
-    with pytest.raises(ValueError, match=r"n_periods=3.0 came"):
+    with pytest.raises(ValueError, match=r"got n_periods=3.0"):
         share_reaching(model, cycle, n_periods=3.0)
     with pytest.raises(ValueError, match="the lower first"):
         share_reaching(model, cycle, spread=(3.0, 0.3))

@@ -42,7 +42,7 @@ def test_runs_that_do_not_agree_are_refused_by_every_method(method, wrong: str) 
 
 ASKED = [
     ({"library": LIBRARY.only({"z": ["x"]})}, r"unknown state 'z'; there are \['x', 'y'\]"),
-    ({"runs": []}, "at least one run is needed: an empty list came"),
+    ({"runs": []}, "at least one run is needed, got an empty list"),
     ({"library": ep.polynomial(["x", "u"], degree=1)}, r"the library needs \['u'\]: sample it as"),
 ]
 
@@ -130,7 +130,7 @@ def test_a_method_needs_no_more_than_a_rule_and_an_answer() -> None:
     [
         (ep.BestSubset(), "which has no selection and no identify"),
         (SimpleNamespace(selection=ep.EBIC()), "which has no identify"),
-        (ep.Regression, "the class Regression came; call it to make a value$"),
+        (ep.Regression, "got the class Regression; call it to make a value$"),
     ],
 )
 def test_what_is_no_method_is_refused_with_what_it_lacks(value: object, lacking: str) -> None:

@@ -223,7 +223,7 @@ def test_a_slash_in_a_unit_is_no_path(tmp_path: Path, name: str, column: str, un
 
 def test_a_count_is_a_unit_only_where_the_file_says_so(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t,x\n" + rows(T, X))
-    with pytest.raises(ValueError, match="must be one that converts to SI: 'animals/ml' came"):
+    with pytest.raises(ValueError, match="must be one that converts to SI, got 'animals/ml'"):
         ep.open_field(
             tmp_path / "a.csv",
             variables={"x": ep.data.Variable("x", "animals/ml")},

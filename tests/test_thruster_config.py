@@ -51,7 +51,7 @@ def test_experiments_take_a_thruster(experiment: str) -> None:
     [
         ("+data.thruster.chanel_length=0.02", r"Thruster: .*'chanel_length'; near it are"),
         ("+data.thruster.wall.colour=1", r"data\.thruster\.wall, wall_material: .*'colour'; it ta"),
-        ("data.thruster.propellant.name=iodine", r"there are the propellants .* 'iodine' came"),
+        ("data.thruster.propellant.name=iodine", r"there are the propellants .* 'iodine'"),
         ("data.thruster.anode._target_=ep2sindy.Anode", r"data\.thruster\.anode must name a _targ"),
     ],
 )

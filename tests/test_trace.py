@@ -307,9 +307,9 @@ def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
     ("make", "message"),
     [
         (lambda: ep.signals.LogSmoother(0.0), "finest_s must be positive and finite"),
-        (lambda: ep.embed(sine(), n_states=6), "n_states must be 2 to 5: 6 came"),
+        (lambda: ep.embed(sine(), n_states=6), "n_states must be 2 to 5, got 6"),
         (lambda: ep.embed(sine(), "lags"), "how must be auto, hidden, rate, derivative, delays"),
-        (lambda: ep.embed(sine(), harmonics=0.5), "harmonics must be one or more: 0.5 came"),
+        (lambda: ep.embed(sine(), harmonics=0.5), "harmonics must be one or more, got 0.5"),
         (lambda: ep.embed(sine(), decimate=0), "decimate must be auto, null or a whole number"),
         (lambda: ep.signals.prepare_signal(ep.lotka_volterra().trajectory()), "one signal must be"),
         (

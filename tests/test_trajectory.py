@@ -45,7 +45,7 @@ REPEATED[20] = REPEATED[19]
     [
         ({"states": NAN_STATES}, r"x\[12\] = nan at t = 0.244898 s"),
         ({"t": REPEATED}, r"t must increase: t\[20\] = 0.387755102 s follows 0.387755102 s"),
-        ({"t": np.linspace(0, 1, 49)}, r"as many samples as t: \(50, 1\) came with 49 times"),
+        ({"t": np.linspace(0, 1, 49)}, r"as many samples as t, got \(50, 1\) with 49 times"),
         ({"inputs": np.ones((49, 1)), "input_names": ["u"]}, "inputs must have shape"),
         ({"inputs": np.ones((50, 1))}, "one name per column"),
         ({"t": np.zeros(1), "states": np.ones((1, 1))}, "at least two samples"),

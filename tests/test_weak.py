@@ -185,5 +185,5 @@ def test_an_input_that_never_changes_is_no_obstacle() -> None:
 
 
 def test_overlapping_boxes_have_no_errors_in_variables() -> None:
-    with pytest.raises(ValueError, match="needs smooth test functions: Boxes came; use Bumps, or"):
+    with pytest.raises(ValueError, match="needs smooth test functions, got Boxes; use Bumps, or"):
         ep.Weak(test_functions=ep.regression.Boxes())

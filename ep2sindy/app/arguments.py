@@ -123,7 +123,7 @@ def _unreadable(text: str, reason: str) -> str:
             """'KEY={NAME: ["TEXT"]}'"""
         )
     return (
-        f"an argument must be KEY=VALUE, such as +exp=discover or seed=1: {text!r} came"
+        f"an argument must be KEY=VALUE, such as +exp=discover or seed=1, got {text!r}"
         f"{near_words(text, COMMANDS, form='the command {}, which stands first')}; "
         f"+exp={text} is the form for an experiment"
     )

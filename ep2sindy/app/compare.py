@@ -52,7 +52,7 @@ def main(arguments: Sequence[str]) -> None:
     given = parser.parse_args(arguments)
     folders = [folder for path in given.run for folder in folders_of(Path(path))]
     if len(folders) < 2:
-        raise ValueError(f"to compare takes two runs or more: {list(map(str, folders))} came")
+        raise ValueError(f"to compare takes two runs or more, got {list(map(str, folders))}")
     runs = [read_run(folder, k) for k, folder in enumerate(folders)]
     page = Path(given.page)
     names = sorted(set.intersection(*({*run.figures} for run in runs)))

@@ -167,7 +167,7 @@ def _no_experiment(typed: Sequence[str], conf: Path) -> ValueError:
     for text in typed:
         key, _, value = text.lstrip("+").partition("=")
         if value in names and near_words(key, ["exp", "experiment"]):
-            return ValueError(f"an experiment is chosen with +exp={value}: {text!r} came")
+            return ValueError(f"an experiment is chosen with +exp={value}, got {text!r}")
     return ValueError(
         f"choose an experiment with +exp=NAME; there are {listed(names)}. A config of your own "
         "begins with the line '# @package _global_'"

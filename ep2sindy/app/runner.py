@@ -72,7 +72,7 @@ def study_class(name: object) -> type:
         raise ValueError(
             f"study must name a module of ep2sindy.studies that has a class Study, one of "
             f"{list_studies()}, or one of your own as package.module, below the folder that you "
-            f"start in: {name!r} came"
+            f"start in, got {name!r}"
         ) from error
 
 

@@ -232,11 +232,11 @@ class Task:
         measured = {name for run in self.runs for name in run.names}
         if twice := [name for name, n in Counter([*measured, *self.hidden]).items() if n > 1]:
             raise ValueError(
-                f"a hidden state is one that no run has: {twice} came with samples or twice; leave "
+                f"a hidden state is one that no run has, got {twice} with samples or twice; leave "
                 "them out of hidden, or out of the runs"
             )
         if self.hidden and self.facts.roles is not None:
             raise ValueError(
-                f"roles need samples of every state: {list(self.hidden)} came as hidden; give "
+                f"roles need samples of every state, got {list(self.hidden)} as hidden; give "
                 "relations between coefficients instead, or leave roles out"
             )

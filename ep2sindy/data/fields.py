@@ -37,7 +37,7 @@ def check_field(field: xr.Dataset) -> None:
     unknown = set(map(str, field.dims)) - set(DIMS)
     if unknown or "time" not in field.dims:
         raise ValueError(
-            f"a field has the dimension time and may have z and r: {list(field.dims)} came; "
+            f"a field has the dimension time and may have z and r, got {list(field.dims)}; "
             "rename or reduce the others"
         )
     for axis in field.dims:
@@ -85,8 +85,8 @@ def grid_points(field: xr.Dataset, axis: str) -> Float[np.ndarray, " points"]:
     """Coordinate of one axis as float64, in s or m. Raises ValueError for what is no field."""
     if not isinstance(field, xr.Dataset):
         raise ValueError(
-            "a field must be an xarray.Dataset, as ep.open_field returns it: "
-            f"{type(field).__name__} came; prepare the field before trajectories are taken from it"
+            "a field must be an xarray.Dataset, as ep.open_field returns it, got "
+            f"{type(field).__name__}; prepare the field before trajectories are taken from it"
         )
     return np.asarray(field[axis].values, dtype=np.float64)
 

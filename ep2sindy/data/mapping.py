@@ -96,7 +96,7 @@ def in_file(
         if isinstance(value, Mapping):
             if not {"name", "unit"} <= set(value) <= {"name", "unit", "dims"}:
                 problems.found.append(
-                    f"{ours} needs a name, a unit, perhaps dims: {dict(value)} came"
+                    f"{ours} needs a name, a unit, perhaps dims, got {dict(value)}"
                 )
                 continue
             value = Variable(value["name"], str(value["unit"]), value.get("dims"))
@@ -141,7 +141,7 @@ def _split_selection(source: FileSource, name: str) -> tuple[str | None, tuple[i
         return None, ()
     parts = [part.strip() for part in found[2].split(",")]
     if not all(re.fullmatch(r":|-?\d+", part) for part in parts):
-        raise ValueError(f"part of an array is written like [:, 1]: {name!r} came")
+        raise ValueError(f"part of an array is written like [:, 1], got {name!r}")
     return found[1], tuple(slice(None) if part == ":" else int(part) for part in parts)
 
 

@@ -38,7 +38,7 @@ def real_numbers(values: object, what: str) -> np.ndarray:
             "O": "convert them first, .astype(float)",
         }
         way_out = ways.get(array.dtype.kind, "convert them first")
-        raise ValueError(f"{what} must hold real numbers: {array.dtype} came; {way_out}")
+        raise ValueError(f"{what} must hold real numbers, got {array.dtype}; {way_out}")
     copy = np.array(array, dtype=np.float64, order="C")
     if masked is not None:
         copy[np.ma.getmaskarray(masked)] = np.nan
@@ -234,7 +234,7 @@ def quantiles(draws: Float[np.ndarray, "draws ..."], levels: Sequence[float]) ->
 def band_of(draws: Float[np.ndarray, "draws ..."], level: float) -> np.ndarray:
     """Lower and upper bound that hold this share of the draws. ValueError if it is no share."""
     if not 0.0 < level < 1.0:
-        raise ValueError(f"level must lie between 0 and 1: {level} came")
+        raise ValueError(f"level must lie between 0 and 1, got {level}")
     return quantiles(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
 
 

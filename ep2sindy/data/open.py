@@ -197,7 +197,7 @@ def write_field(field: xr.Dataset, path: str | Path) -> None:
     """
     check_field(field)
     if Path(path).suffix != ".nc":
-        raise ValueError(f"a field is written as NetCDF, to a name that ends in .nc: {path} came")
+        raise ValueError(f"a field is written as NetCDF, to a name that ends in .nc, got {path}")
     write_netcdf(field.drop_encoding(), Path(path))
 
 

@@ -67,7 +67,7 @@ def derive(field: xr.Dataset, *, name: str, expression: str, units: str) -> xr.D
     check_new(field, name)
     array = evaluate(field, expression)
     if not array.dims:
-        raise ValueError(f"a derived variable must use at least one variable: {expression!r} came")
+        raise ValueError(f"a derived variable must use at least one variable, got {expression!r}")
     derived = field.assign({name: array.drop_attrs(deep=False).assign_attrs(units=units)})
     check_field(derived)
     return derived
@@ -104,7 +104,7 @@ def gradient(field: xr.Dataset, *, of: str, name: str, axis: str = "z") -> xr.Da
 def _check_axis(data: xr.Dataset | xr.DataArray, axis: str, what: str) -> None:
     if axis not in SPACE or data.sizes.get(axis, 1) < 2:
         raise ValueError(
-            f"{what} needs two or more cells along z or r: sizes {dict(data.sizes)} came; name an "
+            f"{what} needs two or more cells along z or r, got sizes {dict(data.sizes)}; name an "
             "axis of several cells, or take the step before the cells are averaged"
         )
 
@@ -167,7 +167,7 @@ def keep_where(field: xr.Dataset, *, condition: str) -> xr.Dataset:
     inside = evaluate(field, condition)
     if inside.dtype != bool or not set(inside.dims) & set(SPACE) or "time" in inside.dims:
         raise ValueError(
-            f"a condition must compare places, not samples: {condition!r} came; write for example "
+            f"a condition must compare places, not samples, got {condition!r}; write for example "
             "'(z > 0.01) & (r < 0.05)'"
         )
     return mask_outside(field, inside)
@@ -207,8 +207,8 @@ def _value(node: ast.expr, field: xr.Dataset) -> xr.DataArray:
         case ast.Call(func=ast.Name(id=name), args=[argument]) if name in FUNCTIONS:
             return FUNCTIONS[name](_value(argument, field))
     raise ValueError(
-        f"an expression may use + - * / ^ < <= > >= & |, brackets and {list(FUNCTIONS)}: "
-        f"{ast.unparse(node)!r} came"
+        f"an expression may use + - * / ^ < <= > >= & |, brackets and {list(FUNCTIONS)}, got "
+        f"{ast.unparse(node)!r}"
     )
 
 
@@ -240,7 +240,7 @@ def decimate(field: xr.Dataset, *, factor: int) -> xr.Dataset:
     n_samples = field.sizes["time"]
     if factor < 1 or n_samples <= factor:
         raise ValueError(
-            f"factor must be 1 or more and leave two samples or more: {factor} came with "
+            f"factor must be 1 or more and leave two samples or more, got {factor} with "
             f"{n_samples} samples"
         )
     return field.isel(time=slice(None, None, factor))
@@ -259,13 +259,13 @@ def low_pass(field: xr.Dataset, *, cutoff_Hz: float, order: int = 4) -> xr.Datas
     n_edge = 3 * (order + 1)
     if not 0 < cutoff_Hz < 0.5 / dt_s:
         raise ValueError(
-            f"cutoff_Hz must lie between 0 and half the sampling rate, {0.5 / dt_s:g} Hz: "
-            f"{cutoff_Hz:g} came"
+            f"cutoff_Hz must lie between 0 and half the sampling rate, {0.5 / dt_s:g} Hz, got "
+            f"{cutoff_Hz:g}"
         )
     if field.sizes["time"] <= n_edge:
         raise ValueError(
-            f"a low-pass of order {order} needs more than {n_edge} samples: "
-            f"{field.sizes['time']} came; lower the order or leave it out"
+            f"a low-pass of order {order} needs more than {n_edge} samples, got "
+            f"{field.sizes['time']}; lower the order or leave it out"
         )
     sos = signal.butter(order, cutoff_Hz, fs=1 / dt_s, output="sos")
     smooth = {}
@@ -300,7 +300,7 @@ def resample(field: xr.Dataset, *, dt_s: float) -> xr.Dataset:
     t = grid_points(field, "time")
     if not 0 < dt_s <= 0.5 * (t[-1] - t[0]):
         raise ValueError(
-            f"dt_s must be positive and leave two samples or more: {dt_s:g} s came for a record of "
+            f"dt_s must be positive and leave two samples or more, got {dt_s:g} s for a record of "
             f"{t[-1] - t[0]:g} s"
         )
     finer = dt_s <= np.median(np.diff(t)) * (1 + 1e-6)
@@ -378,7 +378,7 @@ def delay(
     kept = t >= t[0] + delay_s * (1 - 1e-12)
     if delay_s <= 0 or kept.sum() < 2:
         raise ValueError(
-            f"delay_s must be positive and leave two samples or more: {delay_s:g} s came for a "
+            f"delay_s must be positive and leave two samples or more, got {delay_s:g} s for a "
             f"record of {t[-1] - t[0]:g} s"
         )
     straight = make_interp_spline(t, array.values, k=1, axis=0, check_finite=False)
@@ -398,7 +398,7 @@ def derivative(field: xr.Dataset, *, variable: str, name: str | None = None) -> 
     name = name or f"d{variable}_dt"
     check_new(field, name)
     if len(t) < 3:
-        raise ValueError(f"a derivative needs three samples or more: {len(t)} came")
+        raise ValueError(f"a derivative needs three samples or more, got {len(t)}")
     rate = np.gradient(array.values, t, axis=0, edge_order=2)
     units = unit_product([(array.attrs["units"], 1), ("s", -1)])
     return field.assign({name: array.copy(data=rate).assign_attrs(units=units)})
@@ -414,7 +414,7 @@ def detrend(
     names = _of_time(field) if variables is None else list(variables)
     t = grid_points(field, "time")
     if not 1 <= degree < len(t):
-        raise ValueError(f"degree must be 1 or more, below the number of samples: {degree} came")
+        raise ValueError(f"degree must be 1 or more, below the number of samples, got {degree}")
     basis = np.linalg.qr(np.vander((t - t.mean()) / np.ptp(t), degree + 1, increasing=True))[0]
     found = {}
     for name in names:

@@ -292,7 +292,7 @@ def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[floa
         ruler = given.to(target, "boltzmann") if target else given.to_base_units()
     except UNIT_ERRORS as error:
         raise ValueError(
-            f"the unit of {ours} must be one that converts to {target or 'SI'}: {unit!r} came "
+            f"the unit of {ours} must be one that converts to {target or 'SI'}, got {unit!r} "
             f"({error or type(error).__name__}); write for example 'cm^-3', '1e19 m^-3', 'km/s'"
         ) from None
     zero, one, two = (float(value) for value in ruler.magnitude)

@@ -86,7 +86,7 @@ def _with_units(
 ) -> tuple[dict[str, Variable], dict[str, str]]:
     """Locations with the user's units, and the questions for those that still lack one."""
     if unknown := sorted({*units} - {*found}):
-        raise ValueError(f"units are of {[*found]}: {unknown} came")
+        raise ValueError(f"units are of {[*found]}, got {unknown}")
     complete, no_unit = {}, {}
     for ours, variable in found.items():
         if ours in units and variable.unit not in ("", "1"):

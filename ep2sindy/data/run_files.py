@@ -60,12 +60,12 @@ class FilePattern:
         if not self.names or re.search(r"[{}]", _PLACEHOLDER.sub("", self.text)):
             raise ValueError(
                 "the files of operating points need a pattern with a placeholder for each "
-                f"quantity, like {example}: {self.text!r} came"
+                f"quantity, like {example}, got {self.text!r}"
             )
         if wrong := [name for name in self.names if not name.isidentifier() or name == DATA]:
             raise ValueError(
                 "a placeholder must be the name of a quantity, of letters, digits and _, and not "
-                f"{DATA!r}, like {example}: {wrong[0]!r} came in {self.text!r}"
+                f"{DATA!r}, like {example}, got {wrong[0]!r} in {self.text!r}"
             )
 
     @cached_property

@@ -71,10 +71,10 @@ def trajectories_of(
     several = isinstance(runs, Sequence) and not isinstance(runs, tuple | str)
     listed: list[Any] = [*cast("Sequence[Any]", runs)] if several else [runs]
     if not listed:
-        raise ValueError("at least one run is needed: an empty list came")
+        raise ValueError("at least one run is needed, got an empty list")
     times = t if isinstance(t, list | tuple) and several else [t] * len(listed)
     if len(times) != len(listed):
-        raise ValueError(f"t must hold times for each run: {len(times)} came for {len(listed)}")
+        raise ValueError(f"t must hold times for each run, got {len(times)} for {len(listed)}")
     found = []
     for k, (run, own) in enumerate(zip(listed, times, strict=True)):
         timed = run if own is None else _timed(run, own)
@@ -87,11 +87,11 @@ def _timed(run: object, t: object) -> object:
     """A run that has no times, with times or a step in s."""
     if isinstance(t, str):
         raise ValueError(
-            f"t must be times or a step in s: {t!r} came; call a table's column of times 'time', "
+            f"t must be times or a step in s, got {t!r}; call a table's column of times 'time', "
             "or by its unit, as 'time (ms)'"
         )
     if isinstance(run, Trajectory | tuple) or _is_field(run):
-        raise ValueError(f"t is for arrays and tables without times: a {type(run).__name__} came")
+        raise ValueError(f"t is for arrays and tables without times, got a {type(run).__name__}")
     rows: Any = run if is_run(run) else np.ma.asanyarray(run)
     times: Any = t
     if np.ndim(times) == 0:
@@ -101,7 +101,7 @@ def _timed(run: object, t: object) -> object:
         return times, rows
     times = np.asarray(times)
     if times.shape != (len(rows),):
-        raise ValueError(f"t must have a time for each of {len(rows)} rows: {times.shape} came")
+        raise ValueError(f"t must have a time for each of {len(rows)} rows, got {times.shape}")
     return rows.reset_index(drop=True).assign(**{TIMES[0]: times})
 
 
@@ -171,8 +171,8 @@ def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
     """Convert a Dataset over time to a trajectory; see `_from_table`."""
     if tuple(field.dims) != ("time",):
         raise ValueError(
-            "a Dataset must have the dimension time alone to be a run: "
-            f"{list(map(str, field.dims))} came; average over a zone, ep.zone_average(field, "
+            "a Dataset must have the dimension time alone to be a run, got "
+            f"{list(map(str, field.dims))}; average over a zone, ep.zone_average(field, "
             "ep.Zone(), states=[...]), or take a point, ep.data.point_samples(field, ...)"
         )
     if "time" not in field.coords:
@@ -208,7 +208,7 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
     table = table.set_axis([_word(name) for name in table.columns], axis="columns")
     if not table.columns.is_unique:
         raise ValueError(
-            f"columns of a table must have names of their own: {list(table.columns)} came; rename "
+            f"columns of a table must have names of their own, got {list(table.columns)}; rename "
             "or drop those that repeat"
         )
     times = [name for name in table.columns if name in TIMES]
@@ -226,7 +226,7 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
         del wrong[times[0]]
     if wrong:
         way_out = "give time in s, as numbers or dates" if times[0] in wrong else "drop them"
-        raise ValueError(f"columns of a table must hold real numbers: {wrong} came; {way_out}")
+        raise ValueError(f"columns of a table must hold real numbers, got {wrong}; {way_out}")
     values, units = columns_in_si(table[states])
     states = list(units)
     t, clock = _elapsed(table[times[0]])
@@ -276,8 +276,8 @@ def _from_arrays(t: object, x: object, partial: bool) -> Trajectory:
     states: Any = np.ma.asanyarray(x)
     if times.ndim != 1 or states.ndim not in (1, 2) or len(times) != len(states):
         raise ValueError(
-            "arrays (t, x) must have shapes (samples,) and (samples,) or (samples, n_states): "
-            f"{times.shape} and {states.shape} came"
+            "arrays (t, x) must have shapes (samples,) and (samples,) or (samples, n_states), got "
+            f"{times.shape} and {states.shape}"
         )
     columns = real_numbers(states[:, None] if states.ndim == 1 else states, "states")
     names = ["x"] if states.ndim == 1 else [f"x{k}" for k in range(states.shape[1])]

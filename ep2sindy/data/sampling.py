@@ -55,7 +55,7 @@ def side_by_side(zones: Mapping[str, Zone | Sequence[float]], field: xr.Dataset)
     taken, reached_m = 0, -math.inf
     for name, given in zones.items():
         if not re.fullmatch(r"\w{1,100}", str(name)):
-            raise ValueError(f"a zone's name must be a word, such as 'exit': {name!r} came")
+            raise ValueError(f"a zone's name must be a word, such as 'exit', got {name!r}")
         zone = resolve_zone(given if isinstance(given, Zone) else Zone(z=given), field)
         begin_m, end_m = map(float, zone.z or (-math.inf, math.inf))
         if begin_m < reached_m or zone.z is None:
@@ -98,7 +98,7 @@ class ZoneAverage:
         if not (zones is None or is_number or (isinstance(zones, Mapping) and zones)):
             raise ValueError(
                 "zones must be a whole number of parts, one or more, or zones by name, such as "
-                f"{{anode: [0, 0.01], exit: [0.01, 0.025]}} in m: {zones!r} came"
+                f"{{anode: [0, 0.01], exit: [0.01, 0.025]}} in m, got {zones!r}"
             )
 
     def parts(self, field: xr.Dataset) -> dict[str, Zone]:
@@ -156,7 +156,7 @@ class ZoneAverage:
         if any(there.start != here.stop for here, there in pairwise(inside)):
             raise ValueError(
                 "zones that exchange something must adjoin, each beginning where the one before "
-                f"ends: {self.zones} came"
+                f"ends, got {self.zones}"
             )
         lengths = cell_sizes(field, "z", axisymmetric=self.axisymmetric)
         return {n: float(lengths[part].sum()) for n, part in zip(parts, inside, strict=True)}
@@ -219,14 +219,14 @@ def _nearest(field: xr.Dataset, *, z: float | None, r: float | None) -> dict[str
     places = {axis: value for axis, value in (("z", z), ("r", r)) if value is not None}
     axes = [axis for axis in SPACE if axis in field.dims]
     if sorted(places) != sorted(axes):
-        raise ValueError(f"a point needs one place per axis {axes} of its field: {places} came")
+        raise ValueError(f"a point needs one place per axis {axes} of its field, got {places}")
     nearest = {}
     for axis, place in places.items():
         points = grid_points(field, axis)
         ends = cell_edges(points)[[0, -1]] if len(points) > 1 else points[[0, 0]]
         if not ends[0] <= place <= ends[1]:
             raise ValueError(
-                f"a point must lie on the grid: {axis} = {place:g} m came, the grid's cells reach "
+                f"a point must lie on the grid, got {axis} = {place:g} m, the grid's cells reach "
                 f"from {ends[0]:g} to {ends[1]:g} m"
             )
         nearest[axis] = [int(np.argmin(np.abs(points - place)))]

@@ -68,7 +68,7 @@ def files_of(path: object) -> list[str]:
     if isinstance(path, list | tuple) and path:
         return [file for each in path for file in files_of(each)]
     if not isinstance(path, str | Path):
-        raise ValueError(f"a path must be a file, a pattern or a list of them: {path!r} came")
+        raise ValueError(f"a path must be a file, a pattern or a list of them, got {path!r}")
     if not any(sign in str(path) for sign in "*?[") or Path(path).exists():
         return [str(path)]
     found = sorted(glob(str(path), recursive=True))

@@ -97,7 +97,7 @@ class Trajectory:
             check_variable(name)
             if name in (*self.names, "time"):
                 raise ValueError(
-                    f"a parameter needs a name that no variable has: {name!r} came; rename one"
+                    f"a parameter needs a name that no variable has, got {name!r}; rename one"
                 )
         units = {n: self.units.get(n, "1") for n in (*self.names, *self.parameters)}
         object.__setattr__(self, "units", MappingProxyType(units))
@@ -114,8 +114,8 @@ class Trajectory:
         missing = np.asarray(self.missing)
         if missing.shape != states.shape or missing.dtype != np.bool_:
             raise ValueError(
-                "missing must be a mask of the states, true or false for each sample: "
-                f"{missing.dtype} of shape {missing.shape} came with states of shape "
+                "missing must be a mask of the states, true or false for each sample, got "
+                f"{missing.dtype} of shape {missing.shape} with states of shape "
                 f"{states.shape}; write missing=np.isnan(states)"
             )
         lacking = np.atleast_1d(missing.all(axis=0))
@@ -291,17 +291,17 @@ class Trajectory:
         ):
             if values.ndim != 2 or len(values) != len(self.t):
                 raise ValueError(
-                    f"{role} must have shape (samples, variables) with as many samples as t: "
-                    f"{values.shape} came with {len(self.t)} times"
+                    f"{role} must have shape (samples, variables) with as many samples as t, got "
+                    f"{values.shape} with {len(self.t)} times"
                 )
             if values.shape[1] != len(names):
                 raise ValueError(
-                    f"{role} must have one name per column: {values.shape[1]} columns came with "
+                    f"{role} must have one name per column, got {values.shape[1]} columns with "
                     f"the names {list(names)}"
                 )
         repeated = [name for name, n in Counter(self.names).items() if n > 1]
         if repeated:
-            raise ValueError(f"variable names must be unique: {repeated} came more than once")
+            raise ValueError(f"variable names must be unique, got {repeated} more than once")
         if not self.state_names:
             raise ValueError("a trajectory needs at least one state; name one in state_names")
 
@@ -337,7 +337,7 @@ def _finite(parameters: Mapping[str, float]) -> dict[str, float]:
     """The parameters as floats. Raises ValueError unless they are finite numbers."""
     for name, value in parameters.items():
         if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
-            raise ValueError(f"a parameter must be a finite number: {name}={value!r} came")
+            raise ValueError(f"a parameter must be a finite number, got {name}={value!r}")
     return {name: float(value) for name, value in parameters.items()}
 
 
@@ -372,7 +372,7 @@ def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]
     the inputs, which are taken by name; states must come in one order.
     """
     if not trajectories:
-        raise ValueError("at least one trajectory is needed to find equations: none came")
+        raise ValueError("at least one trajectory is needed to find equations, got none")
     first = trajectories[0]
     names = [*first.state_names, *(v for v in variables if v not in first.state_names)]
     for k, run in enumerate(trajectories):

@@ -113,7 +113,7 @@ def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str])
             f"unknown variables {unknown}; this field has {list(field.data_vars)}{''.join(hints)}"
         )
     if len(set(columns)) < len(columns):
-        raise ValueError(f"states, inputs and products must differ: {list(columns)} came")
+        raise ValueError(f"states, inputs and products must differ, got {list(columns)}")
 
 
 def _zone_weights(
@@ -200,7 +200,7 @@ class Zone:
             if isinstance(bounds, str) or len(bounds) != 2 or not bounds[0] < bounds[1]:
                 names = f" or one of {', '.join(PARTS)}" if axis == "z" else ""
                 raise ValueError(
-                    f"a zone's {axis} must be two increasing numbers in m{names}: {bounds!r} came"
+                    f"a zone's {axis} must be two increasing numbers in m{names}, got {bounds!r}"
                 )
             object.__setattr__(self, axis, (float(bounds[0]), float(bounds[1])))
 
@@ -276,7 +276,7 @@ def zone_slices(field: xr.Dataset, zone: Zone) -> dict[str, slice]:
             continue
         if axis not in field.dims:
             raise ValueError(
-                f"a zone may bound only the axes of its field: {axis} came, the field has "
+                f"a zone may bound only the axes of its field, got {axis}, the field has "
                 f"{list(field.dims)}; leave {axis} out of the zone"
             )
         points = grid_points(field, axis)
@@ -287,8 +287,8 @@ def zone_slices(field: xr.Dataset, zone: Zone) -> dict[str, slice]:
         beyond = max(points[0] - bounds[0] - steps[0], bounds[1] - points[-1] - steps[-1])
         if start >= stop or beyond > rounding:
             raise ValueError(
-                f"a zone must hold grid points and stay on the grid: {axis} from {bounds[0]:g} to "
-                f"{bounds[1]:g} m came, the grid has {len(points)} points from {points[0]:g} to "
+                f"a zone must hold grid points and stay on the grid, got {axis} from {bounds[0]:g} to "
+                f"{bounds[1]:g} m, the grid has {len(points)} points from {points[0]:g} to "
                 f"{points[-1]:g} m; take a zone on the grid ('trajectory.zone.{axis}=[FROM,TO]')"
             )
         slices[axis] = slice(start, stop)

@@ -129,7 +129,7 @@ class SINDy(BaseEstimator):
         known = list(self.model_.states)
         if input_features is not None and list(input_features) != known:
             raise ValueError(
-                f"input_features should match those of fit, {known}: {list(input_features)} came"
+                f"input_features should match those of fit, {known}, got {list(input_features)}"
             )
         return np.array(self.model_.library.names, dtype=object)
 
@@ -140,8 +140,8 @@ class SINDy(BaseEstimator):
         columns = _columns(u)
         if columns.shape[1] != len(self.input_names_):
             raise ValueError(
-                f"u must have a column for each of {list(self.input_names_)}, as in fit: shape "
-                f"{columns.shape} came"
+                f"u must have a column for each of {list(self.input_names_)}, as in fit, got shape "
+                f"{columns.shape}"
             )
         return columns[:, [self.input_names_.index(name) for name in self.model_.inputs]]
 
@@ -155,8 +155,8 @@ class SINDy(BaseEstimator):
         inputs = [None] * len(parts) if u is None else u if several else [u]
         if not len(parts) == len(times) == len(inputs):
             raise ValueError(
-                f"each of {len(parts)} trajectories needs its times and its inputs: lists of "
-                f"{len(times)} and {len(inputs)} came"
+                f"each of {len(parts)} trajectories needs its times and its inputs, got lists of "
+                f"{len(times)} and {len(inputs)}"
             )
         found = []
         for k, (part, at, drive) in enumerate(zip(parts, times, inputs, strict=True)):

@@ -81,7 +81,7 @@ class TrajectorySearch:
             raise ValueError(
                 "a search of trajectories weighs models by their likelihood: selection must "
                 "be Evidence() (selection=evidence), or a rule that runs models, such as "
-                f"FreeRunScore(): {self.selection!r} came. Rules of rows go with a regression, "
+                f"FreeRunScore(), got {self.selection!r}. Rules of rows go with a regression, "
                 "such as Regression(search=BestSubset()) (search=best_subset)"
             )
 
@@ -100,8 +100,8 @@ class TrajectorySearch:
         """
         if task.facts.roles is not None and self.selection.basis == "runs":
             raise ValueError(
-                "a search of trajectories keeps roles by likelihood: selection must be Evidence(), "
-                f"{self.selection!r} came; Regression(selection=FreeRunScore()) judges by runs"
+                "a search of trajectories keeps roles by likelihood: selection must be Evidence(), got "
+                f"{self.selection!r}; Regression(selection=FreeRunScore()) judges by runs"
             )
         found = self._estimate(task, progress)
         library = task.library.with_known_terms(task.states)
@@ -244,7 +244,7 @@ class Regression:
         """Assemble rows, search them, and choose. Raises ValueError for hidden states."""
         if task.hidden:
             raise ValueError(
-                f"a regression needs samples of every state: {list(task.hidden)} came as hidden; "
+                f"a regression needs samples of every state, got {list(task.hidden)} as hidden; "
                 "take TrajectorySearch(), or make states of a signal by ep.embed"
             )
         if any(run.missing is not None for run in task.runs):
@@ -277,8 +277,8 @@ class Regression:
 
         if not isinstance(self.selection, FreeRunScore):
             raise ValueError(
-                "roles tie all equations together, so a rule must judge whole systems: selection "
-                f"must be FreeRunScore(), {self.selection!r} came"
+                "roles tie all equations together, so a rule must rank whole systems: selection "
+                f"must be FreeRunScore(), got {self.selection!r}"
             )
         library = task.library.with_known_terms(task.states)
         with progress.stage(None, "", "rows of the regression"):
@@ -370,7 +370,7 @@ def method_of(
         return Regression(formulation, search, selection, bootstraps, depth)
     if bootstraps.n:
         raise ValueError(
-            f"a search of trajectories draws no bootstraps: {bootstraps!r} came; take "
+            f"a search of trajectories draws no bootstraps, got {bootstraps!r}; take "
             "Bootstraps(n=0) (bootstraps=none), or a regression"
         )
     set_here: dict[str, Any] = {}
@@ -379,7 +379,7 @@ def method_of(
         if given != default:  # a config always has a value there
             if own not in (default, given):
                 raise ValueError(
-                    f"{name} must be set once: {own!r} came in the search (search.{name}), and "
+                    f"{name} must be set once, got {own!r} in the search (search.{name}), and "
                     f"{given!r} beside it; leave one of them out"
                 )
             set_here[name] = given

@@ -487,7 +487,7 @@ def _unit(text: str, run: Trajectory) -> float:
         raise ValueError(
             f"a function with a number to be fitted must have one {FITTED} and one variable of "
             f"{list(run.names)}, such as 'sign({FITTED}*{run.names[-1]})' or "
-            f"'1/({FITTED}+{run.names[0]})': {text!r} came"
+            f"'1/({FITTED}+{run.names[0]})', got {text!r}"
         )
     return float(run.columns(named).std())
 

@@ -71,22 +71,22 @@ class PointSearch:
         object.__setattr__(self, "states", tuple(self.states))
         if not 0.0 <= self.least_variation < 1.0:
             raise ValueError(
-                f"least_variation must lie in [0, 1): {self.least_variation} came; it is a share"
+                f"least_variation must lie in [0, 1), got {self.least_variation}; it is a share"
             )
         check_kind("method", self.method, Regression, "ep.Regression(bootstraps=ep.Bootstraps())")
         if not (n := self.method.bootstraps.n):
-            raise ValueError(f"a pointwise study needs bootstraps for its spread: n={n} came")
+            raise ValueError(f"a pointwise study needs bootstraps for its spread, got n={n}")
         facts, every_term = self.library.facts, dict.fromkeys(self.states, self.library.names)
         constraint(self.library, every_term, facts.relations)  # refuses those that cannot hold
         if facts.roles is not None:
             raise ValueError(
-                "roles tie all equations together, and a pointwise study searches one at a time: "
-                f"{facts.roles} came; give relations"
+                "roles tie all equations together, and a pointwise study searches one at a time, got "
+                f"{facts.roles}; give relations"
             )
         if facts.relations and (n_culled := self.method.bootstraps.n_culled):
             raise ValueError(
-                "relations need all their terms in every bootstrap: n_culled must be 0, "
-                f"{n_culled} came"
+                "relations need all their terms in every bootstrap: n_culled must be 0, got "
+                f"{n_culled}"
             )
 
     @cached_property

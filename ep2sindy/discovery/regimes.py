@@ -71,7 +71,7 @@ class Regimes:
         equation: see in_support and the spread in the table.
         """
         if not 0 <= regime < self.n_regimes:
-            raise ValueError(f"regimes run from 0 to {self.n_regimes - 1}: {regime} came")
+            raise ValueError(f"regimes run from 0 to {self.n_regimes - 1}, got {regime}")
         rows = self.table[self.table["regime"] == regime]
         return {
             str(equation): dict(zip(acting["term"], acting["coef"], strict=True))

@@ -330,8 +330,8 @@ def _encode(value: Any) -> Any:
     name = type(value).__name__ if type(value) in STORED.values() else place_of(type(value))
     if name is None or not is_dataclass(value):
         raise ValueError(
-            f"a discovery is stored with its method, of classes of this package alone: {value!r} "
-            "came; store its model, found.model.save(path)"
+            f"a discovery is stored with its method, of classes of this package alone, got {value!r}"
+            "; store its model, found.model.save(path)"
         )
     return {"class": name, **{f.name: _encode(getattr(value, f.name)) for f in fields(value)}}
 

@@ -54,8 +54,8 @@ class PointsTask:
     def __post_init__(self) -> None:
         if self.asked.hidden:
             raise ValueError(
-                f"equations of several points need samples of every state: {self.asked.hidden} "
-                "came as hidden; make the same states of every run by ep.signals.embed_alike"
+                f"equations of several points need samples of every state, got {self.asked.hidden}"
+                " as hidden; make the same states of every run by ep.signals.embed_alike"
             )
         check_shared(self.regression)
 
@@ -66,8 +66,8 @@ class PointsTask:
             return self.method
         if not isinstance(self.method, TrajectorySearch):
             raise ValueError(
-                "equations of several points are found by Regression or TrajectorySearch: "
-                f"{self.method!r} came"
+                "equations of several points are found by Regression or TrajectorySearch, got "
+                f"{self.method!r}"
             )
         n_terms = self.method.max_terms
         return Regression(search=BestSubset() if n_terms is None else BestSubset(max_terms=n_terms))

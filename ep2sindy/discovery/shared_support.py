@@ -52,7 +52,7 @@ def check_shared(method: Regression) -> BestSubset:
         )
     if method.bootstraps.n:
         raise ValueError(
-            f"a shared search has no bootstraps: {method.bootstraps} came; use Bootstraps(n=0)"
+            f"a shared search has no bootstraps, got {method.bootstraps}; use Bootstraps(n=0)"
         )
     return method.search
 

@@ -106,7 +106,7 @@ def growing_parts(
 def check_limit_s(limit_s: float | None) -> None:
     """Raise ValueError for a limit that is not positive."""
     if limit_s is not None and not limit_s > 0.0:
-        raise ValueError(f"limit_s must be positive, in s, or None for no limit: {limit_s!r} came")
+        raise ValueError(f"limit_s must be positive, in s, or None for no limit, got {limit_s!r}")
 
 
 def check_size(

@@ -330,8 +330,8 @@ def check_runs(task: Task) -> None:
     n_samples = sum(run.n_samples for run in task.runs)
     if n_samples <= len(task.library):
         raise ValueError(
-            f"a library of {len(task.library)} terms needs more samples than terms: {n_samples} "
-            "came; use a smaller library or more data"
+            f"a library of {len(task.library)} terms needs more samples than terms, got {n_samples}"
+            "; use a smaller library or more data"
         )
     check_domain(task.runs, task.library, smooth=True)
     for run in task.runs:

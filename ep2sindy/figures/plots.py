@@ -68,7 +68,7 @@ def plot(value: object, *rest: object, **settings: object) -> Figure:
     of more than two parameters.
     """
     kinds = ", ".join(sorted(kind.__name__ for kind in plot.registry if kind is not object))
-    raise TypeError(f"plot draws a {kinds}: {type(value).__name__} came")
+    raise TypeError(f"plot draws a {kinds}, got {type(value).__name__}")
 
 
 @plot.register

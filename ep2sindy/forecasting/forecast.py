@@ -203,7 +203,7 @@ def _times(t: np.ndarray, step_s: float, horizon: float | ArrayLike) -> np.ndarr
     if asked.ndim != 1 or not asked.size or not (np.diff(np.append(t[-1], asked)) > 0.0).all():
         raise ValueError(
             "horizon must be a positive duration in s, or increasing times after the history's "
-            f"end at {t[-1]:.6g} s: {horizon!r} came"
+            f"end at {t[-1]:.6g} s, got {horizon!r}"
         )
     return asked
 

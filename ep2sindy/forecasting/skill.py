@@ -329,7 +329,7 @@ def _horizon_of(record: Trajectory, n_fitted: int, period_s: float, horizon_s: f
     n = max(1, round(wanted / record.dt_s))
     if horizon_s is not None and n >= left:
         raise ValueError(
-            f"the horizon must leave room for starts: {horizon_s:g} s came, and "
+            f"the horizon must leave room for starts, got {horizon_s:g} s, and "
             f"{left * record.dt_s:.4g} s are held out"
         )
     return min(n, max(1, left // 2)) if horizon_s is None else n

@@ -198,7 +198,7 @@ def tune_estimator(
     names = measured_states(model, run) if measured is None else list(measured)
     if not names or not set(names) <= set(model.states):
         raise ValueError(
-            f"measured must name some of the states {list(model.states)}: {names} came"
+            f"measured must name some of the states {list(model.states)}, got {names}"
         )
     if run.n_samples < MIN_SAMPLES:
         raise ValueError(

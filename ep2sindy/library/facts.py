@@ -42,15 +42,15 @@ class Facts:
             if not isinstance(factors, Mapping):
                 raise ValueError(
                     "a known coefficient is a sum of functions of the parameters, such as "
-                    f"{{'x': {{'x*y': {{'1': 2.0}}}}}}: {factors!r} came for {place}"
+                    f"{{'x': {{'x*y': {{'1': 2.0}}}}}}, got {factors!r} for {place}"
                 )
         if self.roles is None:
             return
         check_kind("roles", self.roles, Roles, "ep.Roles(exchange=[('n_n', 'n_i')])")
         if self.relations or self.only or self.excluded or self.known:
             raise ValueError(
-                "roles say which terms the equations may have and how they are tied: relations, "
-                "terms, or coefficients came as well; give roles alone, or leave them out"
+                "roles say which terms the equations may have and how they are tied, got relations, "
+                "terms, or coefficients as well; give roles alone, or leave them out"
             )
 
     def __or__(self, more: Facts) -> Facts:
@@ -84,14 +84,14 @@ class Facts:
         for state, places in barred.items():
             if len(places) == len(library.names):
                 raise ValueError(
-                    f"exclude must leave terms to every equation: all {len(places)} of the library "
-                    f"came for {state!r}; leave some of them out of exclude"
+                    f"exclude must leave terms to every equation, got all {len(places)} of the library"
+                    f" for {state!r}; leave some of them out of exclude"
                 )
         for state, term in self.places:
             if library.index(term) in barred.get(state, ()):
                 raise ValueError(
-                    f"a term is excluded, or it is named in terms and relations: {term!r} of "
-                    f"{state!r} came in both; leave it out of one of them"
+                    f"a term is excluded, or it is named in terms and relations, got {term!r} of "
+                    f"{state!r} in both; leave it out of one of them"
                 )
 
     @property
@@ -110,12 +110,12 @@ def _by_state(given: object) -> Mapping[str, tuple[str, ...]]:
     """The terms of every state that are named. Raises ValueError for what are no lists of names."""
     example = "{'x': ['x', 'x*y']}"
     if not isinstance(given, Mapping):
-        raise ValueError(f"terms must be lists by state, like {example}: {given!r} came")
+        raise ValueError(f"terms must be lists by state, like {example}, got {given!r}")
     for state, names in given.items():
         check_list(f"the terms of {state!r}", names)
         if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
             raise ValueError(
-                f"terms must be lists of names, like {example}: {names!r} came for {state!r}; the "
+                f"terms must be lists of names, like {example}, got {names!r} for {state!r}; the "
                 "constant is '1', and a coefficient that is known is a relation, 'x: x == 0.5'"
             )
     return MappingProxyType({state: tuple(names) for state, names in given.items()})

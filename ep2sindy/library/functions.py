@@ -207,7 +207,7 @@ def function_of(part: Part) -> Function:
             f"your own before it is named: ep.register_function({name!r}, value, derivative)"
         )
     if not (isfinite(part.scale) and isfinite(part.shift)):
-        raise ValueError(f"the numbers of a function must be finite: {part.text!r:.80} came")
+        raise ValueError(f"the numbers of a function must be finite, got {part.text!r:.80}")
     if not part.scale:
         raise ValueError(f"a function must be of its variable: {part.text!r} multiplies it by 0")
     return Function(_kinds[name], part.variable, part.scale, part.shift)
@@ -241,12 +241,12 @@ def register_function(
     ('1', 'x', 'tanh(x)')
     """
     if not re.fullmatch(r"[^\W\d]\w*", name) or name == INVERSE:
-        raise ValueError(f"a function's name must be a plain word, such as 'tanh': {name!r} came")
+        raise ValueError(f"a function's name must be a plain word, such as 'tanh', got {name!r}")
     if name in _kinds and not _kinds[name].own:
         raise ValueError(f"{name!r} is built in: give your function another name")
     low, high = map(float, domain)
     if not low < high:
-        raise ValueError(f"a domain must be an interval (low, high): {domain} came")
+        raise ValueError(f"a domain must be an interval (low, high), got {domain}")
     if derivative is None:
         needs = f"a derivative is found by itself for {FORMULA}: {name!r} is none"
         way_out = f"give it, as in ep.register_function({name!r}, value, derivative)"
@@ -274,8 +274,8 @@ def _check_derivative(
     for what, found in (("value", values), ("derivative", slopes)):
         if found.shape != points.shape or not np.isfinite(found).all():
             raise ValueError(
-                f"{what} of {name!r} must give a finite number for each of {points.tolist()}: "
-                f"{found.tolist()} came; write it with NumPy, and give domain=(low, high) where "
+                f"{what} of {name!r} must give a finite number for each of {points.tolist()}, got "
+                f"{found.tolist()}; write it with NumPy, and give domain=(low, high) where "
                 "it ends"
             )
     differences = (ahead - behind) / (2.0 * step)

@@ -70,7 +70,7 @@ class Library:
         if len(set(self.variables)) < len(self.variables):
             raise ValueError(f"variables must be unique: {list(self.variables)}")
         if not len(exponents):
-            raise ValueError("a library needs at least one term: none came")
+            raise ValueError("a library needs at least one term, got none")
         if len(set(map(tuple, exponents.tolist()))) < len(exponents):
             raise ValueError(f"terms must be unique: {list(self.names)}")
         self.facts.check(self)

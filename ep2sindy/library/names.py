@@ -49,8 +49,8 @@ def check_variable(name: str) -> None:
         word = re.sub(r"\W+", "_", str(name)).strip("_")[:50] or "x"
         other = f"x{word}" if word[0].isdecimal() else word
         raise ValueError(
-            f"a variable's name must be a word of letters, digits and _, such as 'n_i': {name!r} "
-            f"came; rename it, perhaps {other!r}"
+            f"a variable's name must be a word of letters, digits and _, such as 'n_i', got {name!r}"
+            f"; rename it, perhaps {other!r}"
         )
 
 
@@ -122,8 +122,8 @@ def split_term(name: str) -> list[Part]:
         return []
     if not _TERM.fullmatch(name):
         raise ValueError(
-            f"a term is variables joined by *, with whole powers, and functions of one variable: "
-            f"{name!r:.300} came; write it like 'n_i^2*n_n', 'x*sin(2*y)' or 'x/(0.5+y)'"
+            f"a term is variables joined by *, with whole powers, and functions of one variable, got "
+            f"{name!r:.300}; write it like 'n_i^2*n_n', 'x*sin(2*y)' or 'x/(0.5+y)'"
         )
     parts = []
     for found in _FACTORS.finditer(name):
@@ -135,7 +135,7 @@ def split_term(name: str) -> list[Part]:
 
 def _power(text: str | None, name: str) -> int:
     if len(text or "") > LONGEST_POWER:
-        raise ValueError(f"a power must have up to {LONGEST_POWER} digits: {name!r:.80} came")
+        raise ValueError(f"a power must have up to {LONGEST_POWER} digits, got {name!r:.80}")
     return int(text or 1)
 
 
@@ -153,7 +153,7 @@ def split_factors(name: str) -> list[tuple[str, int]]:
     parts = split_term(name)
     if not parts or any(part.function for part in parts):
         raise ValueError(
-            f"a product is variables joined by *, with whole powers: {name!r:.300} came; write it "
+            f"a product is variables joined by *, with whole powers, got {name!r:.300}; write it "
             "like 'n_i^2*n_n'"
         )
     return [(part.variable, part.power) for part in parts]

@@ -46,9 +46,9 @@ class Relation:
 
     def __post_init__(self) -> None:
         if not self.factors:
-            raise ValueError(f"a relation must name a coefficient: {self.text!r} came; {_EXAMPLE}")
+            raise ValueError(f"a relation must name a coefficient, got {self.text!r}; {_EXAMPLE}")
         if not np.isfinite([self.value, *(factor for factor, _, _ in self.factors)]).all():
-            raise ValueError(f"the numbers of a relation must be finite: {self.text!r} came")
+            raise ValueError(f"the numbers of a relation must be finite, got {self.text!r}")
 
 
 def parse_relation(text: str) -> Relation:
@@ -58,7 +58,7 @@ def parse_relation(text: str) -> Relation:
     Raises ValueError with the text and the position of the first part that cannot be read.
     """
     if text.count("==") != 1:
-        raise ValueError(f"a relation has two sides joined by one '==': {text!r} came; {_EXAMPLE}")
+        raise ValueError(f"a relation has two sides joined by one '==', got {text!r}; {_EXAMPLE}")
     middle = text.index("==")
     factors: list[tuple[float, str, str]] = []
     value = 0.0
@@ -90,7 +90,7 @@ def _unreadable(text: str, position: int, expected: str) -> ValueError:
     rest = text[position:].lstrip()
     return ValueError(
         f"{expected} must stand at character {len(text) - len(rest) + 1} of the relation "
-        f"{text!r}: {rest[:12] or 'the end'!r} came; {_EXAMPLE}"
+        f"{text!r}, got {rest[:12] or 'the end'!r}; {_EXAMPLE}"
     )
 
 

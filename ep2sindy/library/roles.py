@@ -99,7 +99,7 @@ class Roles:
             ):
                 raise ValueError(
                     "an exchange joins two states, (from, to), or sides such as 'A + B', by any "
-                    f"term, or by those that a third entry names: {entry!r} came"
+                    f"term, or by those that a third entry names, got {entry!r}"
                 )
         if not isinstance(self.outflow, Mapping):
             check_list("outflow", self.outflow)
@@ -108,7 +108,7 @@ class Roles:
                 raise ValueError(f"sizes must be positive numbers: {state} has {size!r}")
         named = Counter(role.name for role in self._roles)
         if twice := [name for name, n in named.items() if n > 1]:
-            raise ValueError(f"a role must be given once: {twice} came twice")
+            raise ValueError(f"a role must be given once, got {twice} twice")
         for role in self._roles:
             _check_how(role)
         if both := [state for state in self.equations if state in self.balanced]:
@@ -221,7 +221,7 @@ class Roles:
         if several or any(role.how != FREE for role in compress(self._roles, named)):
             raise ValueError(
                 "roles in several zones take terms by neighbourhood: give exchanges as (from, to), "
-                f"and outflow as a list of states; {self} came"
+                f"and outflow as a list of states, got {self}"
             )
         zones, states = list(sizes), self.states
         exchange = [
@@ -294,7 +294,7 @@ class Roles:
             return
         if how != FREE and (wrong := [term for term in terms if not _holds(term, giver)]):
             raise ValueError(
-                f"by mass action what lowers {giver!r} contains it: {wrong} came for the role "
+                f"by mass action what lowers {giver!r} contains it, got {wrong} for the role "
                 f"{role.name!r}; name other terms, or leave nonnegative out"
             )
         yield from (self._process(role, term) for term in terms if _holds(term, giver))
@@ -320,7 +320,7 @@ class Roles:
     def _check(self, library: NamedTerms, states: Sequence[str]) -> None:
         if unknown := [state for state in self.states if state not in states]:
             raise ValueError(
-                f"roles must name states: {unknown} came, and the states are {list(states)}"
+                f"roles must name states, got {unknown}, and the states are {list(states)}"
             )
         if self.open:
             raise ValueError(
@@ -333,7 +333,7 @@ class Roles:
         for _, term in self.known:
             if (name := read_term(term, variables).name) != term:
                 raise ValueError(
-                    f"a known term must be written as the library does, {name!r}: {term!r} came"
+                    f"a known term must be written as the library does, {name!r}, got {term!r}"
                 )
 
 
@@ -352,7 +352,7 @@ def _check_how(role: Role) -> None:
     ways = "terms with their coefficients in SI" if role.giver else "a number in SI per second"
     raise ValueError(
         f"how {role.name!r} is played must be {ways}, a list of terms, {KNOWN!r}, {FREE!r} or "
-        f"{EITHER!r}: {how!r} came"
+        f"{EITHER!r}, got {how!r}"
     )
 
 

@@ -116,7 +116,7 @@ def functions_named(names: Sequence[str], variables: Sequence[str]) -> list[Func
             if [(bool(p.function), p.power) for p in split_term(text)] != [(True, 1)]:
                 raise ValueError(
                     f"functions must be some of {function_names()}, for every variable, or one "
-                    f"written out, such as 'sin(2*{variables[0]})': {name!r} came; products go "
+                    f"written out, such as 'sin(2*{variables[0]})', got {name!r}; products go "
                     "into products, or come with function_degree=2; a function of your own is "
                     "registered first, by ep.register_function"
                 )
@@ -153,7 +153,7 @@ def check_degrees(degree: int, function_degree: int, n_variables: int, n_functio
 
 def _check_size(name: str, degree: int, n_factors: int) -> None:
     if degree > LARGEST_DEGREE:
-        raise ValueError(f"{name} must be {LARGEST_DEGREE} or less: {degree} came")
+        raise ValueError(f"{name} must be {LARGEST_DEGREE} or less, got {degree}")
     if (n_terms := comb(n_factors + degree, degree)) <= MAX_TERMS:
         check_exponents(n_terms, n_factors)
         return
@@ -169,7 +169,7 @@ def check_exponents(n_terms: int, n_factors: int) -> None:
     if n_terms * n_factors > MAX_EXPONENTS:
         raise ValueError(
             f"a library may have up to {MAX_EXPONENTS / 1e6:g} million exponents, one for every "
-            f"term and variable or function: {n_terms} terms of {n_factors} came; leave out terms, "
+            f"term and variable or function, got {n_terms} terms of {n_factors}; leave out terms, "
             "or variables that no term has"
         )
 

@@ -38,7 +38,7 @@ def check_unit(unit: str) -> None:
         shown = repr(unit) if len(unit) <= LONGEST else f"{unit[:LONGEST]!r}..."
         raise ValueError(
             f"a unit must be written as symbols and numbers joined by * / and ^, such as 'm^-3' "
-            f"or '1e19 m^-3': {shown} came; '1' is that of a pure number, 'm^-3' that of a count "
+            f"or '1e19 m^-3', got {shown}; '1' is that of a pure number, 'm^-3' that of a count "
             "in a volume"
         )
 
@@ -178,7 +178,7 @@ def seconds_in(unit: str) -> float:
         return float(registry().Quantity(unit).to("s").magnitude)
     except UNIT_ERRORS as error:
         raise ValueError(
-            f"a unit of time must be such as 's', 'us', 'h' or 'year': {unit!r} came"
+            f"a unit of time must be such as 's', 'us', 'h' or 'year', got {unit!r}"
         ) from error
 
 

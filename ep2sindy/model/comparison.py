@@ -73,7 +73,7 @@ class FreeRunBounds:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not value > 0.0:
-                raise ValueError(f"the bound {name} must be positive: {value} came")
+                raise ValueError(f"the bound {name} must be positive, got {value}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +254,7 @@ def columns_of(states: Sequence[str], judged: Sequence[str] | None) -> list[int]
     """Column indices of the judged states, None meaning all; ValueError for an unknown state."""
     names = list(states if judged is None else judged)
     if not names or not set(names) <= set(states):
-        raise ValueError(f"judged must name some of the states {list(states)}: {names} came")
+        raise ValueError(f"judged must name some of the states {list(states)}, got {names}")
     return [list(states).index(name) for name in names]
 
 

@@ -36,7 +36,7 @@ def inputs_at_samples(
     if values.shape != (*shape, len(names)):
         raise ValueError(
             f"inputs must have shape {(*shape, len(names))}, one column for each of "
-            f"{list(names)}: {values.shape} came"
+            f"{list(names)}, got {values.shape}"
         )
     _check_finite("inputs", values)
     return values
@@ -153,12 +153,12 @@ def _check_names(names: Sequence[str], given: Mapping[str, Any]) -> None:
 
 def _column(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     if callable(values):
-        raise ValueError(f"input {name!r} must be samples here: a function came; evaluate it first")
+        raise ValueError(f"input {name!r} must be samples here, got a function; evaluate it first")
     column = np.asarray(values, dtype=np.float64)
     if column.shape not in (shape, ()):
         raise ValueError(
-            f"input {name!r} must have shape {shape}, as the samples, or be one number: "
-            f"{column.shape} came"
+            f"input {name!r} must have shape {shape}, as the samples, or be one number, got "
+            f"{column.shape}"
         )
     _check_finite(f"input {name!r}", column)
     return np.broadcast_to(column, shape)
@@ -166,4 +166,4 @@ def _column(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 def _check_finite(what: str, values: np.ndarray) -> None:
     if not np.isfinite(values).all():
-        raise ValueError(f"{what} must be finite: {values[~np.isfinite(values)][0]} came")
+        raise ValueError(f"{what} must be finite, got {values[~np.isfinite(values)][0]}")

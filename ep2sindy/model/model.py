@@ -74,21 +74,21 @@ class SparseModel:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
         object.__setattr__(self, "courses", check_courses(self.courses, self.inputs))
         if len(set(self.states)) < len(self.states):
-            raise ValueError(f"states must be unique: {list(self.states)} came")
+            raise ValueError(f"states must be unique, got {list(self.states)}")
         if self.coef.shape != (len(self.library), len(self.states)):
             raise ValueError(
-                "coef must have one row per term and one column per equation: shape "
-                f"{self.coef.shape} came for {len(self.library)} terms and {list(self.states)}"
+                "coef must have one row per term and one column per equation, got shape "
+                f"{self.coef.shape} for {len(self.library)} terms and {list(self.states)}"
             )
         if not np.isfinite(self.coef).all():
-            raise ValueError(f"coefficients must be finite: {self.coef.tolist()} came")
+            raise ValueError(f"coefficients must be finite, got {self.coef.tolist()}")
         if self.covariance is not None:
             object.__setattr__(self, "covariance", read_only(self.covariance))
             n_coefs = int(np.count_nonzero(self.coef))
             if self.covariance.shape != (n_coefs, n_coefs):
                 raise ValueError(
-                    "covariance must have a row and a column per coefficient that is not zero: "
-                    f"shape {self.covariance.shape} came for {n_coefs}"
+                    "covariance must have a row and a column per coefficient that is not zero, got "
+                    f"shape {self.covariance.shape} for {n_coefs}"
                 )
 
     def __eq__(self, other: object) -> bool:
@@ -253,7 +253,7 @@ class SparseModel:
         states = np.asarray(x, dtype=np.float64)
         if states.ndim == 0 or states.shape[-1] != len(self.states):
             raise ValueError(
-                f"x must have a column for each of {list(self.states)}: shape {states.shape} came"
+                f"x must have a column for each of {list(self.states)}, got shape {states.shape}"
             )
         return self.derivative(states, inputs_at_samples(self.inputs, inputs, states.shape[:-1]))
 
@@ -284,7 +284,7 @@ class SparseModel:
             if truth.shape != shape:
                 raise ValueError(
                     f"x_dot must have shape {shape}, a row per sample and a column for each of "
-                    f"{list(self.states)}: {truth.shape} came"
+                    f"{list(self.states)}, got {truth.shape}"
                 )
         pairs = zip(truth.T, self.field.rates(values).T, strict=True)
         return float(np.mean([r2(truth=y, prediction=p[None])[0] for y, p in pairs]))

@@ -185,13 +185,13 @@ def check_start(
     """
     if isinstance(x0, Mapping):
         if set(x0) != set(states):
-            raise ValueError(f"x0 must give a number for each of {list(states)}: {dict(x0)} came")
+            raise ValueError(f"x0 must give a number for each of {list(states)}, got {dict(x0)}")
         x0 = [x0[state] for state in states]
     start = np.asarray(x0, dtype=np.float64)
     if start.shape != (len(states),) or not np.isfinite(start).all():
-        came = f"shape {start.shape}" if start.size > 8 else f"{start.tolist()}"
+        got = f"shape {start.shape}" if start.size > 8 else f"{start.tolist()}"
         raise ValueError(
-            f"{name} must give a finite number for each of {list(states)}: {came} came{hint}"
+            f"{name} must give a finite number for each of {list(states)}, got {got}{hint}"
         )
     return start
 

@@ -68,8 +68,8 @@ class LimitCycle:
         check_positive("period_s", self.period_s)
         if self.states.ndim != 2 or multipliers.shape != self.states.shape[1:]:
             raise ValueError(
-                "a cycle has one multiplier per state: multipliers of shape "
-                f"{multipliers.shape} came for states of shape {self.states.shape}"
+                "a cycle has one multiplier per state, got multipliers of shape "
+                f"{multipliers.shape} for states of shape {self.states.shape}"
             )
 
     @property
@@ -112,9 +112,9 @@ def limit_cycle(
     _check_free(model)
     start = check_start(model.states, start, name="start")
     if not (np.isfinite(period_s) and period_s > 0.0):
-        raise ValueError(f"period_s must be a positive time in s: {period_s} came")
+        raise ValueError(f"period_s must be a positive time in s, got {period_s}")
     if n_samples < 8:
-        raise ValueError(f"n_samples must be 8 or more, to draw a cycle: {n_samples} came")
+        raise ValueError(f"n_samples must be 8 or more, to draw a cycle, got {n_samples}")
     find = partial(_find_orbit, period_s=period_s, n_samples=n_samples)
     cycle = find(model, start) or find(model, start, n_settling=N_SETTLING)
     if cycle is None:
@@ -268,10 +268,10 @@ def _check_reach(
     if n_starts < 1 or not (np.isfinite(n_periods) and n_periods > N_LATE):
         raise ValueError(
             f"one start or more and over {N_LATE:g} periods are needed, of which the last "
-            f"{N_LATE:g} are judged: n_starts={n_starts}, n_periods={n_periods} came"
+            f"{N_LATE:g} are judged, got n_starts={n_starts}, n_periods={n_periods}"
         )
     if not 0.0 < spread[0] < spread[1] < np.inf:
-        raise ValueError(f"spread must be two positive factors, the lower first: {spread} came")
+        raise ValueError(f"spread must be two positive factors, the lower first, got {spread}")
 
 
 # Closed orbits of a model without inputs, by Newton's method on the return after one period.

@@ -62,8 +62,8 @@ class FittingSettings:
     def __post_init__(self) -> None:
         if self.n_windows < 2 or not self.periods > 0.0:
             raise ValueError(
-                "refinement needs two windows or more, of some length: "
-                f"n_windows={self.n_windows} and periods={self.periods} came"
+                "refinement needs two windows or more, of some length, got "
+                f"n_windows={self.n_windows} and periods={self.periods}"
             )
 
 

@@ -78,36 +78,36 @@ class OperatingLaw:
             object.__setattr__(self, "left_out", read_only(self.left_out))
             if self.left_out.shape != (len(self.points),):
                 raise ValueError(
-                    f"left_out must have an error for each of {len(self.points)} points: shape "
-                    f"{self.left_out.shape} came"
+                    f"left_out must have an error for each of {len(self.points)} points, got shape "
+                    f"{self.left_out.shape}"
                 )
         object.__setattr__(self, "units", MappingProxyType(dict(self.units)))
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
         shape = (len(self.coefficients), len(self.functions))
         if self.coef.shape != shape or not np.isfinite(self.coef).all():
             raise ValueError(
-                "a law must have a finite number for every coefficient and function: shape "
-                f"{self.coef.shape} came for {shape}"
+                "a law must have a finite number for every coefficient and function, got shape "
+                f"{self.coef.shape} for {shape}"
             )
         for state, term in self.coefficients:
             if state not in self.states or term not in self.library.names:
                 raise ValueError(
                     f"a law's coefficients must be of {list(self.states)} and "
-                    f"{list(self.library.names)}: {term} of {state} came"
+                    f"{list(self.library.names)}, got {term} of {state}"
                 )
         if self.points.shape[1:] != (len(self.parameters),) or not len(self.points):
             raise ValueError(
-                f"points must have a column for each of {list(self.parameters)}: shape "
-                f"{self.points.shape} came"
+                f"points must have a column for each of {list(self.parameters)}, got shape "
+                f"{self.points.shape}"
             )
         if not np.isfinite(self.points).all():
-            raise ValueError(f"points must be finite: {self.points.tolist()} came")
+            raise ValueError(f"points must be finite, got {self.points.tolist()}")
         if self.covariance is not None:
             object.__setattr__(self, "covariance", read_only(self.covariance))
             if self.covariance.shape != (self.coef.size, self.coef.size):
                 raise ValueError(
-                    f"the covariance must be that of {self.coef.size} numbers: shape "
-                    f"{self.covariance.shape} came"
+                    f"the covariance must be that of {self.coef.size} numbers, got shape "
+                    f"{self.covariance.shape}"
                 )
 
     @property
@@ -287,7 +287,7 @@ def make_basis(
         if n_spare and len(points) < len(functions) + n_spare:
             raise ValueError(
                 f"a law of {len(functions)} functions of {list(functions.variables)} needs more "
-                f"points than these, since each is left out in turn: {len(points)} came"
+                f"points than these, since each is left out in turn, got {len(points)}"
             )
         return Basis(functions.evaluate(points))
     except ValueError:
@@ -326,8 +326,8 @@ class LawConstraint:
             if not (np.isfinite(values) & (values != 0.0)).all():
                 where = dict(zip(self.functions.variables, point, strict=True))
                 raise ValueError(
-                    "known coefficients must be finite and not zero at every operating point: "
-                    f"{values.tolist()} came at {where}; leave the term or the point out"
+                    "known coefficients must be finite and not zero at every operating point, got "
+                    f"{values.tolist()} at {where}; leave the term or the point out"
                 )
         return [replace(self.common, d=values) for values in d]
 

@@ -114,7 +114,7 @@ class PointFits:
         """The parameters of the points in the order of the functions' variables."""
         if unknown := [v for v in functions.variables if v not in self.parameters]:
             raise ValueError(
-                f"a law's functions must be of {list(self.parameters)}: {unknown} came"
+                f"a law's functions must be of {list(self.parameters)}, got {unknown}"
             )
         return self.points[:, [self.parameters.index(v) for v in functions.variables]]
 

@@ -44,12 +44,12 @@ class Quantity:
     def __post_init__(self) -> None:
         if self.coefficient.count(":") != 1:
             raise ValueError(
-                f"a quantity needs a coefficient such as 'n_i: n_i*u_iz': {self.coefficient!r} came"
+                f"a quantity needs a coefficient such as 'n_i: n_i*u_iz', got {self.coefficient!r}"
             )
         if not np.isfinite(self.factor) or self.factor == 0.0 or self.power not in (-1, 1):
             raise ValueError(
-                "a quantity is factor * coef^power, the factor not zero and the power 1 or -1: "
-                f"factor={self.factor!r}, power={self.power!r} came"
+                "a quantity is factor * coef^power, the factor not zero and the power 1 or -1, got "
+                f"factor={self.factor!r}, power={self.power!r}"
             )
 
     @property
@@ -195,10 +195,10 @@ def _check(
 ) -> None:
     names = list(library.variables)
     if len(values) < 3:
-        raise ValueError(f"a law needs three points or more: {len(values)} came")
+        raise ValueError(f"a law needs three points or more, got {len(values)}")
     if parameters.shape[1] != len(names):
         raise ValueError(
-            f"parameters must have one column for each of {names}: {parameters.shape[1]} came"
+            f"parameters must have one column for each of {names}, got {parameters.shape[1]}"
         )
     if not (np.isfinite(values).all() and np.isfinite(parameters).all()):
         raise ValueError("values and parameters must be finite: leave out points that are not")

@@ -115,8 +115,8 @@ def group_by_point(
         first = runs[0]
         if set(run.parameters) != set(first.parameters):
             raise ValueError(
-                "runs of several operating points need the same parameters: "
-                f"{list(first.parameters)} came, and {list(run.parameters)} in "
+                "runs of several operating points need the same parameters, got "
+                f"{list(first.parameters)}, and {list(run.parameters)} in "
                 f"{run.label or 'another run'}; name them alike in all, or give runs of one point"
             )
         with name_point(run.parameters):
@@ -155,7 +155,7 @@ def read_points(
         if set(point) != set(names) or not np.isfinite(list(point.values())).all():
             raise ValueError(
                 f"an operating point must have one finite value for each of {list(names)}, and no "
-                f"other: {dict(point)} came"
+                f"other, got {dict(point)}"
             )
     return np.array([[float(point[name]) for name in names] for point in points])
 
@@ -167,7 +167,7 @@ def values_of(points: Mapping[str, Sequence[Trajectory]]) -> Float[np.ndarray, "
         raise ValueError(
             "a law or a shared support needs runs of several operating points, which carry their "
             "parameters: Trajectory(..., parameters={'V_D_V': 300.0}), or ep.read_runs("
-            "'runs/V{V_D_V}.csv'); runs without parameters came"
+            "'runs/V{V_D_V}.csv'), got runs without parameters"
         )
     return read_points(first, list(first[0]))
 

@@ -82,7 +82,7 @@ class Corrected:
         if values.shape[-1] != len(self.scale):
             raise ValueError(
                 f"the learned term takes {list(self.model.states)} and inputs "
-                f"{list(self.model.inputs)}: {values.shape[-1]} columns came"
+                f"{list(self.model.inputs)}, got {values.shape[-1]} columns"
             )
         flat = torch.tensor((values / self.scale).reshape(-1, len(self.scale)))
         with torch.no_grad():
@@ -121,7 +121,7 @@ def refine_with_correction(
     settings = settings.override(changes)
     method = settings.method or DESCENT
     if not isinstance(method, GradientDescent):
-        raise ValueError(f"a learned correction is trained by GradientDescent alone: {method} came")
+        raise ValueError(f"a learned correction is trained by GradientDescent alone, got {method}")
     (batch,) = settings.cut([model], [trajectories], np.random.default_rng(seed))
     with as_progress(progress).stage(None, "iteration", "refinement") as advance:
         history, observe = record(callback, advance)
@@ -201,8 +201,8 @@ def _check_shape(term: nn.Module, known: ScaledEquations, device: str) -> None:
     if out.shape != (3, known.n_states):
         raise ValueError(
             f"a correction must map (rows, {len(known.variables)}) to (rows, {known.n_states}), "
-            f"one column per state {list(known.variables[: known.n_states])}: "
-            f"{tuple(out.shape)} came from {tuple(rows.shape)}"
+            f"one column per state {list(known.variables[: known.n_states])}, got "
+            f"{tuple(out.shape)} from {tuple(rows.shape)}"
         )
 
 

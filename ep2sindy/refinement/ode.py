@@ -155,8 +155,8 @@ class ODE(nn.Module):
         """
         if len({(point.variables, point.n_states) for point in points}) > 1:
             raise ValueError(
-                "models refined in one batch must share their states and inputs: "
-                f"{sorted({point.variables for point in points})} came"
+                "models refined in one batch must share their states and inputs, got "
+                f"{sorted({point.variables for point in points})}"
             )
         products, basis, offset = _weights(points)
         return ODE(

@@ -75,12 +75,12 @@ class RefinementSettings:
         if self.periods is not None:
             if self.window is not None:
                 raise ValueError(
-                    "a window is set by its samples or by its periods: "
-                    f"window={self.window} and periods={self.periods} came; leave out one"
+                    "a window is set by its samples or by its periods, got "
+                    f"window={self.window} and periods={self.periods}; leave out one"
                 )
             if not self.periods > 0.0:
                 raise ValueError(
-                    f"periods must be positive: {self.periods} came; leave it out for one and a "
+                    f"periods must be positive, got {self.periods}; leave it out for one and a "
                     "half"
                 )
 
@@ -104,8 +104,8 @@ class RefinementSettings:
         """
         if len(models) != len(trajectories):
             raise ValueError(
-                "every model needs a list of trajectories of its own: "
-                f"{len(models)} models and {len(trajectories)} lists came"
+                "every model needs a list of trajectories of its own, got "
+                f"{len(models)} models and {len(trajectories)} lists"
             )
         window = self.window
         if window is None:

@@ -173,7 +173,7 @@ def _by_model(
         if is_run(trajectories) or any(map(is_run, cast("Sequence[Any]", trajectories))):
             raise ValueError(
                 "a list of models takes a list of trajectories for each, as in "
-                f"refine(models, [[run] for run in runs]): {len(models)} models came with "
+                f"refine(models, [[run] for run in runs]), got {len(models)} models with "
                 f"{'one run' if is_run(trajectories) else 'a list of runs'}"
             )
         records = [list(runs) for runs in cast("Sequence[Sequence[Trajectory]]", trajectories)]
@@ -190,8 +190,8 @@ def _resolve_constraints(
         return [settings.constraint] * len(models)
     if settings.constraint is not None or len(constraints) != len(models):
         raise ValueError(
-            "constraints must hold one entry per model, and replace `constraint`: "
-            f"{len(constraints)} came for {len(models)} models"
+            "constraints must hold one entry per model, and replace `constraint`, got "
+            f"{len(constraints)} for {len(models)} models"
             f"{'' if settings.constraint is None else ', beside a common one; leave out one'}"
         )
     return constraints

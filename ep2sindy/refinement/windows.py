@@ -154,7 +154,7 @@ def check_windows(n_windows: int, window: int | None) -> None:
 def _longest(trajectories: Sequence[Trajectory]) -> int:
     """Samples in the longest stretch without a gap; ValueError for no trajectory."""
     if not trajectories:
-        raise ValueError("refinement needs at least one trajectory: none came")
+        raise ValueError("refinement needs at least one trajectory, got none")
     return max(stop - start for run in trajectories for start, stop in between_gaps(run.t))
 
 

@@ -54,8 +54,8 @@ class Bootstraps:
         set_counts(self, {"n": 0, "n_culled": 0, "block": 1})
         if not 0.0 < self.smallest <= self.largest:
             raise ValueError(
-                "shares must satisfy 0 < smallest <= largest: "
-                f"smallest={self.smallest}, largest={self.largest} came"
+                "shares must satisfy 0 < smallest <= largest, got "
+                f"smallest={self.smallest}, largest={self.largest}"
             )
 
     def draw(
@@ -69,8 +69,8 @@ class Bootstraps:
             return problem.train_products[None], terms[None]
         if self.block > 1 and len(problem.trajectories) > 1:
             raise ValueError(
-                f"blocks of {self.block} would cross from one trajectory to the next: "
-                f"{len(problem.trajectories)} trajectories came; use block=1"
+                f"blocks of {self.block} would cross from one trajectory to the next, got "
+                f"{len(problem.trajectories)} trajectories; use block=1"
             )
         if self.n > 1 and self.n * problem.n_train > MOST_WEIGHTS:  # the draws come one by one
             halves = [replace(self, n=n) for n in (self.n // 2, self.n - self.n // 2)]
@@ -271,8 +271,8 @@ def count_block_draws(
     """
     if not 1 <= block <= n_rows:
         raise ValueError(
-            f"a block must hold between one and all {n_rows} groups of training rows: {block} "
-            "came; shorten it, or use more data"
+            f"a block must hold between one and all {n_rows} groups of training rows, got {block}"
+            "; shorten it, or use more data"
         )
     first = rng.integers(n_rows - block + 1, size=-(-n_drawn // block))
     drawn = (first[:, None] + np.arange(block)).ravel()[:n_drawn]

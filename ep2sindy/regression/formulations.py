@@ -70,7 +70,7 @@ class BlockSplit:
 
 def _check_fraction(fraction: float) -> None:
     if not 0.0 <= fraction < 1.0:
-        raise ValueError(f"test_fraction must lie in [0, 1): {fraction} came")
+        raise ValueError(f"test_fraction must lie in [0, 1), got {fraction}")
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class Weak:
         check_list("exact_inputs", self.exact_inputs)
         if self.errors_in_variables and isinstance(self.test_functions, Boxes):
             raise ValueError(
-                "errors_in_variables needs smooth test functions: Boxes came; use Bumps, or set "
+                "errors_in_variables needs smooth test functions, got Boxes; use Bumps, or set "
                 "errors_in_variables to false"
             )
 
@@ -392,7 +392,7 @@ def exact_columns(
     unknown = [name for name in declared or () if name not in run.input_names]
     if unknown:
         raise ValueError(
-            f"exact_inputs must name inputs: {unknown} came; this trajectory has the inputs "
+            f"exact_inputs must name inputs, got {unknown}; this trajectory has the inputs "
             f"{list(run.input_names)}"
         )
     if declared is not None:

@@ -40,10 +40,10 @@ class Basis:
         object.__setattr__(self, "values", read_only(self.values))
         n_points, n_terms = self.values.shape
         if not np.isfinite(self.values).all():
-            raise ValueError(f"a basis must be finite: {self.values.tolist()} came")
+            raise ValueError(f"a basis must be finite, got {self.values.tolist()}")
         if n_points < n_terms:
             raise ValueError(
-                f"a law of {n_terms} terms needs as many points: {n_points} came; use one of "
+                f"a law of {n_terms} terms needs as many points, got {n_points}; use one of "
                 "fewer terms"
             )
         strength = np.linalg.svd(self.values / column_norms(self.values), compute_uv=False)

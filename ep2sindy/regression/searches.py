@@ -65,7 +65,7 @@ class AdaptiveLasso:
 
     def __post_init__(self) -> None:
         if self.gamma <= 0.0:
-            raise ValueError(f"gamma must be positive: {self.gamma} came")
+            raise ValueError(f"gamma must be positive, got {self.gamma}")
         set_counts(self, {"max_terms": 1})
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
@@ -103,8 +103,8 @@ class STLSQ:
     def __post_init__(self) -> None:
         if not 0.0 < self.lowest < self.highest:
             raise ValueError(
-                "a threshold sweep needs 0 < lowest < highest: "
-                f"lowest={self.lowest}, highest={self.highest} came"
+                "a threshold sweep needs 0 < lowest < highest, got "
+                f"lowest={self.lowest}, highest={self.highest}"
             )
         set_counts(self, {"n_thresholds": 2, "max_terms": 1})
 

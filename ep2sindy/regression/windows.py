@@ -177,13 +177,13 @@ class Bumps:
     def __post_init__(self) -> None:
         if self.half_width_s is not None and not self.half_width_s > 0.0:
             raise ValueError(
-                f"half_width_s must be positive: {self.half_width_s} came; leave it out to "
+                f"half_width_s must be positive, got {self.half_width_s}; leave it out to "
                 "have it chosen from the spectrum"
             )
         if not self.tau_hat > 0.0 or self.overlap < 1:
             raise ValueError(
-                "tau_hat must be positive and overlap at least 1: "
-                f"tau_hat={self.tau_hat}, overlap={self.overlap} came"
+                "tau_hat must be positive and overlap at least 1, got "
+                f"tau_hat={self.tau_hat}, overlap={self.overlap}"
             )
 
     def windows(self, t: Signal, x: Signal, *, rng: np.random.Generator) -> Windows:
@@ -223,7 +223,7 @@ class Bumps:
         half_width = round(self.half_width_s / dt_s)
         if half_width < 2:
             raise ValueError(
-                f"half_width_s must span two steps or more: {self.half_width_s:g} s came with "
+                f"half_width_s must span two steps or more, got {self.half_width_s:g} s with "
                 f"steps of {dt_s:g} s"
             )
         return half_width

@@ -63,7 +63,7 @@ class RunFolder:
     def file(self, name: str, folder: str = "") -> Path:
         """Path of a result. Raises ValueError for a name that is a path."""
         if name != Path(name).name or "\\" in name or not name.isprintable():
-            raise ValueError(f"a result's name must be that of a file, and no path: {name!r} came")
+            raise ValueError(f"a result's name must be that of a file, and no path, got {name!r}")
         return self.path / folder / name
 
     def write_figure(self, name: str, figure: Figure, formats: Sequence[str] = ("png",)) -> bytes:

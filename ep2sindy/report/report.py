@@ -228,4 +228,4 @@ class Report:
 def _once(kind: str, name: str, known: Collection[str]) -> None:
     """Raise ValueError if there is one of this name: the first would be overwritten."""
     if name in known:
-        raise ValueError(f"every {kind} of a report needs a name of its own: {name!r} came twice")
+        raise ValueError(f"every {kind} of a report needs a name of its own, got {name!r} twice")

@@ -92,7 +92,7 @@ def rows_in_order(
     found = collect(workers, function, pieces, progress.stage(len(pieces), unit))
     if not any(found):
         raise ValueError(
-            f"there must be something to run: {len(found)} pieces came, without a row; leave no "
+            f"there must be something to run, got {len(found)} pieces, without a row; leave no "
             "list of settings empty"
         )
     return [row for rows in found for row in rows]
@@ -145,8 +145,7 @@ class Loky:
     def __post_init__(self) -> None:
         if type(self.n_jobs) is not int or self.n_jobs == 0:
             raise ValueError(
-                f"n_jobs must be a number of processes, or -1 for one per core: {self.n_jobs!r} "
-                "came"
+                f"n_jobs must be a number of processes, or -1 for one per core, got {self.n_jobs!r}"
             )
 
     def run(self, function: Function, pieces: Iterable[Any]) -> Results:

@@ -27,7 +27,7 @@ def cache_folder(kind: str, key: str) -> Path:
     """
     place = Path(os.environ.get(PLACE) or user_cache_path("ep2sindy")) / kind
     if not place.is_absolute():
-        raise OSError(f"a cache needs an absolute folder: {place} came; {PLACE} names another")
+        raise OSError(f"a cache needs an absolute folder, got {place}; {PLACE} names another")
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not os.access(place, os.W_OK):

@@ -1,4 +1,4 @@
-"""Fields of immutable values: read-only copies of arrays, and checks of the settings that came."""
+"""Fields of immutable values: read-only copies of arrays, and checks of settings."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def check_count(name: str, value: object, least: int = 1) -> int:
     except TypeError:
         count = least - 1
     if count < least:
-        raise ValueError(f"{name} must be a whole number, {COUNTS[least]} or more: {value!r} came")
+        raise ValueError(f"{name} must be a whole number, {COUNTS[least]} or more, got {value!r}")
     return count
 
 
 def check_positive(name: str, value: float) -> None:
     """Raise ValueError unless a number is positive and finite."""
     if not 0.0 < value < np.inf:
-        raise ValueError(f"{name} must be positive and finite: {value} came")
+        raise ValueError(f"{name} must be positive and finite, got {value}")
 
 
 def set_counts(settings: object, least: Mapping[str, int]) -> None:
@@ -63,7 +63,7 @@ def set_counts(settings: object, least: Mapping[str, int]) -> None:
 def check_list(name: str, value: object) -> None:
     """Raise ValueError for a text where a list belongs: it would be read letter by letter."""
     if isinstance(value, str):
-        raise ValueError(f"{name} must be a list: {value!r} came; write [{value!r}]")
+        raise ValueError(f"{name} must be a list, got {value!r}; write [{value!r}]")
 
 
 def check_kind(name: str, value: object, kind: type, example: str) -> None:
@@ -73,11 +73,11 @@ def check_kind(name: str, value: object, kind: type, example: str) -> None:
     """
     start = f"{name} must be a {kind.__name__}, such as {example}"
     if isinstance(value, type):
-        raise ValueError(f"{start}: the class {value.__name__} came; call it to make a value")
+        raise ValueError(f"{start}, got the class {value.__name__}; call it to make a value")
     if not isinstance(value, kind):
         members = [m for m in vars(kind) if not m.startswith("_")]
         lacking = [m for m in members if m not in dir(value)] if Protocol in kind.__mro__ else []
         end = f", which has no {' and no '.join(lacking)}" if lacking else ""
-        came = repr(value)
-        came = came if "\n" not in came else f"a {type(value).__name__}"
-        raise ValueError(f"{start}: {came} came{end}")
+        got = repr(value)
+        got = got if "\n" not in got else f"a {type(value).__name__}"
+        raise ValueError(f"{start}, got {got}{end}")

@@ -71,7 +71,7 @@ class WindowsLeftOut:
         if max(lengths) < 2 * MIN_SAMPLES:
             raise ValueError(
                 "a record must hold a window to refine on and another to judge on, of "
-                f"{MIN_SAMPLES} samples or more: at most {max(lengths)} came; use longer records"
+                f"{MIN_SAMPLES} samples or more, got at most {max(lengths)}; use longer records"
             )
         return min(max(wanted, MIN_SAMPLES), max(lengths) // 2)
 

@@ -112,10 +112,10 @@ class EBIC:
 
     def __post_init__(self) -> None:
         if not self.gamma >= 0.0:
-            raise ValueError(f"gamma must be zero or more: {self.gamma} came")
+            raise ValueError(f"gamma must be zero or more, got {self.gamma}")
         if self.coarsening is not None and not self.coarsening > 1.0:
             raise ValueError(
-                f"coarsening counts rows, and must be above 1: {self.coarsening} came; None "
+                f"coarsening counts rows, and must be above 1, got {self.coarsening}; None "
                 "trusts the residuals to the end"
             )
 
@@ -235,9 +235,9 @@ class Knee:
 
     def __post_init__(self) -> None:
         if self.n_norm not in ("library", "max_terms"):
-            raise ValueError(f"n_norm must be 'library' or 'max_terms': {self.n_norm!r} came")
+            raise ValueError(f"n_norm must be 'library' or 'max_terms', got {self.n_norm!r}")
         if self.scale not in ("linear", "log"):
-            raise ValueError(f"scale must be 'linear' or 'log': {self.scale!r} came")
+            raise ValueError(f"scale must be 'linear' or 'log', got {self.scale!r}")
 
     @property
     def label(self) -> str:

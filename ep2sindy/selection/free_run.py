@@ -138,9 +138,9 @@ class FreeRunScore:
         least = dict.fromkeys(("n_windows", "n_confirmed", "max_combinations", "n_starts"), 1)
         set_counts(self, {"n_folds": 2} | least)
         if not self.window_periods > 0.0:
-            raise ValueError(f"window_periods must be positive: {self.window_periods} came")
+            raise ValueError(f"window_periods must be positive, got {self.window_periods}")
         if not 0.0 < self.margin <= 1.0:
-            raise ValueError(f"margin must lie between 0 and 1: {self.margin} came")
+            raise ValueError(f"margin must lie between 0 and 1, got {self.margin}")
         check_list("judged", self.judged)
 
     def decide(self, fronts: Fronts, task: Task, *, progress: Progress = SILENT) -> Decision:
@@ -180,7 +180,7 @@ class FreeRunScore:
         states = [front.equation for front in fronts]
         if sorted(states) != sorted(runs[0].state_names):
             raise ValueError(
-                f"to integrate, every state needs one front: {states} came for the states "
+                f"to integrate, every state needs one front, got {states} for the states "
                 f"{list(runs[0].state_names)}"
             )
         smoothed = [KalmanSmoother().smooth(run.t, run.columns(states)) for run in runs]

@@ -225,8 +225,8 @@ def folds(runs: Sequence[Trajectory], n_folds: int) -> list[Fold]:
         return deal([Stretch(k, 0, length) for k, length in enumerate(lengths)], n_folds)
     if max(lengths) < 2 * MIN_SAMPLES * n_folds:
         raise ValueError(
-            f"runs must hold {2 * MIN_SAMPLES * n_folds} samples to be parted in {n_folds}: at "
-            f"most {max(lengths)} came; use longer records"
+            f"runs must hold {2 * MIN_SAMPLES * n_folds} samples to be parted in {n_folds}, got at "
+            f"most {max(lengths)}; use longer records"
         )
     found = []
     for k in range(n_folds):

@@ -82,7 +82,7 @@ class Delay:
         if run.n_samples - first < 2:
             raise ValueError(
                 f"a run must last longer than three delays of {self.delay_s:g} s, after which the "
-                f"chain is filled: {run.t[-1] - run.t[0]:g} s came; shorten the delay"
+                f"chain is filled, got {run.t[-1] - run.t[0]:g} s; shorten the delay"
             )
         return replace(
             run.window(first, run.n_samples),
@@ -96,7 +96,7 @@ class Delay:
 
         if self.state not in run.state_names:
             raise ValueError(
-                f"a delay is of a state: {self.state!r} came, and the states are "
+                f"a delay is of a state, got {self.state!r}, and the states are "
                 f"{list(run.state_names)}"
             )
         if there := sorted(set(self.names) & set(run.names)):

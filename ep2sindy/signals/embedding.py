@@ -71,13 +71,13 @@ class Embedding:
 
     def __post_init__(self) -> None:
         if self.how not in SAYS:
-            raise ValueError(f"how must be auto, {', '.join(SAYS)}: {self.how!r} came")
+            raise ValueError(f"how must be auto, {', '.join(SAYS)}, got {self.how!r}")
         if not self.harmonics >= 1.0:
-            raise ValueError(f"harmonics must be one or more: {self.harmonics} came")
+            raise ValueError(f"harmonics must be one or more, got {self.harmonics}")
         least = 1 if self.how == "hidden" else 2
         if not least <= check_count("n_states", self.n_states) <= MAX_STATES:
             raise ValueError(
-                f"n_states must be {least} to {MAX_STATES}: {self.n_states} came; an oscillation "
+                f"n_states must be {least} to {MAX_STATES}, got {self.n_states}; an oscillation "
                 "that nothing drives needs two, and higher derivatives are noise"
             )
 
@@ -249,7 +249,7 @@ def embed_alike(
     Raises ValueError for no signal.
     """
     if not signals:
-        raise ValueError("an embedding needs a signal or more: an empty list came")
+        raise ValueError("an embedding needs a signal or more, got an empty list")
 
     def make(how: str, reason: str) -> list[Embedded]:
         embedding = Embedding(how, n_states, harmonics)

@@ -65,7 +65,7 @@ def difference(
 ) -> Float[np.ndarray, "samples columns"]:
     """Second-order finite differences, exact for parabolas, also at unequal steps and the ends."""
     if len(t) < 3:
-        raise ValueError(f"second-order differences need three samples or more: {len(t)} came")
+        raise ValueError(f"second-order differences need three samples or more, got {len(t)}")
     found = np.empty(values.shape)
     for start in range(0, len(t), BLOCK):  # differences hold several copies
         first = max(start - 2, 0)
@@ -107,8 +107,8 @@ class SavitzkyGolay:
     def __post_init__(self) -> None:
         if self.window % 2 == 0 or not 0 <= self.order < self.window:
             raise ValueError(
-                "a Savitzky-Golay window must be odd and longer than its order: "
-                f"window={self.window}, order={self.order} came"
+                "a Savitzky-Golay window must be odd and longer than its order, got "
+                f"window={self.window}, order={self.order}"
             )
 
     def smooth(
@@ -117,7 +117,7 @@ class SavitzkyGolay:
         """Raises ValueError when the trajectory is shorter than the window."""
         if len(t) < self.window:
             raise ValueError(
-                f"smoothing needs at least {self.window} samples (its window): {len(t)} came; "
+                f"smoothing needs at least {self.window} samples (its window), got {len(t)}; "
                 "shorten the window or join more data"
             )
         if is_uniform(t):
@@ -331,8 +331,8 @@ class KalmanSmoother:
     def __post_init__(self) -> None:
         if not LOG10_RATIO_MIN <= (self.log10_ratio or 0.0) <= LOG10_RATIO_MAX:
             raise ValueError(
-                f"log10_ratio must lie in [{LOG10_RATIO_MIN:g}, {LOG10_RATIO_MAX:g}]: "
-                f"{self.log10_ratio:g} came; leave it out to have the most likely one found"
+                f"log10_ratio must lie in [{LOG10_RATIO_MIN:g}, {LOG10_RATIO_MAX:g}], got "
+                f"{self.log10_ratio:g}; leave it out to have the most likely one found"
             )
         check_memory_bounds(self.finest_s, self.coarsest_s)
 
@@ -432,8 +432,8 @@ def scale_steps(
     """
     if len(t) < least or len(values) != len(t):
         raise ValueError(
-            f"smoothing needs at least {least} samples, one row of values per time: {len(values)} "
-            f"rows came with {len(t)} times; join more data"
+            f"smoothing needs at least {least} samples, one row of values per time, got {len(values)} "
+            f"rows with {len(t)} times; join more data"
         )
     check_time(t)
     step_s = float(t[-1] - t[0]) / (len(t) - 1)

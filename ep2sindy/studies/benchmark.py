@@ -87,7 +87,7 @@ def build_variants(names: Sequence[str], definitions: Mapping[str, Deferred]) ->
         variant = definitions[name].build()
         if not isinstance(variant, Variant):
             raise ValueError(
-                f"definitions.{name} must name a _target_ that has `find`: {variant} came"
+                f"definitions.{name} must name a _target_ that has `find`, got {variant}"
             )
         variants[name] = variant
     return variants

@@ -143,13 +143,13 @@ class Study:
     def __post_init__(self) -> None:
         if self.hidden and (self.living is not None or len(self.libraries) > 1):
             raise ValueError(
-                f"hidden states go with one library and without living: hidden={list(self.hidden)} "
-                f"came with {len(self.libraries)} libraries; take +exp=discover"
+                f"hidden states go with one library and without living, got hidden={list(self.hidden)}"
+                f" with {len(self.libraries)} libraries; take +exp=discover"
             )
         if self.exclude and self.living is not None:
             raise ValueError(
-                "exclude goes without living, whose roles say which terms there are: "
-                f"exclude={dict(self.exclude)} came; take +exp=discover"
+                "exclude goes without living, whose roles say which terms there are, got "
+                f"exclude={dict(self.exclude)}; take +exp=discover"
             )
 
     def run(self, report: Report) -> None:
@@ -357,7 +357,7 @@ def registered(text: str) -> str:
         load_user_module(module)
     except ImportError as error:
         raise ValueError(
-            f"functions may name one of your own as MODULE.NAME: {text!r} came, and {error}; the "
+            f"functions may name one of your own as MODULE.NAME, got {text!r}, and {error}; the "
             "module must lie below the folder that you start in"
         ) from error
     if name not in function_names():

@@ -80,8 +80,8 @@ class LivingSearch:
     def __post_init__(self) -> None:
         if self.selection.basis != "runs":
             raise ValueError(
-                "a model lives or not when it runs: selection must be a rule that runs models, "
-                f"such as FreeRunScore(), {self.selection!r} came"
+                "whether a model sustains its oscillation shows when it runs: selection must be a rule that runs models, "
+                f"such as FreeRunScore(), got {self.selection!r}"
             )
 
     def found(

@@ -103,8 +103,8 @@ class Study:
     def search(self, library: Library, *, seed: int) -> PointSearch:
         if not isinstance(self.method, Regression):
             raise ValueError(
-                "a search of trajectories fits them whole, and a pointwise study searches rows: "
-                f"{self.method!r} came; use Regression(search=BestSubset()) (search=best_subset)"
+                "a search of trajectories fits them whole, and a pointwise study searches rows, got "
+                f"{self.method!r}; use Regression(search=BestSubset()) (search=best_subset)"
             )
         return PointSearch(self.states, library, self.method, self.least_variation, seed)
 

@@ -129,8 +129,8 @@ def read_published(published: Published, parameters: Sequence[str]) -> pd.DataFr
     for fit, columns in published.items():
         if not set(parameters) < set(columns) or len({*map(len, columns.values())}) > 1:
             raise ValueError(
-                f"thesis must give {list(parameters)} and quantities at every point, or be null: "
-                f"{dict(columns)} came for {fit}"
+                f"thesis must give {list(parameters)} and quantities at every point, or be null, got "
+                f"{dict(columns)} for {fit}"
             )
         for name in columns:
             if name not in parameters:

@@ -269,8 +269,8 @@ def in_unit(field: xr.Dataset, *, signal: str, unit: str) -> xr.Dataset:
         return field  # the trajectory reports what the data hold
     if (stated := field[signal].attrs.get("units", "1")) != "1":
         raise ValueError(
-            f"unit is for a signal whose unit the data do not say: {signal} comes in {stated!r}, "
-            f"and unit={unit} came; leave unit out, or describe the file by data=file"
+            f"unit is for a signal whose unit the data do not say, got {signal} comes in {stated!r}, "
+            f"and unit={unit}; leave unit out, or describe the file by data=file"
         )
     return field.assign({signal: to_si(field[signal], signal, unit, is_variable=True)})
 

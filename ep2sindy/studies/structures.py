@@ -30,10 +30,10 @@ def terms_of(
     key: the config's key for this model, for error messages.
     """
     if set(given) != set(states) or not all(given.values()):
-        came = {state: list(names) for state, names in given.items()}
+        got = {state: list(names) for state, names in given.items()}
         raise ValueError(
             f"{key} must list the terms of every state of {list(states)}, such as "
-            f"{{x: [x, x*y]}}: got {came}"
+            f"{{x: [x, x*y]}}: got {got}"
         )
     terms = {state: [str(name) for name in given[state]] for state in states}
     factors = [

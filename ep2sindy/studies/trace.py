@@ -117,7 +117,7 @@ class Study:
 
     def __post_init__(self) -> None:
         if isinstance(self.offset, str) and self.offset != "fit":
-            raise ValueError(f"offset must be a number or fit: {self.offset!r} came")
+            raise ValueError(f"offset must be a number or fit, got {self.offset!r}")
 
     @property
     def told(self) -> ToldFacts:

@@ -87,8 +87,8 @@ def with_degree(system: System, degree: int) -> System:
     least = int(model.library.degrees[(model.coef != 0.0).any(axis=1)].max())
     if degree < least:
         raise ValueError(
-            f"the library must hold the terms of {system.name}, of degree {least} or more: "
-            f"degree={degree} came; raise it, or leave that system out"
+            f"the library must hold the terms of {system.name}, of degree {least} or more, got "
+            f"degree={degree}; raise it, or leave that system out"
         )
     library = polynomial(model.states, degree=degree)
     coef = coef_matrix(library, [model.terms(state) for state in model.states])

@@ -57,7 +57,7 @@ def _averaged(field: xr.Dataset, zone: Zone) -> Terms:
     first, beyond = int(inside[0]), int(inside[-1]) + 1
     if beyond >= field.sizes["z"]:
         raise ValueError(
-            f"a zone must end before the last cell: {zone.z} came, the cells' centres reach from "
+            f"a zone must end before the last cell, got {zone.z}, the cells' centres reach from "
             f"{float(field['z'][0]):g} to {float(field['z'][-1]):g} m"
         )
     dz = field["dz"].values[first:beyond].astype(float)

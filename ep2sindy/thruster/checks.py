@@ -20,8 +20,8 @@ def set_profile(owner: object, places: str, name: str, positive_in: str | None) 
     check_increasing(owner, places)
     check_rows(owner, places, name)
     if positive_in is not None and (least := min(getattr(owner, name))) <= 0.0:
-        came = f"{least:g} {positive_in}".strip()
-        raise ValueError(f"{type(owner).__name__}.{name} must be positive everywhere, got {came}")
+        got = f"{least:g} {positive_in}".strip()
+        raise ValueError(f"{type(owner).__name__}.{name} must be positive everywhere, got {got}")
 
 
 def check_positive(owner: object, *names: str) -> None:

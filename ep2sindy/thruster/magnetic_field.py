@@ -126,7 +126,7 @@ def _unit(units: dict[str, float], given: str | None, header: str, place: str) -
         return None
     if word not in units:
         raise ValueError(
-            f"{place} must be in one of {list(units)}: {word!r} came; the unit stands last in the "
+            f"{place} must be in one of {list(units)}, got {word!r}; the unit stands last in the "
             "header, as in z_mm,B_mT, or is given"
         )
     return units[word]

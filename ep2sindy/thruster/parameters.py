@@ -66,8 +66,8 @@ class ModulatedVoltage:
         check_positive(self, "share", "frequency_Hz")
         if self.share >= 1.0:
             raise ValueError(
-                f"ModulatedVoltage.share must be below 1, or the supply turns round: {self.share:g}"
-                " came; 0.05 is five per cent"
+                f"ModulatedVoltage.share must be below 1, or the supply turns round, got {self.share:g}"
+                "; 0.05 is five per cent"
             )
 
     def check(self, voltage: float, end_s: float) -> None:

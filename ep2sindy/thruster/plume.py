@@ -37,8 +37,8 @@ class ConicalPlume:
     def __post_init__(self) -> None:
         if not 0.0 <= self.half_angle_deg <= MAX_HALF_ANGLE_DEG:
             raise ValueError(
-                f"ConicalPlume.half_angle_deg must be from 0 to {MAX_HALF_ANGLE_DEG:g}: "
-                f"{self.half_angle_deg!r} came; give the beam's half-angle in degrees"
+                f"ConicalPlume.half_angle_deg must be from 0 to {MAX_HALF_ANGLE_DEG:g}, got "
+                f"{self.half_angle_deg!r}; give the beam's half-angle in degrees"
             )
 
     def tangents(self, u_i: Profile, *, exit_T_e_eV: float, ion_mass: float) -> Profile:

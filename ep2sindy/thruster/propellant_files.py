@@ -46,7 +46,7 @@ def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
         return _resample_ionization(propellant("xenon", coulomb_weight=coulomb_weight), name)
     if name not in MASSES:
         raise ValueError(
-            f"there are the propellants {[*sorted(MASSES), 'xenon_5eV']}: {name!r} came; a table "
+            f"there are the propellants {[*sorted(MASSES), 'xenon_5eV']}, got {name!r}; a table "
             "of your own is read by ep2sindy.thruster.read_propellant"
         )
     return _table(

@@ -196,7 +196,7 @@ class PropellantTable:
         rate, energy = getattr(self, f"{name}_rate"), getattr(self, f"{name}_eV")
         if bool(rate) != (energy is not None):
             raise ValueError(
-                f"{name} of {self.name} needs both its column and {name}_eV: only one came"
+                f"{name} of {self.name} needs both its column and {name}_eV, got only one"
             )
         return bool(rate)
 
@@ -258,8 +258,8 @@ class PropellantTable:
         if name is None or higher > self.charge_states:
             there = [pair for pair in FURTHER_IONIZATIONS if pair[1] <= self.charge_states]
             raise ValueError(
-                f"{self.name} has further ionisations between the charges {there}: "
-                f"{(charge, higher)} came; X -> X+ is `ionization`"
+                f"{self.name} has further ionisations between the charges {there}, got "
+                f"{(charge, higher)}; X -> X+ is `ionization`"
             )
         return name
 

@@ -110,8 +110,8 @@ class PressureShift:
             raise ValueError(f"PressureShift.alpha must be above 1, got {self.alpha!r}")
         if not np.isfinite([self.z0, self.dz]).all():
             raise ValueError(
-                f"PressureShift.z0 and dz must be finite, in channel lengths: {self.z0!r} and "
-                f"{self.dz!r} came"
+                f"PressureShift.z0 and dz must be finite, in channel lengths, got {self.z0!r} and "
+                f"{self.dz!r}"
             )
 
     def shift(self, pressure_Pa: float) -> float:
@@ -160,14 +160,14 @@ class FunctionTransport:
         if not callable(self.function) and not isinstance(self.function, str):
             raise ValueError(
                 "FunctionTransport.function must be a function c(z, t, plasma), or the dotted name "
-                f"of one: {self.function!r} came"
+                f"of one, got {self.function!r}"
             )
         try:
             identity = identify(self.called)
         except (ModuleNotFoundError, AttributeError) as error:
             raise ValueError(
                 "FunctionTransport.function must be a function of yours, as my_module.c, below the "
-                f"folder that you start in: {self.function!r} came, and {error}"
+                f"folder that you start in, got {self.function!r}, and {error}"
             ) from error
         object.__setattr__(self, "identity", identity)
 

@@ -139,7 +139,7 @@ def wall_material(
     """A wall of a named material: BN-SiO2, BN, alumina, SiC or SiO2; the rest as `SheathWall`."""
     if name not in MATERIALS:
         raise ValueError(
-            f"there are walls of {list(MATERIALS)}: {name!r} came; another material is "
+            f"there are walls of {list(MATERIALS)}, got {name!r}; another material is "
             "ep2sindy.thruster.SheathWall(yield_0=..., crossover_eV=...)"
         )
     yield_0, crossover_eV = MATERIALS[name]

@@ -45,8 +45,8 @@ def identify(call: Callable[..., Any]) -> str:
     settings = vars(named).get("__dataclass_params__")
     if not (call.__closure__ is None if is_function else settings and settings.frozen):
         raise ValueError(
-            "a function must be known by its source, so it must hold no values of its own: "
-            f"{call!r} came; write its numbers into it, or make it a frozen dataclass with __call__"
+            "a function must be known by its source, so it must hold no values of its own, got "
+            f"{call!r}; write its numbers into it, or make it a frozen dataclass with __call__"
         )
     try:
         source = Path(inspect.getfile(named)).read_bytes()

@@ -147,8 +147,8 @@ def check_packing(name: str, attributes: Mapping[str, Any]) -> None:
         is_number = value.size == 1 and value.dtype.kind in "iuf" and np.isfinite(value).all()
         if not is_number or (key == "scale_factor" and not value.all()):
             raise ValueError(
-                f"{key} of {name!r} must be a finite number, and no zero scale: "
-                f"{value.tolist()!r:.80} came; put the attribute right, or take it away to read "
+                f"{key} of {name!r} must be a finite number, and no zero scale, got "
+                f"{value.tolist()!r:.80}; put the attribute right, or take it away to read "
                 "the numbers as they are stored"
             )
 
